@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from time import monotonic_ns
 
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
 from rack.backplane.byte_lock import ByteLock
@@ -33,7 +34,7 @@ class Stage(IntEnum):
 
 
 class Entry(IntEnum):
-    """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor STRUCK_* and COUNT."""
+    """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor the rest."""
 
     STAGE = 0
     KIND = 1  # number of the kind, from its name
@@ -47,9 +48,10 @@ class Entry(IntEnum):
     WHEN_BOX = 9  # condition: index of a mailbox; -1: none
     WHEN_FIELD = 10  # index of a field in it
     WHEN_VALUE = 11  # number that the field must equal
-    STRUCK_TICK = 12  # tick at which it first acted; -1: not yet
+    STRUCK_TICK = 12  # tick at which it first changed anything, however little; -1: not yet
     STRUCK_NS = 13  # CLOCK_MONOTONIC at that time
-    COUNT = 14  # times it acted
+    COUNT = 14  # times it acted so much that it must be found
+    HIDDEN = 15  # ticks from STRUCK_TICK to the first of these times
     PARAMETER = 16  # eight of them, as bits of float64
 
 
@@ -87,12 +89,14 @@ class FaultEntry:
         """The stage of the fault."""
         return Stage(self.words[Entry.STAGE])
 
-    def acted(self, tick: int, time_ns: int) -> None:
-        """Count one action of the fault; keep the time of the first one."""
+    def acted(self, tick: int, shows: bool = True) -> None:
+        """Note one action of the fault, and the time of the first one; count those that show: they must be found."""
         if self.words[Entry.STRUCK_TICK] < 0:
-            self.words[Entry.STRUCK_NS] = time_ns
+            self.words[Entry.STRUCK_NS] = monotonic_ns()
             self.words[Entry.STRUCK_TICK] = tick
-        self.words[Entry.COUNT] += 1
+        if shows and not self.words[Entry.COUNT]:
+            self.words[Entry.HIDDEN] = tick - self.words[Entry.STRUCK_TICK]
+        self.words[Entry.COUNT] += shows
 
 
 class FaultTable:
@@ -163,8 +167,6 @@ def _fill(entry: FaultEntry, injection: Injection) -> None:
         (Entry.WHEN_FIELD, when[1]),
         (Entry.WHEN_VALUE, when[2]),
         (Entry.STRUCK_TICK, -1),
-        (Entry.STRUCK_NS, 0),
-        (Entry.COUNT, 0),
     ):
         words[word] = value
     for place, parameter in enumerate(injection.parameters):

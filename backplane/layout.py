@@ -30,10 +30,6 @@ class TickGrid(NamedTuple):
     every: int
     phase: int = 0
 
-    def upto(self, tick: int) -> int:
-        """Return the newest of them up to `tick`; negative before the first."""
-        return tick - (tick - self.phase) % self.every
-
     def since(self, tick: int) -> int:
         """Return the first of them at `tick` or later, `tick` not being negative."""
         return tick + (self.phase - tick) % self.every
@@ -145,7 +141,7 @@ class TaskSpec:
     `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in ticks; releases are
     the ticks `phase`, `phase` + `every`, ... `within_cycles` is the cycles that one plan may take. `priority` is
     SCHED_FIFO's, 0 for ordinary scheduling. `depth` is the number of records in its trace ring, a power of two. `wake`:
-    how it waits for its next cycle in real time.
+    how it waits for its next cycle in real time. `is_external`: a host board that the rack does not start.
     """
 
     name: str
@@ -159,6 +155,7 @@ class TaskSpec:
     depth: int
     wake: Wake = "signal"
     phase: int = 0
+    is_external: bool = False
 
     @property
     def grid(self) -> TickGrid:
@@ -189,6 +186,15 @@ class Layout:
         """The mailboxes that tasks and clock write, at ticks."""
         hosts = {host.name for host in self.hosts}
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
+
+    def pacers(self, host: TaskSpec) -> set[str]:
+        """Return the bus adapters in whose cycles a host board's program runs in lockstep: none of an external one."""
+        return {
+            task.name
+            for task in self.tasks
+            for box in self.mailboxes
+            if {task.name, host.name} <= {box.writer, *box.readers} and not host.is_external
+        }
 
     def mailbox(self, name: str) -> MailboxSpec:
         """Return the mailbox of that name. Raises `KeyError`."""

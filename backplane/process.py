@@ -6,9 +6,8 @@ import ctypes
 import os
 import select
 import signal
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import process_time_ns
 
@@ -99,22 +98,21 @@ def take_processor(spec: TaskSpec) -> int:
 
 
 @contextmanager
-def cores_kept_awake() -> Iterator[None]:
-    """Keep every core from sleeping while it is idle, if the system permits that (as a rule only to root).
+def cores_kept_awake() -> Iterator[str]:
+    """Keep every core from sleeping while it is idle; yield why the system refuses that, empty if it permits it.
 
-    A core that sleeps takes 20 us and more to wake up. The request ends with the process, however that ends:
+    A core that sleeps takes 20 us and more to wake up. But one that is held awake spins: a host that gives a virtual
+    machine a quota of processor time counts that, and takes the core away for ms once the quota is used up. As a rule
+    the system permits it to root only. The request ends with the process, however that ends:
     https://docs.kernel.org/power/pm_qos_interface.html
     """
-    try:
-        request = os.open(LATENCY_REQUEST, os.O_WRONLY)
-    except OSError:
-        yield
-        return
-    try:
-        os.write(request, (0).to_bytes(4, sys.byteorder))
-        yield
-    finally:
-        os.close(request)
+    refusal = ""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(LATENCY_REQUEST.open("r+b", 0)).write(bytes(4))
+        except OSError as error:
+            refusal = f"idle cores sleep, since {LATENCY_REQUEST} cannot be opened: {error.strerror}"
+        yield refusal
 
 
 def set_priority(priority: int) -> bool:

@@ -26,7 +26,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 13
+VERSION = 14
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
@@ -103,9 +103,10 @@ class Segment:
             self.words[at], self.words[at + 1] = address, len(text)
             self.bytes[address : address + len(text)] = text
             address += len(text)
-        for task in self.layout.tasks:
-            block = self.block(task.name)
+        for process in self.layout.processes:
+            block = self.block(process.name)
             block[Block.RELEASED] = block[Block.DONE] = -1
+        for task in self.layout.tasks:
             self.words[System.SYSFAIL + task.slot] = 1
         self.words[Head.VERSION] = VERSION
         self.words[Head.SIZE] = len(self.bytes)

@@ -65,6 +65,8 @@ class System(IntEnum):
     HOLD_AT = 53  # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
     HELD = 54  # 1 + tick before which it holds now; 0: it does not. Written by the clock
     PEER_STOP = 55  # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
+    SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
+    FOLLOWER_DRAINED = 57  # the recorder has taken everything up to here, whether or not it is in its files
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -85,7 +87,10 @@ class Demand(IntEnum):
 
 
 class Block(IntEnum):
-    """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the finder of a loss."""
+    """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the finder of a loss.
+
+    A host board has one too. In lockstep its bus adapter releases it: see `rack.boards.adapters.bus_adapter`.
+    """
 
     RELEASED = 0  # newest release, as a tick; -1: none yet
     DEADLINE = 1  # tick before which that cycle, or plan, must be finished
@@ -112,6 +117,8 @@ class Block(IntEnum):
     INTERRUPTS = 22  # messages that have interrupted this board and were served, under protocol interrupt
     INTERRUPTS_LOST = 23  # those lost because too many waited
     INTERRUPTS_WAITING = 24  # the largest number that has waited
+    CLOCK_SKIPPED = 25  # ticks skipped by the clock that this task has reported
+    WAITS_UNTIL = 26  # of a host board in lockstep: tick until which its program waits; 0: a message has come
 
 
 class TaskState(IntEnum):

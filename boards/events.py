@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import State
+from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
-from rack.backplane.words import Run, System
+from rack.backplane.words import Block, Run, System
+from rack.levels.goals import ObjectEnd, ends
+
+if TYPE_CHECKING:
+    from rack.levels.tables import GoalConfig
 
 OfRun = Literal["launch", "waiting", "ready", "start", "printed", "died", "done", "stop", "end", "recorder", "command"]
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
@@ -38,6 +43,41 @@ class Event:
     since: int = -1
 
 
+DEMANDED, NO_TORQUE = "a stop is demanded", "no torque"
+"""Reasons for which brakes engage: on a demand, of which other events say why, or because no torque came in time."""
+HELD_MS = 5e3
+"""Time on end for which an arm may be braked, or a level held, in a run that succeeds, without a cause in sight."""
+HELD_PART = 0.5
+"""Part of a run for which an arm may be braked so, again and again."""
+
+
+@dataclass(frozen=True)
+class Braking:
+    """Brakes that engaged for one reason at tick `since`."""
+
+    why: str
+    since: int
+    lasted_ms: float
+
+
+def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
+    """Return every time that brakes engaged in a run of `end` ticks, by its events; not those of the start."""
+    changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
+    found = [(one.subject, one.tick - int(one.value), one.tick) for one in changes if one.code == "brakes_opened"]
+    if changes and changes[-1].code == "brakes_closed":
+        found.append((changes[-1].subject, changes[-1].tick, end))
+    return tuple(Braking(why, since, round((until - since) * tick_ms, 6)) for why, since, until in found if why)
+
+
+def braked_text(found: Sequence[Braking]) -> str:
+    """Return how often brakes engaged, at least once, how long, and why, as readable text."""
+    longest = max(found, key=lambda one: one.lasted_ms)
+    total_ms = sum(one.lasted_ms for one in found)
+    times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
+    reasons = ", ".join(f"{why} ({count})" for why, count in Counter(one.why for one in found).most_common())
+    return f"brakes engaged {len(found)} time{'s' * (len(found) > 1)}, {times}: {reasons}"
+
+
 Cause = Literal["task done", "task refused", "task failed", "time over", "stopped", "board lost", "launcher lost"]
 """A task is refused if it never began, as it has no moves; any other task that ends with an error has failed."""
 
@@ -46,7 +86,9 @@ Cause = Literal["task done", "task refused", "task failed", "time over", "stoppe
 class Outcome:
     """The end of a run: its cause, its length in ticks, and the digest of everything written until then.
 
-    `state` and `reason` are those of the level that ends the run; `faults` are latched faults and lost boards.
+    `state` and `reason` are those of the level that ends the run; `faults` are latched faults, lost boards,
+    objects beyond their goals when the task says that it is done, and long holds without a cause in sight. `brakings`
+    are those after the start; `objects`: where each ended.
     """
 
     cause: Cause
@@ -55,6 +97,8 @@ class Outcome:
     reason: str
     digest: str
     faults: tuple[str, ...]
+    brakings: tuple[Braking, ...] = ()
+    objects: tuple[ObjectEnd, ...] = ()
 
     @property
     def worked(self) -> bool:
@@ -98,6 +142,15 @@ class Journal:
         return self.segment.words[System.TICK]
 
 
+def statuses(segment: Segment, field: str) -> Iterator[tuple[str, Message]]:
+    """Yield the last status of every level whose status has a field, with its board."""
+    for box in segment.layout.mailboxes:
+        if box.name.endswith(".status") and field in (own.name for own in box.fields):
+            status = open_observer(segment, box.name).peek()
+            if status.is_there:
+                yield box.writer, status.value
+
+
 class Ending:
     """Judges the end of a run. `ends_run` and `silent` are as in `ClockWiring`."""
 
@@ -116,15 +169,40 @@ class Ending:
 
     def latched(self) -> list[str]:
         """Return a line for every level whose last status reports an error, except the level that ends the run."""
-        found = []
+        errors = [(board, status.reason) for board, status in statuses(self._segment, "error") if status.error]
+        return [f"level '{board}': {reason}" for board, reason in errors if f"{board}.status" != self._ends_run]
+
+    def held(self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float) -> Iterator[str]:
+        """Yield in a line what held a run of `ran_ms` for so long that it is no success.
+
+        Nothing is yielded with a cause in sight: a fault was injected, an operator has commanded, a stop is demanded.
+        Levels of a rack on a network wait for other racks, and show for which.
+        """
+        segment = self._segment
+        if segment.words[System.DEMAND] or any(event.kind in ("fault", "command") for event in events):
+            return
+        never, held = [], []
+        for name, status in statuses(segment, "state"):
+            block = segment.block(name)
+            since = block[Block.LEVEL_SINCE]
+            lasted_ms = ran_ms - since * segment.layout.clock_ns * 1e-6
+            if not found and getattr(status, "braked", False):
+                never.append(Braking(status.reason or NO_TORQUE, since, lasted_ms))
+            if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
+                held.append(f"level '{name}' held for {lasted_ms:g} ms without a cause in sight: {status.reason}")
+        braked = [one for one in found if one.why != DEMANDED] or never
+        times = [one.lasted_ms for one in braked]
+        if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
+            yield f"held without a cause in sight, in {ran_ms:g} ms: {braked_text(braked)}"
+        elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
+            yield from held
+
+    def ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
+        """Return where objects that have goals ended, as sensed last; none if nothing senses them."""
         for box in self._segment.layout.mailboxes:
-            board, _, port = box.name.partition(".")
-            if port != "status" or box.name == self._ends_run or "error" not in (field.name for field in box.fields):
-                continue
-            status = open_observer(self._segment, box.name).peek()
-            if status.is_there and status.value.error:
-                found.append(f"level '{board}': {status.value.reason}")
-        return found
+            if box.message == "scene" and (scene := open_observer(self._segment, box.name).peek()).is_there:
+                return tuple(ends(goals, scene.value.position))
+        return ()
 
     def cause(self) -> Cause:
         """Return the cause of the end of a run that was not stopped."""

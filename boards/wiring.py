@@ -58,7 +58,10 @@ class TaskWiring:
 
 @dataclass(frozen=True)
 class HostWiring:
-    """One host board: its program's class, and the mailbox of each port. External: a prompt runs it, not the rack."""
+    """One host board: its program's class, and the mailbox of each port. External: a prompt runs it, not the rack.
+
+    `computing`: simulated time for which it computes after each wait, in lockstep, ticks.
+    """
 
     board: str
     target: str
@@ -66,6 +69,7 @@ class HostWiring:
     outputs: Mapping[str, str]
     context: LevelContext
     is_external: bool = False
+    computing: int = 0
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class ClockWiring:
     All other times are ticks. The run ends at `stop_tick` (0: never), or `linger` after the status mailbox `ends_run`
     reports done or error, or if its writer, not lost, has written nothing for `silent`. In lockstep the clock is at
     most `history` ahead of a recorder, and a lost board rejoins `restart_ticks` after its loss. `on_loss`: the demand
-    on the arm while a task is lost.
+    on the arm while a task is lost. `keeps_awake`: no core sleeps while it is idle.
     """
 
     lockstep: bool
@@ -87,5 +91,6 @@ class ClockWiring:
     history: int
     core: int
     priority: int
+    keeps_awake: bool
     restart_ticks: int
     on_loss: Mapping[str, Demand]

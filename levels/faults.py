@@ -75,9 +75,12 @@ class ActiveFault:
 
 @dataclass(frozen=True)
 class SensorStep:
-    """Spoils a sample. `act` returns the spoilt sample, and whether it differs from the truth."""
+    """Spoils a sample. `act` returns the spoilt sample, and whether that shows; None: it is the truth.
 
-    act: Callable[[Sample, ActiveFault], tuple[Sample, bool]]
+    What shows must be found: the bound counts from there.
+    """
+
+    act: Callable[[Sample, ActiveFault], tuple[Sample, bool | None]]
 
 
 @dataclass(frozen=True)
@@ -99,24 +102,20 @@ class TendonStep:
     """Tears a tendon of a hand, so that it gives no tension: that of `joint` on `side`, 0 flexor, 1 extensor."""
 
 
-def _with_position(sample: Sample, position: Array, fault: ActiveFault) -> tuple[Sample, bool]:
-    return sample._replace(position=position), bool(fault.joints.any())
-
-
 def position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Make positions NaN."""
-    return _with_position(sample, np.where(fault.joints, np.nan, sample.position), fault)
+    return sample._replace(position=np.where(fault.joints, np.nan, sample.position)), True
 
 
 def position_biased(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add `size`, rad, to positions."""
-    return _with_position(sample, sample.position + fault["size"] * fault.joints, fault)
+    return sample._replace(position=sample.position + fault["size"] * fault.joints), True
 
 
 def position_noisy(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add noise of standard deviation `size`, rad, to positions."""
     noise = fault["size"] * fault.draw(sample.tick).standard_normal(len(fault.joints))
-    return _with_position(sample, sample.position + noise * fault.joints, fault)
+    return sample._replace(position=sample.position + noise * fault.joints), True
 
 
 def sample_missing(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
@@ -125,11 +124,12 @@ def sample_missing(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     return first._replace(tick=first.tick - fault.every), True
 
 
-def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
     """Keep positions and velocities as they were when the fault began."""
     first, truth = fault.first(sample), (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)
-    return sample._replace(position=stuck[0], velocity=stuck[1]), bool((np.abs(stuck - truth) > APART).any())
+    off = np.abs(stuck - truth)
+    return sample._replace(position=stuck[0], velocity=stuck[1]), bool((off > APART).any()) if off.any() else None
 
 
 def torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:

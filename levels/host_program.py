@@ -1,6 +1,7 @@
 """A program of the host side: no rate, no deadline, no real-time priority; it may block, import anything, and raise.
 
-A host board is a process of its own under ordinary scheduling. The clock does not release it and never waits for it.
+A host board is a process of its own under ordinary scheduling. The clock does not release it; real time never waits for
+it.
 It reaches the levels only through a bus adapter (`rack.boards.adapters.bus_adapter`), which exchanges at its own rate.
 The author writes `run`:
 
@@ -14,8 +15,12 @@ The author writes `run`:
                 bus.wait(1.0)
 
 The program is over when `run` returns. An exception ends the process, which is restarted by the rack's policy with a
-new object; serials of messages go on. Messages enter at ticks that depend on the program's timing; a replay with the
-recorded entries repeats a run.
+new object; serials of messages go on.
+
+In real time messages enter at ticks that depend on the program's timing; a replay with the recorded entries repeats a
+run. In lockstep the program runs while the rack's time stands still, until it waits in `bus.wait`; its computing takes
+the simulated time `[host.x] computing_ms`. Then a run repeats, if the program depends on its messages, `tick` and
+`time_s` alone. One that blocks elsewhere for 30 s ends the run. For prompts lockstep does not wait.
 """
 
 from __future__ import annotations
@@ -34,14 +39,18 @@ class Bus(Protocol):
 
     @property
     def tick(self) -> int:
-        """The clock's tick."""
+        """The clock's tick; in lockstep that of the adapter's cycle in which the program runs."""
+
+    @property
+    def time_s(self) -> float:
+        """Time since some moment, s: in lockstep simulated time, in real time that of CLOCK_MONOTONIC."""
 
     @property
     def is_over(self) -> bool:
         """Whether the run has ended: the program should return."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a message arrives; False when none has after the timeout, or when the run ends."""
+        """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when the run ends."""
 
     def read(self, port: str) -> Reading:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the mailbox keeps them."""
@@ -66,8 +75,8 @@ class Bus(Protocol):
     def words(self, address: int, count: int = 1) -> list[int]:
         """Return words of 8 bytes of the crate's memory, from a bus address on; `rack check` prints addresses.
 
-        Any word may be read, whoever writes it, without a message. Raises `ValueError` for an address that is no
-        word's, or beyond the memory.
+        Any word may be read, whoever writes it, without a message; other boards may be writing it,
+        in lockstep too. Raises `ValueError` for an address that is no word's, or beyond the memory.
         """
 
     def finish(self) -> None:

@@ -64,18 +64,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType, SimpleNamespace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
-from pydantic import model_validator
+from pydantic import ValidationError, model_validator
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.queue import ALL
 from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
+from rack.levels.errors import ProgramError
 from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
-from rack.levels.tables import RobotConfig, SceneConfig, Table, frozen
+from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen
 
 __all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
 __all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
@@ -145,6 +146,22 @@ class Program(Table):
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
         """Yield key, as in "action[0].object", value and reason of each entry that does not suit arm or scene."""
+        return ()
+
+    @classmethod
+    def read(cls, table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> Self:
+        """Return the program in the `[task]` table. Raises `ProgramError`, with one line per mistake."""
+        try:
+            program = cls.model_validate(table)
+        except ValidationError as error:
+            lines = [f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
+            raise ProgramError("\n".join(lines)) from error
+        if misfits := [f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)]:
+            raise ProgramError("\n".join(misfits))
+        return program
+
+    def goals(self) -> Iterable[GoalConfig]:
+        """Yield where the program takes objects, in its order: checked when it says that it is done."""
         return ()
 
 
@@ -217,7 +234,8 @@ class Executor(ABC):
         # and reports and clears `findings` and `acted` after it. It calls `inject` when the active faults change.
         self.demand = Demand.NONE  # stop that the rack's safety demands of the arm in this cycle
         self.findings: list[Finding] = []  # faults found in this cycle, once per episode: the board raises alarms
-        self.acted: list[int] = []  # indices, in the injected sequence, of the faults that acted in this cycle
+        # The injected faults that changed anything in this cycle, by index; whether each showed: then it must be found.
+        self.acted: dict[int, bool] = {}
 
     @classmethod
     def preload(cls) -> None:

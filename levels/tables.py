@@ -20,6 +20,7 @@ from rack.levels.errors import LevelError
 Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
 LAST_TICK = 10**15
 """Ticks are 64-bit words: this many of the shortest ones last 300 years."""
 
@@ -157,6 +158,12 @@ class RobotConfig(Table):
     sensors: SensorConfig = Field(SensorConfig(), description="resolution and noise of the joints' encoders")
     wrist: WristConfig | None = Field(None, description="force/torque sensor, if the arm has one")
     hand: HandConfig | None = Field(None, description="tendons and fingers, for a hand in place of an arm")
+    patience_ms: Positive | None = Field(
+        None,
+        le=100.0,
+        description="time without a new torque for which motors keep the last one, ms; then the brakes engage; rounded "
+        "down to whole torque cycles, at least one; default: by what the arm does in it, see `rack check --verbose`",
+    )
     substeps: int = Field(5, ge=1, le=50, description="MuJoCo steps in one servo cycle")
     min_armature: Finite = Field(
         0.05, ge=0, description="least drive inertia of every joint, kg m2: light wrists need it"
@@ -168,7 +175,7 @@ class MotionConfig(Table):
 
     body: str = Field(description="obstacle that moves")
     at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s")
-    to: tuple[Finite, Finite, Finite] = Field(description="where its origin goes, m")
+    to: Vector = Field(description="where its origin goes, m")
     speed: Positive = Field(0.25, description="speed along the straight line, m/s")
 
 
@@ -178,8 +185,17 @@ class PushConfig(Table):
     body: str = Field(description="object that is pushed")
     at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it begins, s")
     seconds: Positive = Field(description="time for which it lasts, s")
-    force: tuple[Finite, Finite, Finite] = Field(description="force at the centre of mass, in the world's frame, N")
+    force: Vector = Field(description="force at the centre of mass, in the world's frame, N")
     rise: NotNegative = Field(0.0, description="time in which it rises, and in which it falls at its end, s")
+
+
+class GoalConfig(Table):
+    """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by itself."""
+
+    object: str = Field(description="object that the task moves, or keeps")
+    position: Vector = Field(description="where its origin ends, m")
+    # A gripper centres a part across its pads, not along them: there it stays as far off as it was taken, or slips.
+    tolerance_mm: Positive = Field(10.0, description="distance from there at which the task still counts as done, mm")
 
 
 class SceneConfig(Table):
@@ -193,6 +209,7 @@ class SceneConfig(Table):
     clearance: Positive = Field(0.015, description="distance that planned motion keeps from everything, m")
     motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
     push: tuple[PushConfig, ...] = Field((), description="forces on objects, by time")
+    goal: tuple[GoalConfig, ...] = Field((), description="where objects end, if the task is done")
 
     @property
     def bodies(self) -> tuple[str, ...]:

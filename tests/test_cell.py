@@ -123,7 +123,7 @@ def test_an_obstacle_cannot_be_shared(tmp_path: Path) -> None:
     text = f'extends = ["{CONFIGS / "cell" / "puma.toml"}", "{robot}"]\ntask = {{}}\n'
     (tmp_path / "post.toml").write_text(text)
     with pytest.raises(ConfigError) as error:
-        resolve(load(tmp_path / "post.toml", ['board.servo.params.shared=["post"]', "task.action=[]"]))
+        resolve(load(tmp_path / "post.toml", ['board.servo.params.shared=["post"]', "task.action=[]", "scene.goal=[]"]))
     assert "an obstacle, which moves by itself; objects: block1, block2, peg" in str(error.value)
 
 

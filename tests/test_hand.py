@@ -13,7 +13,7 @@ from rack.tools.analysis.report import report_of
 from rack.tools.runs.display import Display
 from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
-from rack.tools.viewer.pushes import LENGTH_M
+from rack.tools.viewer.cell import PUSH_M
 from rack.tools.viewer.reading import read
 from tests.levels.arms import ROBOTS
 from tests.tools.command_line import rack
@@ -106,7 +106,7 @@ def test_recording_shows_a_push_as_an_arrow(runs: list[Recording]) -> None:
     file = runs[0].folder / "run.rrd"
     vectors = read(file, "/cell/pushes", "Arrows3D:vectors")
     shown = [row for row in vectors.values if row is not None and len(row)]
-    assert np.array(shown[0][0]) / LENGTH_M == pytest.approx([0.3, 0.0, 0.5], abs=1e-3)
+    assert np.array(shown[0][0]) / PUSH_M == pytest.approx([0.3, 0.0, 0.5], abs=1e-3)
     assert len(shown) == pytest.approx(0.2 / 0.02, abs=3.5)
     assert not len(vectors.values[-1])  # the last message takes the arrow away
 

@@ -87,7 +87,7 @@ def test_a_lost_client_leaves_its_segment_ended_and_the_force_held_and_then_rele
     assert np.abs(wrench[held, 2] - PRESS).max() < 2.0
     assert resting[held][-1]
     assert ends[-1][ended[-1] == 6].item() == RequestEnd.CANCELLED
-    assert np.abs(wrench[released, 2])[-1] < 2.0
+    assert np.abs(wrench[released, 2])[-1] < 0.5  # five times the sensor's noise
     assert np.abs(np.diff(place[released], axis=0)).max() < 1e-3
     assert b"forces released, the position is held" in reason[-1].encode()
 

@@ -44,7 +44,8 @@ def analyze(
     """Compare a run with the timing model: every equation that `rack check` predicts, with its measurement.
 
     Times of levels are processor time, without waiting and preemption. A virtual machine stalled by its host counts the
-    stall as processor time; --percentile 99 leaves out whatever happens less than once in 100 cycles.
+    stall as processor time: cycles in which one is seen are not judged. Not every one is seen; --percentile 99 leaves
+    out whatever happens less than once in 100 cycles.
 
     It lists the cycles that broke an equation, and the tasks that had their core meanwhile. It writes analysis.json,
     residuals.png and residuals.svg.

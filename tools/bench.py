@@ -8,7 +8,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from rack.tools.benches.options import Against, Config, Plot, Rates, Rounds, Share, print_found, show
+from rack.tools.benches.options import (
+    Against,
+    Config,
+    Plot,
+    RackRounds,
+    Rates,
+    Rounds,
+    Seconds,
+    Share,
+    print_found,
+    show,
+)
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, config_names
@@ -35,18 +46,15 @@ def mailbox(
     zenoh within one session never leaves its process: these two are no peers.
     """
     from rack.tools.benches.mailbox import CASES, measure
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(CASES, rounds, progress)
-    show(found, plot, as_json)
+    show(lambda progress: measure(CASES, rounds, progress), plot, as_json)
 
 
 @bench.command()
 def cycle(
     against: Against = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")] = 6.0,
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    rounds: RackRounds = 3,
     share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
@@ -58,11 +66,8 @@ def cycle(
     TREE needs and this environment lacks, give in PYTHONPATH.
     """
     from rack.tools.benches.cycle import measure
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(against, seconds, rounds, progress, share)
-    show(found, plot, as_json)
+    show(lambda progress: measure(against, seconds, rounds, progress, share), plot, as_json)
 
 
 @bench.command()
@@ -71,7 +76,7 @@ def lockstep(
     seconds: Annotated[
         float | None, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most")
     ] = None,
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")] = 3,
+    rounds: RackRounds = 3,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
@@ -81,12 +86,9 @@ def lockstep(
     Its messages must be those of the rack, bit for bit. What TREE needs and this environment lacks, give in PYTHONPATH.
     """
     from rack.tools.benches.lockstep import RACKS, measure
-    from rack.tools.console.progress import progress_for
 
     racks = {name: min(filter(None, (own, seconds)), default=None) for name, own in RACKS.items()}
-    with progress_for(as_json) as progress:
-        found = measure(against, racks, rounds, progress)
-    show(found, plot, as_json)
+    show(lambda progress: measure(against, racks, rounds, progress), plot, as_json)
 
 
 @bench.command()
@@ -158,25 +160,16 @@ def response(
     that command, the torque must differ from that tick on. Exit status 1 if one does not, or a bound is exceeded.
     """
     from rack.tools.benches.response import ResponseRuns
-    from rack.tools.console.progress import progress_for
-    from rack.tools.console.tables import terminal_width
-    from rack.tools.timing.operator_response import plot
 
-    with progress_for(as_json) as progress:
-        measured = ResponseRuns(config, mode, seed, progress).measure(commands, twins if mode == "lockstep" else 0)
-    print_found(measured.document(), measured.lines(terminal_width()), as_json)
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        paths = plot(measured.response, out)
-        if not as_json:
-            print(f"pictures: {', '.join(map(str, paths))}")
-    raise typer.Exit(0 if measured.held else 1)
+    twins = twins if mode == "lockstep" else 0
+    found = show(lambda progress: ResponseRuns(config, mode, seed, progress).measure(commands, twins), out, as_json)
+    raise typer.Exit(0 if found.held else 1)
 
 
 @bench.command()
 def clock(
     rate: Rates = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 2.0,
+    seconds: Seconds = 2.0,
     rounds: Rounds = 3,
     share: Share = False,
     plot: Plot = None,
@@ -186,15 +179,15 @@ def clock(
 
     Lateness is the time from grid point to start. An empty board waits in each of the ways that a config permits. By
     turns with it, on the same core at the same rate and priority: `cyclictest`, a bare loop of clock_nanosleep in
-    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
+    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`. A board that sleeps and `cyclictest` also run with
+    idle cores held awake, as root; all others let them sleep. The last line says which `clock.idle_cores` suits this
+    machine: with fewer wake-ups late by a period, beyond chance, or else with the better worst one. Let nothing
+    else run meanwhile.
     """
     from rack.tools.benches.clock import RATES_HZ, measure
     from rack.tools.benches.observed import Runs
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress)
-    show(found, plot, as_json)
+    show(lambda progress: measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress), plot, as_json)
 
 
 @bench.command()
@@ -215,11 +208,8 @@ def rate(
     """
     from rack.tools.benches.observed import Runs
     from rack.tools.benches.rate import RATES_HZ, measure
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress)
-    show(found, plot, as_json)
+    show(lambda progress: measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress), plot, as_json)
 
 
 @bench.command()
@@ -243,13 +233,12 @@ def boards(
     from rack.tools.benches.boards import COUNTS, measure
     from rack.tools.benches.chain import LONGEST
     from rack.tools.benches.observed import Runs
-    from rack.tools.console.progress import progress_for
 
-    if max(count or COUNTS) > LONGEST:
-        raise Failure(f"--count {max(count or COUNTS)}: a crate takes up to {LONGEST} boards and the clock", 2)
-    with progress_for(as_json) as progress:
-        found = measure(sorted(set(count or COUNTS)), Runs(seconds, rounds, share), against, progress)
-    show(found, plot, as_json)
+    counts = sorted(set(count or COUNTS))
+    if counts[-1] > LONGEST:
+        raise Failure(f"--count {counts[-1]}: a crate takes up to {LONGEST} boards and the clock", 2)
+    runs = Runs(seconds, rounds, share)
+    found = show(lambda progress: measure(counts, runs, against, progress), plot, as_json)
     raise typer.Exit(0 if found.exact else 1)
 
 
@@ -271,11 +260,8 @@ def launch(
     time until the brakes of the arm are engaged.
     """
     from rack.tools.benches.launch import LaunchCounts, measure
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(config, LaunchCounts(rounds, kills), against, share, progress)
-    show(found, plot, as_json)
+    show(lambda progress: measure(config, LaunchCounts(rounds, kills), against, share, progress), plot, as_json)
 
 
 @bench.command()
@@ -320,11 +306,8 @@ def systems(
     from rack.tools.benches.observed import Runs
     from rack.tools.benches.systems.bench import measure
     from rack.tools.benches.systems.bench import systems as bundled
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(configs or bundled(), Runs(seconds, 1, share), progress)
-    show(found, plot, as_json)
+    found = show(lambda progress: measure(configs or bundled(), Runs(seconds, 1, share), progress), plot, as_json)
     raise typer.Exit(0 if found.worked else 1)
 
 
@@ -345,11 +328,8 @@ def hand(
     many were lost. Exit status 1 if a rack did not do its task.
     """
     from rack.tools.benches.hand import measure
-    from rack.tools.console.progress import progress_for
 
-    with progress_for(as_json) as progress:
-        found = measure(rounds, share, progress)
-    show(found, plot, as_json)
+    found = show(lambda progress: measure(rounds, share, progress), plot, as_json)
     raise typer.Exit(0 if found.worked else 1)
 
 
@@ -357,7 +337,7 @@ def hand(
 def lan(
     racks: Annotated[list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; several times")] = None,
     rate: Rates = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")] = 3.0,
+    seconds: Seconds = 3.0,
     rounds: Rounds = 1,
     loss: Annotated[float, typer.Option(metavar="SHARE", min=0, max=0.2, help="share of packets lost")] = 0.0,
     plot: Plot = None,
@@ -373,9 +353,6 @@ def lan(
     and false deaths. All machines share the cores of this one: with many racks these are the limit, not the network.
     """
     from rack.tools.benches.lan import COUNTS, RATES_HZ, LanRuns, measure
-    from rack.tools.console.progress import progress_for
 
     runs = LanRuns(sorted(set(racks or COUNTS)), sorted(set(rate or RATES_HZ)), seconds, rounds, loss)
-    with progress_for(as_json) as progress:
-        found = measure(runs, progress)
-    show(found, plot, as_json)
+    show(lambda progress: measure(runs, progress), plot, as_json)

@@ -12,6 +12,7 @@ import typer
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.config import load, shared_out
+from rack.boards.config.cell import built_cell
 from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
 from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
 from rack.levels.timing.forecast import Forecast
@@ -37,6 +38,12 @@ Percentile = Annotated[
 ]
 Fix = Annotated[bool, typer.Option("--fix", help="print only the config, with the cheapest changes that make it fit")]
 
+Verbose = Annotated[bool, typer.Option("--verbose", help="add what the arm does while it waits for a new torque")]
+PATIENCE = (
+    "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted: {permitted_ms} ms). "
+    "Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors at full torque put in {energy_j} J"
+)
+
 
 def check(
     config: ConfigName,
@@ -45,6 +52,7 @@ def check(
     run: From = None,
     percentile: Percentile = 100.0,
     fix: Fix = False,
+    verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
     """Validate a config, show its inventory, and predict its timing.
@@ -88,7 +96,8 @@ def check(
         print_json(stock | {"timing": forecast.document() | {"repair": fitting.document()}})
     else:
         width = terminal_width()
-        lines = [*inventory_lines(stock, width), *forecast_lines(forecast, width), "", *fitting.lines()]
+        patience = [PATIENCE.format(**found) for found in stock["patience"]] if verbose else []
+        lines = [*inventory_lines(stock, width), *patience, *forecast_lines(forecast, width), "", *fitting.lines()]
         print_wrapped("\n".join(lines))
     sys.exit(0 if forecast.holds else 1)
 
@@ -166,9 +175,28 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
         "tasks": tasks,
         "hosts": [_host(name, host, layout) for name, host in config.host.items()],
         "network": _network(config),
+        "patience": list(_patience(config, layout)),
         "mailboxes": mailboxes,
         "notes": notes,
     }
+
+
+def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
+    """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile, joint by joint."""
+    for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
+        assert config.robot is not None, "it drives one"
+        cell = built_cell(config.robot, config.scene, config.clock_ns)
+        every, tick_ms = config.every(board), layout.clock_ns * 1e-6
+        ticks = cell.patience.ticks(every, tick_ms * 1e-3)
+        angle_mrad = ticks * tick_ms * cell.bounds.velocity
+        yield {
+            "board": board,
+            "ms": ticks * tick_ms,
+            "cycles": ticks // every,
+            "permitted_ms": round(cell.patience.seconds * 1e3, 3),
+            "angle_mrad": angle_mrad.round(1).tolist(),
+            "energy_j": round(float((angle_mrad * cell.bounds.torque).sum()) * 1e-3, 3),
+        }
 
 
 def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:

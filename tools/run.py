@@ -40,7 +40,8 @@ FromRun = Annotated[
     typer.Option(
         "--entries",
         metavar="RUN",
-        help="start no host boards: what they sent in this recorded run enters again, at the same ticks",
+        help="start no host boards: what they sent in this recorded run enters again, at the same ticks; for runs in "
+        "real time, or with a prompt: other runs repeat in lockstep by themselves",
     ),
 ]
 NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
@@ -67,8 +68,10 @@ def run(
     On a terminal a live table shows every task and what holds the rack; elsewhere one line a second is printed. --json
     prints the report as one document. With --no-record it has the same keys; those that need a recording are null.
 
-    Exit status: 0 the task was done, or --seconds have passed, and no fault is latched; 1 otherwise; 2 usage or config
-    error. Ctrl-C ends the run in order, with a report and exit status 130.
+    Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no fault is latched,
+    and the recording is complete. 1 otherwise, also if brakes or a level held the rack for over 5 s, or brakes for half
+    of the run, without a cause in sight. 2 usage or config error. A full disk ends the run. Ctrl-C ends it in order,
+    with a report and exit status 130.
 
     \b
     Examples:

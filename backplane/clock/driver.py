@@ -22,8 +22,8 @@ from rack.backplane.clock.released_task import ReleasedTask, Watchdog, by_priori
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import AlarmWriter
-from rack.backplane.words import Head, Run, System
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
+from rack.backplane.words import Block, Head, Run, System
 
 # Plain integers for the hot path.
 _TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
@@ -31,6 +31,8 @@ _TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
 )
 LEAD_NS = 300_000
 """How far ahead of its grid point the clock begins a tick: room for its own wake-up and for the work of a tick."""
+LATE_PART = 2
+"""A core was away if the clock wakes late, or nothing runs that is due, for more than one part in so many of a tick."""
 LEAD_PART = 3
 """The clock is ahead by at most one part in so many of a tick."""
 
@@ -51,16 +53,20 @@ class Controller(Protocol):
 class ClockDriver(ABC):
     """The part common to both modes: the tick, the releases, the end of the run.
 
-    `controller` is set by the clock's board, if it has one. The next `skip` ticks are skipped.
+    `controller` is set by the clock's board, if it has one. The next `skip` ticks are skipped. `processes`: the
+    tasks, and the host boards, which the clock does not release. `is_flooded`: a fault makes a task write more than the
+    rings are made for.
     """
 
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         self.words = segment.words
         self.tasks = [ReleasedTask(segment, task) for task in by_priority(segment.layout)]
+        self.processes = [*self.tasks, *(ReleasedTask(segment, host) for host in segment.layout.hosts)]
         groups = groupby(self.tasks, key=lambda task: (task.spec.role, task.spec.every, task.spec.phase))
         self._groups = [(every, phase, list(tasks)) for (_, every, phase), tasks in groups]
         self.controller: Controller | None = None
         self.skip = 0
+        self.is_flooded = False
         self.alarms = alarms or AlarmWriter(segment, CLOCK)
         self.watchdog = Watchdog(self.alarms, self.words[System.PERIOD_NS])
         self._ended = ended
@@ -78,8 +84,15 @@ class ClockDriver(ABC):
         if not self.skip:
             return True
         self.skip -= 1
-        self.words[System.CLOCK_SKIPPED] += 1
         return False
+
+    def count_skipped(self, first: int, ticks: int) -> None:
+        """Publish that the clock skips so many ticks from `first` on.
+
+        All at once, and the count last: a late task must see neither half a skip nor one that began after its release.
+        """
+        self.words[System.SKIPPED_FROM] = first
+        self.words[System.CLOCK_SKIPPED] += ticks
 
     def due(self, tick: int, last: int) -> list[ReleasedTask]:
         """Return the tasks with a release in (last, tick], in the order of their releases."""
@@ -150,6 +163,7 @@ class RealtimeDriver(ClockDriver):
         super().__init__(segment, ended, alarms)
         self._epoch_ns, self._period_ns = self.words[System.EPOCH_NS], self.words[System.PERIOD_NS]
         leads = any(task.sleeps for task in self.tasks)
+        self._woke_ns = 0
         self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_PART) if leads else 0
 
     def run(self) -> None:
@@ -187,10 +201,11 @@ class RealtimeDriver(ClockDriver):
         for task in sleeping:
             task.release(tick)
         now = self.words[_TICK_NS] = time.monotonic_ns()
-        if now >= point:
-            # They have looked for their release already, and sleep on.
+        if now >= point or tick > last + 1:
             for task in sleeping:
-                task.wake()
+                # It has looked for its release already, and sleeps on.
+                if now >= self._time_of(task.block[Block.RELEASED]):
+                    task.wake()
         if len(sleeping) < len(due):
             self._sleep_until(point)
             for task in due:
@@ -209,12 +224,22 @@ class RealtimeDriver(ClockDriver):
             time.sleep(wait * 1e-9)
 
     def _sleep_until_next(self, tick: int) -> int:
-        """Sleep until a tick begins; return the newest tick to begin by then, at least the one after `tick`."""
-        self._sleep_until(self._time_of(tick + 1) - self._lead_ns)
-        now = (time.monotonic_ns() + self._lead_ns - self._epoch_ns) // self._period_ns
+        """Sleep until a tick begins; return the newest tick to begin by then, at least the one after `tick`.
+
+        The clock preempts all else on its core: if it wakes late, that core was away. Reports tell stalls by it.
+        """
+        due_ns, has_ticked = self._time_of(tick + 1), self._woke_ns
+        self._sleep_until(due_ns - self._lead_ns)
+        self._woke_ns = time.monotonic_ns()
+        now = (self._woke_ns + self._lead_ns - self._epoch_ns) // self._period_ns
         if stop := self.words[_STOP_TICK]:
             # Even a late clock makes the run's last tick: tasks that are late for it are seen.
             now = min(now, stop - 1)
         next_tick = max(tick + 1, now)
-        self.words[System.CLOCK_SKIPPED] += next_tick - tick - 1
+        skipped = next_tick - tick - 1
+        if skipped:
+            self.count_skipped(tick + 1, skipped)
+        # Before its first tick, at the start or after a restart, a late clock says nothing about its core.
+        if has_ticked and (late_ns := self._woke_ns - due_ns) > self._period_ns // LATE_PART:
+            self.alarms.ring(next_tick, Alarm.CLOCK_LATE, value=late_ns, since=tick + 1)
         return next_tick

@@ -19,10 +19,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Run, System
 
-IDLE_S = 5.0
-"""Bound of the wait for a recorder that is stopped, or dead and not restarted."""
-SLOW_S = 30.0
-"""Bound of the wait for a recorder that runs but reads no rows: a new one may still be importing its libraries."""
+IDLE_S = 30.0
+"""Bound of the wait for a recorder that is stopped, or dead and not replaced. Its launcher replaces it much sooner."""
 # Plain integers for the hot path.
 _FOLLOWER_PID, _FOLLOWER_TICK = int(System.FOLLOWER_PID), int(System.FOLLOWER_TICK)
 _HOLD_AT = int(System.HOLD_AT)
@@ -116,21 +114,24 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
-        """Wait for a recorder before its rings overflow: in lockstep time stands still meanwhile."""
+        """Wait for a recorder, however slow, before its rings overflow: in lockstep time stands still meanwhile."""
         words = self.words
-        if not words[_FOLLOWER_PID] or tick - words[_FOLLOWER_TICK] <= self._history_ticks:
-            return True
-        seen, since = words[_FOLLOWER_TICK], time.monotonic()
-        while (pid := words[_FOLLOWER_PID]) and tick - words[_FOLLOWER_TICK] > self._history_ticks:
-            if words[_FOLLOWER_TICK] != seen:
-                seen, since = words[_FOLLOWER_TICK], time.monotonic()
-            bound_s = IDLE_S if state_of(pid) in (*STOPPED, *GONE) else SLOW_S
-            if time.monotonic() - since > bound_s:
+        since = time.monotonic()
+        while (pid := words[_FOLLOWER_PID]) and self._is_ahead(tick):
+            if state_of(pid) not in (*STOPPED, *GONE):
+                since = time.monotonic()
+            elif time.monotonic() - since > IDLE_S:
                 words[_FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False
             time.sleep(LOOK_S)
         return True
+
+    def _is_ahead(self, tick: int) -> bool:
+        """Say whether the recorder must catch up first; rings that are flooded hold little more than a tick."""
+        if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
+            return True
+        return self.words[_FOLLOWER_TICK] < tick - self._history_ticks
 
     def _wait_for_step(self, tick: int) -> bool:
         """Hold before `tick` while the host steps the rack; False when the launcher is gone."""

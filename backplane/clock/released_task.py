@@ -95,8 +95,8 @@ class ReleasedTask:
 
     @property
     def is_ready(self) -> bool:
-        """Whether a lost task's new process waits for its first release."""
-        return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING)
+        """Whether a lost task's new process waits for its first release; that of a host board may be done already."""
+        return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
     @property
     def is_given_up(self) -> bool:

@@ -34,6 +34,10 @@ PEER = -2
 """Subject of a demand on the arm that the loss of another rack makes."""
 
 
+BY_DEMAND, NO_TORQUE, AT_START = -1, -2, -3
+"""Why brakes engaged, where no error says it: on a demand, because no torque came in time, or had come at all."""
+
+
 class Alarm(IntEnum):
     """Kinds of alarms. In brackets: subject; value."""
 
@@ -44,6 +48,7 @@ class Alarm(IntEnum):
     REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
     DEMAND = 5  # [task whose loss demands it, PEER: another rack's, -1: the emergency stop or nobody; Demand]
     COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was issued
+    FLOWS = 7  # [mailbox; ticks since the fault ended]  a good message made after a fault of its messages
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
     PLAN_LATE = 11  # [task; releases missed]  a plan has not finished within its cycles (eq. 3.8)
@@ -63,7 +68,7 @@ class Alarm(IntEnum):
     # Raised by tasks: the clock.
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
-    CLOCK_LATE = 32  # [-1; lateness, ns]
+    CLOCK_LATE = 32  # [-1; lateness, ns]  by the clock too: it woke so much later than the grid point of tick `since`
     # Raised by boards: what interrupts them.
     INBOX_FULL = 33  # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
     # Raised by the servo level: the arm.
@@ -74,8 +79,8 @@ class Alarm(IntEnum):
     ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
     COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is NaN or infinite
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
-    BRAKES_CLOSED = 47  # [-1; ticks without torque, 0: demanded]
-    BRAKES_OPENED = 48  # [-1; ticks they were engaged]
+    BRAKES_CLOSED = 47  # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
+    BRAKES_OPENED = 48  # [as they engaged; ticks they were engaged]
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
     LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged

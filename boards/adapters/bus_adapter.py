@@ -10,19 +10,32 @@ a level's mailbox by ticks and writes a copy, which host boards read whenever th
 A hung, dead or flooding host board costs the real-time side nothing: the ring is bounded, a cycle looks at no more than
 `most` messages of an entry, and nothing here waits. The bridge's status shows it, entry by entry.
 
+In lockstep a program runs only within cycles of its bridges, after the exchange, and the cycle waits until it waits. It
+is due when a message has come, when the time has come until which it waits, and at its start. What it sends is taken
+in a later cycle, once its computing is over: that takes the simulated time `[host.x] computing_ms`, however long it
+really took. So it enters at ticks that the config determines. If a program has several bridges, lockstep releases all
+tasks one at a time.
+
+Alternative considered: a clock that releases programs as it does tasks. They would need a rate, and a message would
+wait for their next cycle.
+
 A replay does without host boards: what entered in a recorded run is given out again, each message at its tick.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
+from rack.backplane.clock.released_task import ReleasedTask
+from rack.backplane.clock.wake import CHECK_S
+from rack.backplane.layout import TaskSpec
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Field, Message, MessageType, State, status
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, TaskState
+from rack.backplane.words import Block, System, TaskState
 from rack.boards.adapters.adapter import STATUS, Adapter
 from rack.boards.adapters.entries import (
     ENTRY,
@@ -36,8 +49,12 @@ from rack.boards.adapters.entries import (
     Replayed,
     Rows,
 )
+from rack.levels.errors import CannotGoOn
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.tables import read_params
+
+LONGEST_S = 30.0
+"""Real time within which a program in lockstep must wait, or end; its start and imports have as long."""
 
 
 class BusAdapter(Adapter):
@@ -51,6 +68,7 @@ class BusAdapter(Adapter):
         self._tables = read_params(AdapterParams, context.params).entries
         self._counts = {port: EntryCount() for port in self._tables}
         self._entries: list[tuple[EntryConfig, Crossing]] = []
+        self._turns: list[HostTurn] = []
         self._hosts: dict[str, memoryview] = {}
         self._before: dict[str, bytes] = {}
         self._statuses: Replayed | None = None
@@ -88,6 +106,9 @@ class BusAdapter(Adapter):
                     since = own.newest if before.is_there else NEVER
                     entry = Replayed(entries[port], port, table.asynchronous, since)
             self._entries.append((table, entry))
+        if segment.words[System.LOCKSTEP] and entries is None:
+            board = self.context.board
+            self._turns = [HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)]
         if entries is not None:
             self._statuses = Replayed(entries[STATUS], STATUS, is_queued=False)
 
@@ -97,7 +118,7 @@ class BusAdapter(Adapter):
             count.resume(getattr(before.value, port), status.newest)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Exchange the entries that are due."""
+        """Exchange the entries that are due; then, in lockstep, let programs run."""
         if self._before:
             for port, message in self._before.items():
                 getattr(write, port).raw[:] = message
@@ -106,6 +127,8 @@ class BusAdapter(Adapter):
         for table, entry in self._entries:
             if table.is_due(cycle):
                 entry.exchange(read, write, tick)
+        for turn in self._turns:
+            turn.take(tick)
         if self._statuses is not None:
             self._statuses.exchange(read, write, tick)
         else:
@@ -115,15 +138,50 @@ class BusAdapter(Adapter):
         for port, count in self._counts.items():
             count.fill(getattr(status, port), tick)
         states = {name: block[Block.STATE] for name, block in self._hosts.items()}
-        gone = [name for name, state in states.items() if state == TaskState.GIVEN_UP]
         lost = [name for name, block in self._hosts.items() if block[Block.LOST]]
+        gone = [name for name, state in states.items() if state == TaskState.GIVEN_UP]
         status.state, status.error, status.reason = State.EXECUTING, 0, ""
-        if gone:
-            status.state, status.reason = State.ERROR, f"host board '{gone[0]}' was given up"
-        elif lost:
+        if lost:
+            # First: in lockstep the Rack may give it up at any tick, and the clock confirms that at one.
             status.state, status.reason = State.HOLDING, f"host board '{lost[0]}' is lost: it is being restarted"
+        elif gone:
+            status.state, status.reason = State.ERROR, f"host board '{gone[0]}' was given up"
         elif states and all(state == TaskState.ENDED for state in states.values()):
             status.state = State.DONE
+
+
+class HostTurn(ReleasedTask):
+    """A host board's program in lockstep, as its adapter sees it; its own end is `rack.boards.host.bus.HostBus`."""
+
+    def __init__(self, segment: Segment, host: TaskSpec) -> None:
+        super().__init__(segment, host)
+        self._segment = segment
+
+    def take(self, tick: int) -> None:
+        """Let the program run in the cycle released at `tick` if it is due, and wait until it waits.
+
+        Raises `CannotGoOn` if that takes too long.
+        """
+        block = self.block
+        # It may be done, or given up.
+        if block[Block.STATE] > TaskState.RUNNING or block[Block.WAITS_UNTIL] > tick or not self.is_free(tick):
+            return
+        block[Block.RELEASED] = tick
+        self.wake()
+        bound_s = time.monotonic() + LONGEST_S
+        while not self.is_settled():
+            if self.done.acquire(CHECK_S):
+                continue
+            if self._segment.words[System.STOP_REQUEST] or not self._segment.launcher_is_alive:
+                break
+            if time.monotonic() > bound_s:
+                raise CannotGoOn(
+                    f"the program of host board '{self.spec.name}' has not waited for {LONGEST_S:g} s of real time: "
+                    "lockstep cannot go on without it"
+                )
+        if block[Block.LOST]:
+            # The crate has noted the tick of the clock, which may be ahead of this cycle.
+            block[Block.LOST] = tick + 1
 
 
 def status_of(entries: Mapping[str, EntryConfig]) -> MessageType:

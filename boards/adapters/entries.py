@@ -16,6 +16,7 @@ from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import Field, MessageType
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.words import Block
 from rack.levels.level import Ports
 from rack.levels.tables import LAST_TICK, Table
 
@@ -125,17 +126,19 @@ class Inward:
     def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._ring, self._port, self._table, self._count = HostReader(segment, table.source), port, table, count
         self._refused, self._overtaken = count.refused, count.overtaken
+        self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take what waits, and check it."""
+        """Take what waits, and check it. In lockstep what a program sends is there once its computing is over."""
         ring, count, out = self._ring, self._count, getattr(write, self._port)
+        waiting = ring.waiting if self._writer[Block.DEADLINE] <= tick else 0
         if self._table.asynchronous:
-            for _ in range(min(ring.waiting, self._table.most, out.room())):
+            for _ in range(min(waiting, self._table.most, out.room())):
                 if (message := ring.take()) is not None:
                     out.copy_from(message)
                     out.send()
                     count.passes(tick, ring.written)
-        elif ring.waiting and (message := ring.take_newest(self._table.most)) is not None:
+        elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.passes(tick, ring.written)
         count.refused, count.overtaken = self._refused + ring.refused, self._overtaken + ring.overtaken
@@ -148,7 +151,8 @@ class Outward:
     def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._writer, self._port, self._table, self._count = open_writer(segment, own), port, table, count
         self._source = open_observer(segment, table.source)
-        self._wake = [wake_semaphore(segment.rack, reader) for reader in self._writer.spec.readers]
+        readers = self._writer.spec.readers
+        self._readers = [(segment.block(name), wake_semaphore(segment.rack, name)) for name in readers]
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
         """Copy what is there."""
@@ -161,7 +165,9 @@ class Outward:
         # A reading does not say when its message was written.
         self._source.read(tick)
         self._count.passes(tick, self._source.newest)
-        for semaphore in self._wake:
+        for block, semaphore in self._readers:
+            # In lockstep its program is due.
+            block[Block.WAITS_UNTIL] = 0
             # One post is enough: a host board that does not wait would let the semaphore overflow.
             if not semaphore.value:
                 semaphore.release()

@@ -31,7 +31,7 @@ def cell_sizes(config: RackConfig, mistakes: list[Mistake], is_whole: bool = Tru
         if is_whole:
             from rack.levels.robot.cell import sizes
 
-            return sizes(_cell(config.robot, config.scene, config.clock_ns))
+            return sizes(built_cell(config.robot, config.scene, config.clock_ns))
     except RobotError as error:
         found = [str(error)]
     for line in _unknown_names(config.robot, config.scene) or found:
@@ -55,15 +55,16 @@ def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) 
     """Return the name of a geom of the cell."""
     from rack.levels.robot import lookup
 
-    return lookup.geom_name(_cell(robot, scene, clock_ns).model, geom)
+    return lookup.geom_name(built_cell(robot, scene, clock_ns).model, geom)
 
 
 def joint_ranges(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> NDArray[np.float64]:
     """Return the range of commanded joint positions, (joints, 2), rad. Raises `RobotError`."""
-    return _cell(robot, scene, clock_ns).limits.position
+    return built_cell(robot, scene, clock_ns).limits.position
 
 
-def _cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+def built_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+    """Return the cell. Raises `RobotError`."""
     from rack.levels.robot.cell import build_cell
 
     return build_cell(robot, scene, clock_ns)

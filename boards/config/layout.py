@@ -30,6 +30,7 @@ from rack.boards.config.sides import Sides, key_of
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND
+from rack.levels.tables import GoalConfig
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""
@@ -97,6 +98,7 @@ class Wiring:
         self.mistakes += crossing or queue_mistakes(self)
         self.mistakes += [*asynchronous_mistakes(self), *interrupt_mistakes(self)]
         self._check_params()
+        self.goals: list[GoalConfig] = []  # of the programs
         if not broken & {"robot", "scene", "task"}:
             self._check_programs()
 
@@ -161,6 +163,7 @@ class Wiring:
             else:
                 misfits = program.misfits(self.config.robot, self.config.scene)
                 self.mistakes += [Mistake(f"task.{key}", value, why) for key, value, why in misfits]
+                self.goals += program.goals()
 
     @property
     def has_unknown(self) -> bool:
@@ -191,7 +194,7 @@ class Wiring:
     def layout(self, sizes: Mapping[str, int]) -> Layout:
         """Return the layout of a config without mistakes."""
         tasks = tuple(self._task(ports) for ports in self.tasks)
-        hosts = tuple(_host(ports.place) for ports in self.hosts)
+        hosts = tuple(self._host(ports.place) for ports in self.hosts)
         by_name = {task.name: task for task in tasks + hosts}
         mailboxes: list[MailboxSpec] = []
         for name, (ports, output) in self.writers.items():
@@ -254,6 +257,13 @@ class Wiring:
             phase=self.config.board[place.board].phase,
         )
 
+    def _host(self, place: TaskPlace) -> TaskSpec:
+        """Return the record of a host board: it has no rate, and leaves no trace."""
+        is_external = self.config.host[place.board].external
+        return TaskSpec(
+            place.name, place.board, place.role, place.slot, place.core, 0, 1, 1, 0, is_external=is_external
+        )
+
     def _wake(self, place: TaskPlace) -> Wake:
         """Return how a task waits for its next cycle. The planner of a polling executor must not poll too."""
         wake = self.config.board[place.board].wake or self.config.clock.wake
@@ -299,11 +309,6 @@ class Wiring:
             return "time-slice"
         # A lock would make the clock wait for readers.
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
-
-
-def _host(place: TaskPlace) -> TaskSpec:
-    """Return the record of a host board: it has no rate, and leaves no trace."""
-    return TaskSpec(place.name, place.board, place.role, place.slot, place.core, 0, 1, 1, 0)
 
 
 def too_large(layout: Layout) -> Iterable[Mistake]:

@@ -286,14 +286,16 @@ def _robot(config: RackConfig) -> Iterator[Mistake]:
 
 def _scene(config: RackConfig) -> Iterator[Mistake]:
     scene = config.scene
-    for at, motion in enumerate(scene.motion):
-        if motion.body not in scene.obstacles:
-            why = f"no such obstacle; scene.obstacles: {', '.join(scene.obstacles) or 'none'}"
-            yield Mistake(f"scene.motion[{at}].body", motion.body, why)
-    for at, push in enumerate(scene.push):
-        if push.body not in scene.objects:
-            why = f"no such object; scene.objects: {', '.join(scene.objects) or 'none'}"
-            yield Mistake(f"scene.push[{at}].body", push.body, why)
+    for kind, key, those in (
+        ("motion", "body", "obstacles"),
+        ("push", "body", "objects"),
+        ("goal", "object", "objects"),
+    ):
+        for at, entry in enumerate(getattr(scene, kind)):
+            name, known = getattr(entry, key), getattr(scene, those)
+            if name not in known:
+                why = f"no such {those[:-1]}; scene.{those}: {', '.join(known) or 'none'}"
+                yield Mistake(f"scene.{kind}[{at}].{key}", name, why)
     yield from _repeated("scene.objects and scene.obstacles", scene.bodies)
 
 

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
+from rack.backplane.process import cores_kept_awake
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
@@ -37,7 +38,7 @@ from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import BusTimes, ClockWiring, Entries, HostWiring, TaskWiring, mailboxes_of
 from rack.levels.level import Executor, LevelContext, Pace
-from rack.levels.tables import RobotConfig, Table
+from rack.levels.tables import GoalConfig, RobotConfig, Table
 
 LINGER_S = 0.5
 """Simulated time that a run continues after the task ends, to let the arm come to rest."""
@@ -93,6 +94,7 @@ class Resolved:
     hosts: tuple[HostWiring, ...]
     faults: tuple[Injection, ...]
     commands: tuple[Request, ...]
+    goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
     def with_entries(self, entries: Mapping[str, Entries]) -> Resolved:
         """Return the rack for a replay: no host boards, but what each bus adapter wrote in the recorded run."""
@@ -112,6 +114,7 @@ class Resolved:
             history=self._ticks(AHEAD_S),
             core=self._clock_core,
             priority=clock.priority,
+            keeps_awake=clock.mode == "realtime" and clock.idle_cores == "awake",
             restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
             on_loss={task.name: self._on_loss(task.board) for task in self.layout.tasks if task.role == "executor"},
         )
@@ -149,12 +152,16 @@ class Resolved:
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
-        """Return notes for the launch to report: cores replaced, priorities refused, no TLS, no repeatable run."""
-        refused, live = self._refused(segment), ", ".join(host.board for host in self.hosts)
+        """Return notes for the launch to report: cores replaced, priorities refused, idle cores held awake, ..."""
+        refused = self._refused(segment)
         found = [*shared_out(self.config), *network_notes(self.config)]
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
-        if live and self.config.clock.mode == "lockstep":
-            found.append(f"what {live} sends enters at ticks that depend on its timing; --entries RUN repeats a run")
+        if self.clock(None).keeps_awake:
+            with cores_kept_awake() as refusal:
+                found.append(f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}')
+        if self.config.clock.mode == "lockstep":
+            why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
+            found += [f"what {host.board} {why}" for host in self.hosts if host.is_external]
         return found
 
     def check_realtime(self, segment: Segment) -> None:
@@ -224,7 +231,10 @@ class _Examined:
         failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
         tasks = tuple(self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks)
         hosts = tuple(self._host(ports) for ports in self._wiring.hosts)
-        return Resolved(config, layout, tasks, hosts, faults, requests(config, layout))
+        # A goal that the config states replaces that of the program.
+        rows = config.scene.objects.index
+        goals = {rows(goal.object): goal for goal in (*self._wiring.goals, *config.scene.goal)}
+        return Resolved(config, layout, tasks, hosts, faults, requests(config, layout), goals)
 
     def _host(self, ports: TaskPorts) -> HostWiring:
         config, name = self._config, ports.place.board
@@ -235,6 +245,7 @@ class _Examined:
             outputs=dict(ports.writes),
             context=self._context_of(name, 1, config.host[name].params),
             is_external=config.host[name].external,
+            computing=round(config.host[name].computing_ms * 1e6 / config.clock_ns),
         )
 
     def _task(self, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:

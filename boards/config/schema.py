@@ -21,7 +21,7 @@ from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
 from rack.levels.operator import NAME_BYTES, Goal, Operation
-from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table
+from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table, Vector
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
@@ -32,6 +32,7 @@ ANY_CORE = -1
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
+IdleCores = Literal["sleep", "awake"]
 OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
 
@@ -49,7 +50,6 @@ Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
-Vector = tuple[Finite, Finite, Finite]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
@@ -78,6 +78,11 @@ class ClockConfig(Table):
         "timer",
         description="how boards wait for their next cycle: timer: each sleeps to its own grid point; signal: until the "
         "clock wakes them; poll: busy-wait",
+    )
+    idle_cores: IdleCores = Field(
+        "sleep",
+        description="in real time, idle cores sleep or are held awake, which root alone may do; awake: wake-ups are "
+        "earlier by some 20 us on bare metal; a virtual machine may lose its cores for ms; see rack bench clock",
     )
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
@@ -249,6 +254,13 @@ class HostConfig(Table):
     below: Neighbours = Field((), description="bus adapter through which it reaches the levels; or a list")
     reads: dict[str, Sources] = Field({}, description="mailbox by port; overrides the program's own")
     params: dict[str, Any] = Field({}, description="parameters of the program, declared by its class")
+    computing_ms: float = Field(
+        0.0,
+        ge=0.0,
+        le=1e9,
+        description="in lockstep, simulated time from a wake-up until what it sends is passed on and it may be woken "
+        "again, ms; in real time its computing takes as long as it takes",
+    )
     restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board")
     restarts_within_s: Positive | None = Field(None, description="overrides supervision.within_s for this board, s")
 

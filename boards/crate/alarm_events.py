@@ -18,13 +18,16 @@ from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
 from rack.boards.config.commands import setting_name
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import Event, EventKind
+from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.describe import board_of, joint_name, subject_of
 from rack.boards.faults.describe import describe as describe_fault
 from rack.boards.operator import describe, level_of, message_of
+from rack.levels.messages import Error
 from rack.levels.operator import Operation
 
-About = Literal["task", "mailbox", "joint", "geom", "name", "nothing"]
+About = Literal["task", "mailbox", "joint", "geom", "name", "brakes", "nothing"]
+ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
+"""Why brakes engaged, where no error says it: by the subject of their alarm, from 0 down."""
 EMERGENCY_STOP = "emergency stop"
 ANOTHER_RACK = "another rack"
 
@@ -32,6 +35,7 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",
     Alarm.REJOINED: "recovery",
+    Alarm.FLOWS: "recovery",
     Alarm.DEMAND: "reaction",
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
@@ -51,6 +55,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.LATE: ("task", "'{subject}' missed its deadline: still running at its next release"),
     Alarm.PLAN_LATE: ("task", "'{subject}' missed its deadline: its plan was not finished"),
     Alarm.STARVED: ("task", "'{subject}' is not getting its core: {releases} missed since tick {since}"),
+    Alarm.FLOWS: ("mailbox", "'{subject}': messages flow again, {span} after a fault"),
     Alarm.STALE: ("mailbox", "'{subject}' is stale, {span}: its writer '{writer}' is dead or stopped"),
     Alarm.MUTE: ("mailbox", "'{subject}' is stale, {span}: '{writer}' is running but not writing"),
     Alarm.GAP: ("mailbox", "'{subject}': {messages} lost, gap in serials"),
@@ -75,7 +80,8 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
     Alarm.TENSION_LIMIT: ("joint", "tension of {subject} cut to its limit: {value:.3g} N was commanded"),
     Alarm.TENDON: ("joint", "tendon of {subject} is slack: {value:.3g} N"),
-    Alarm.BRAKES_OPENED: ("nothing", "brakes released after {span}"),
+    Alarm.BRAKES_CLOSED: ("brakes", "brakes engaged: {subject}"),
+    Alarm.BRAKES_OPENED: ("brakes", "brakes released after {span}"),
     Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
     Alarm.FORCE_LIMIT: ("nothing", "contact too strong: force of {value:.3g} N"),
@@ -162,10 +168,9 @@ class AlarmEvents:
             demand = Demand(int(value))
             subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
             kind, text = ("reaction" if demand else "recovery"), _demand(demand, subject)
-        elif alarm == Alarm.BRAKES_CLOSED:
-            subject, text = "", f"brakes engaged: no torque for {self._span(value)}" if value else "brakes engaged"
         else:
             subject, text = self._described(alarm, row, owner)
+            text += f" for {self._span(value)}" if alarm == Alarm.BRAKES_CLOSED and value else ""
             board = subject if alarm == Alarm.REJOINED else owner
         realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
         return Event(realtime_ns, int(row["tick"]), kind, board, text, code, fault, subject, value, int(since))
@@ -181,6 +186,8 @@ class AlarmEvents:
             subject = joint_name(number, self._joints)
         elif about == "name":
             subject = self._name(owner, number)
+        elif about == "brakes":
+            subject = Error(number).name.lower() if number > 0 else ENGAGED_BY[-number]
         elif about == "geom":
             subject, writer = self._geom(number), self._geom(int(value))
         elif about == "mailbox":

@@ -1,6 +1,6 @@
-"""The host boards of a run: started with it, restarted by the rack's policy, never waited for.
+"""The host boards of a run: started with it, restarted by the rack's policy, in real time never waited for.
 
-Their loss demands nothing of the arm, and no board waits for their return.
+Their loss demands nothing of the arm. The clock admits their return, as it does that of other boards.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from rack.backplane.process import STOPPED, state_of
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, System, TaskState
+from rack.backplane.words import Block, TaskState
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.recovery import Supervision
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
@@ -30,7 +30,6 @@ class HostBoards:
     ) -> None:
         self._segment, self._supervision, self._crate, self._journal = segment, supervision, crate, journal
         self._wirings = {wiring.board: wiring for wiring in wirings if not wiring.is_external}
-        self._lost: dict[str, int] = {}  # tick of the loss, until the new process runs
         self._stopped: set[str] = set()
 
     def start(self) -> None:
@@ -55,18 +54,14 @@ class HostBoards:
             block[Block.STATE] = TaskState.GIVEN_UP
             self._journal.add("reaction", end.name, f"gave up on '{end.name}'", "given_up")
             return False
-        self._lost[end.name] = end.tick
         self._crate.ask(PowerOn(end.name, self._wirings[end.name]))
         self._journal.add("reaction", end.name, str(restart), "restart")
         return True
 
     def look(self) -> None:
-        """Record returns, and end host boards that a signal has stopped: nothing else shows that one hangs."""
+        """End host boards that a signal has stopped: nothing else shows that one hangs."""
         for name in self._wirings:
             block = self._segment.block(name)
-            if name in self._lost and block[Block.STATE] == TaskState.RUNNING and not block[Block.LOST]:
-                ticks = self._segment.words[System.TICK] - self._lost.pop(name)
-                self._journal.add("recovery", name, f"'{name}' is back after {ticks} ticks", "rejoined", subject=name)
             if name not in self._stopped and state_of(block[Block.PID]) in STOPPED:
                 self._stopped.add(name)
                 text = f"'{name}' is not responding: stopped by a signal"

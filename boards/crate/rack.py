@@ -45,7 +45,7 @@ from rack.boards.crate.requests import (
     Preload,
 )
 from rack.boards.errors import CANNOT_GO_ON, ConfigError, LaunchError, Mistake
-from rack.boards.events import Cause, Ending, Event, Journal, Outcome
+from rack.boards.events import Cause, Ending, Event, Journal, Outcome, brakings
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import Entries
 
@@ -211,8 +211,7 @@ class Rack:
         while self.outcome is None:
             self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
             self._record_stop()
-            for line in self._line.printed():
-                self._journal.add("printed", "", line)
+            self._record_printed()
             for rung in self._alarms.drain():
                 self._act_on(rung)
             for board in self._heartbeat.hanging():
@@ -236,6 +235,10 @@ class Rack:
         self._cause = self._cause or "stopped"
         self.segment.words[System.STOP_REQUEST] = 1
         os.eventfd_write(self._line.attention, 1)
+
+    def _record_printed(self) -> None:
+        for line in self._line.printed():
+            self._journal.add("printed", "", line)
 
     def _record_stop(self) -> None:
         if self._why_stopped and self._stop_by is None:
@@ -298,6 +301,10 @@ class Rack:
             self._give_up(end.name, text)
             return
         is_final = end.status == CANNOT_GO_ON
+        if is_final:
+            # It has printed the reason.
+            self._record_printed()
+            text = next((e.text for e in reversed(self.events) if e.text.startswith(f"board '{end.name}': ")), text)
         restart = self._recovery.lose(end.name, end.tick, is_final)
         if restart is None:
             self._is_beyond_help = end.name == CLOCK
@@ -319,10 +326,27 @@ class Rack:
         state, reason = self._ending.final_state()
         # A stop may also come from another process, by a word in the segment.
         cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._ending.cause())
+        tick_ms = self.config.clock_ns * 1e-6
+        found = brakings(self.events, stop, tick_ms)
         if cause in ("task done", "time over"):
             self._faults += self._ending.latched()
+        if cause == "time over":
+            self._faults += self._ending.held(self.events, found, stop * tick_ms)
+        objects = self._ending.ends(self._plan.goals)
+        if cause == "task done":
+            # Written so that NaN is too far.
+            self._faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self._end_boards()
-        self.outcome = Outcome(cause, stop, state, reason, digest(self.segment, stop), tuple(self._faults))
+        self.outcome = Outcome(
+            cause=cause,
+            ticks=stop,
+            state=state,
+            reason=reason,
+            digest=digest(self.segment, stop),
+            faults=tuple(self._faults),
+            brakings=found,
+            objects=objects,
+        )
         self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
 
     def close(self) -> None:

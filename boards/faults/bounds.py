@@ -1,4 +1,7 @@
-"""Detection bounds: the ticks within which a fault must be detected, counted from the tick at which it first acts.
+"""Detection bounds: the ticks within which a fault must be detected, counted from the tick at which it first shows.
+
+Most faults show as soon as they act. One of the arm may act at first by less than friction, a contact or a creeping
+joint hides: no detector can tell it from a sound arm, so until then no bound runs.
 
 A bound is a sum of terms. Each term has a text and computes its ticks: one source for help, judgement and tests.
 A cycle is that of the affected task; a planner's is its time slice. A message is delivered at its reader's first read
@@ -38,6 +41,12 @@ def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
     return max((box.delay + between_reads(layout, box, reader) for box in boxes for reader in box.readers), default=0)
 
 
+def struck_mailboxes(layout: Layout, at: int, board: str) -> tuple[MailboxSpec, ...]:
+    """Return the mailboxes that a fault of a task concerns: that with index `at`; -1: all that it writes."""
+    chosen = layout.mailboxes if at < 0 else layout.mailboxes[at : at + 1]
+    return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
+
+
 def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
     """Return the longest time between a task's reads of a mailbox, in ticks."""
     return max(cycle_ticks(layout, reader), layout.read_grid(mailbox, reader).every)
@@ -60,9 +69,8 @@ class BoundCase:
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
         """The affected mailboxes that the reader reads; without a `reader`, those that any task reads."""
-        at, reader = self.injection.mailbox, self.reader
-        chosen = self.layout.mailboxes if at < 0 else self.layout.mailboxes[at : at + 1]
-        return tuple(m for m in chosen if m.writer == self.board and (reader in m.readers if reader else m.readers))
+        struck, reader = struck_mailboxes(self.layout, self.injection.mailbox, self.board), self.reader
+        return tuple(m for m in struck if (reader in m.readers if reader else m.readers))
 
     @property
     def is_planner(self) -> bool:
@@ -157,8 +165,15 @@ def delayed(parameter: str) -> Bound:
 
 
 def skipped(parameter: str) -> Bound:
-    """Return a bound of as many ticks as the parameter says; the first tick that is not skipped shows the fault."""
-    return Bound("the next tick", lambda case: int(case.parameters[parameter]))
+    """Return the bound of a skip of as many ticks as the parameter says.
+
+    The fastest boards find it in their next cycle; a release that was skipped comes in the first tick that is not.
+    """
+
+    return Bound(
+        "the next cycle of the fastest boards",
+        lambda case: max(int(case.parameters[parameter]), min(task.every for task in case.layout.tasks) - 1),
+    )
 
 
 def by_rack_or(count: int) -> Bound:

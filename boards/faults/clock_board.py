@@ -12,18 +12,20 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 
 from rack.backplane.clock.driver import ClockDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
-from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.faults.bounds import struck_mailboxes
+from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import KINDS
-from rack.boards.faults.messages import forge
+from rack.boards.faults.messages import Babble, forge
 
 OPEN = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
@@ -42,20 +44,19 @@ class StruckRack:
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
         self.segment, self.driver = segment, driver
         self.clock = SystemClock(segment)
-        # The clock neither releases host boards nor waits for them, but faults strike their processes.
-        self._struck = [*driver.tasks, *(ReleasedTask(segment, host) for host in segment.layout.hosts)]
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
         """Return the task, or host board, that a fault strikes; None: the clock."""
-        return next((task for task in self._struck if task.index == entry[Entry.TASK]), None)
+        return next((task for task in self.driver.processes if task.index == entry[Entry.TASK]), None)
 
     def send(self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals) -> bool:
         """Send a signal to a task's process; return False if there is no such process."""
         pid = task.block[Block.PID]
-        # A host board whose program is done, or which a replay does without, has no process.
-        if task.lost_tick >= 0 or pid <= 0:
+        # A host board whose program is done, or given up, or which a replay does without, has no process; the crate may
+        # not have seen yet that one has ended.
+        if task.lost_tick >= 0 or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
             return False
-        entry.acted(tick, time.monotonic_ns())
+        entry.acted(tick)
         try:
             os.kill(pid, number)
         except ProcessLookupError:
@@ -87,7 +88,7 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
     if task is None:
         # The clock kills itself: its successor finds the entry struck.
-        entry.acted(tick, time.monotonic_ns())
+        entry.acted(tick)
         os.kill(os.getpid(), signal.SIGKILL)
         return
     # The crate marks the task lost, then counts the loss. The system controller acts on the count: wait for both.
@@ -101,6 +102,9 @@ def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
     if task is not None and rack.send(entry, tick, task, signal.SIGSTOP):
         task.is_stopped = True
+        if task.spec.role == "host":
+            # The Rack ends its process some time; lockstep waits for that here.
+            rack.driver.await_state(task, lambda: task.lost_tick >= 0)
 
 
 def _continue(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
@@ -118,22 +122,23 @@ def _is_lost(rack: StruckRack, entry: FaultEntry) -> bool:
 
 
 def _masquerade(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
-    entry.acted(tick, time.monotonic_ns())
+    entry.acted(tick)
     forge(rack.segment, rack.segment.layout.mailboxes[entry[Entry.MAILBOX]].name, tick)
 
 
 def _stop_clock(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
-    entry.acted(tick, time.monotonic_ns())
+    entry.acted(tick)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
 def _skip(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
-    entry.acted(tick, time.monotonic_ns())
+    entry.acted(tick)
     rack.driver.skip = int(entry.parameters[0])
+    rack.driver.count_skipped(tick, rack.driver.skip)
 
 
 def _delay(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
-    entry.acted(tick, time.monotonic_ns())
+    entry.acted(tick)
     part = random.Random(entry[Entry.SEED] + tick).uniform(LEAST_LATE, entry.parameters[0])
     until = rack.clock.time_of(tick) + int(part * rack.clock.period_ns)
     # A tick is delayed by less than a tick period, so the grid itself stays.
@@ -156,17 +161,22 @@ def _step(entry: FaultEntry) -> ClockStep:
 
 
 class FaultStage:
-    """Begins and ends faults at ticks, before any task of the tick is released.
+    """Begins and ends faults at ticks, before any task of the tick is released; sees messages flow again after them.
 
     In real time a fault with a phase strikes within its tick, after the releases. There is nothing to do in a tick if
-    no fault is `open` (waiting or active) and none but the first `injected` ones have come.
+    no fault is `open` (waiting or active), none but the first `injected` ones have come, and no messages are `awaited`:
+    by mailbox, as an index, the tick from which one must be.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
         self._segment, self._words = segment, segment.words
         self._rack, self._table, self._alarms = StruckRack(segment, driver), FaultTable(segment), driver.alarms
-        self._observers: dict[int, Reader] = {}
+        self._observer = cache(lambda box: open_observer(segment, segment.layout.mailboxes[box].name))
         self.injected = 0
+        self.awaited: dict[int, int] = {}
+        for entry in self._table.staged((Stage.OVER,)):
+            # A restarted clock does not know what its predecessor has seen.
+            self._await_messages(entry)
         self.open: list[FaultEntry] = []
         self._phased: list[FaultEntry] = []
 
@@ -186,6 +196,13 @@ class FaultStage:
         for entry in self.open:
             if entry.stage == Stage.ACTIVE:
                 _step(entry).during(self._rack, entry, tick)
+        acting = [KINDS[entry[Entry.KIND]].step for entry in self.open if entry.stage == Stage.ACTIVE]
+        self._rack.driver.is_flooded = Babble in acting
+        for box, since in list(self.awaited.items()):
+            observer = self._observer(box)
+            if observer.read(tick - 1).is_there and observer.newest >= since:
+                del self.awaited[box]
+                self._alarms.ring(tick, Alarm.FLOWS, box, tick - since, since)
 
     def within(self, tick: int) -> None:
         """Let the faults with a phase in `tick` strike at their times; call it after the releases."""
@@ -210,12 +227,9 @@ class FaultStage:
         """
         if entry[Entry.WHEN_BOX] < 0:
             return entry[Entry.FROM] <= tick
-        box = entry[Entry.WHEN_BOX]
-        spec = self._segment.layout.mailboxes[box]
-        if box not in self._observers:
-            self._observers[box] = open_observer(self._segment, spec.name)
-        reading = self._observers[box].read(tick - 1)
-        field = spec.fields[entry[Entry.WHEN_FIELD]].name
+        observer = self._observer(entry[Entry.WHEN_BOX])
+        reading = observer.read(tick - 1)
+        field = observer.spec.fields[entry[Entry.WHEN_FIELD]].name
         return reading.is_there and int(getattr(reading.value, field)) == entry[Entry.WHEN_VALUE]
 
     def _begin(self, entry: FaultEntry, tick: int) -> None:
@@ -235,6 +249,15 @@ class FaultStage:
 
     def _finish(self, entry: FaultEntry, tick: int) -> None:
         entry.words[Entry.STAGE] = Stage.OVER
+        # Some end early: they strike once, or have lost their object.
+        entry.words[Entry.UNTIL] = min(entry[Entry.UNTIL], tick)
         self._words[System.FAULTS] += 1
         _step(entry).end(self._rack, entry, tick)
         self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry[Entry.COUNT])
+        self._await_messages(entry)
+
+    def _await_messages(self, entry: FaultEntry) -> None:
+        layout = self._segment.layout
+        if KINDS[entry[Entry.KIND]].takes_mailbox:
+            for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board_of(entry, layout)):
+                self.awaited[layout.mailboxes.index(box)] = entry[Entry.UNTIL]

@@ -20,7 +20,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import PARAMETERS, FaultEntry, Injection
 from rack.backplane.layout import Layout
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks
+from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, struck_mailboxes
 from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
@@ -146,7 +146,7 @@ class Kind:
         return {p.name: value for p, value in zip(self.parameters, entry.parameters, strict=False)}
 
     def bound_ticks(self, injection: Injection, layout: Layout, reader: str | None = None) -> int | None:
-        """Return the bound from the tick at which a fault first acts to its detection, ticks; None: no bound.
+        """Return the bound from the tick at which a fault first shows to its detection, ticks; None: no bound.
 
         `reader` is the task that detects it; None: the first to do so, for a death the Rack. A mailbox without readers
         has no bound.
@@ -157,13 +157,15 @@ class Kind:
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
     def recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
-        """Return the time from the end of a fault, or its detection, within which all reactions must be undone, ticks.
+        """Return the time from the end of a fault, or its detection, within which all is well again, ticks.
 
         `restart_s`: simulated time that a restart may take. A restarted board rejoins at its next release; the executor
-        of a restarted planner continues with its first plan.
+        of a restarted planner continues with its first plan. Messages flow again with the next one of each mailbox.
         """
         ends = self.consequence.ends_process
         cycle = cycle_ticks(layout, board) if ends and board != CLOCK else 0
+        if self.takes_mailbox:
+            cycle += max((box.every + box.delay for box in struck_mailboxes(layout, -1, board)), default=0)
         return cycle + ceil((self.consequence.recovery_s + ends * restart_s) * 1e9 / layout.clock_ns)
 
 

@@ -10,7 +10,6 @@ import os
 import random
 import signal
 from collections.abc import Callable, Sequence
-from time import monotonic_ns
 from typing import NamedTuple
 
 from rack.backplane.fault_table import Entry, FaultEntry
@@ -67,7 +66,7 @@ class MessageStep:
 
     def acts(self, message: Outgoing) -> None:
         """Count that the fault acts, in the cycle that writes the message."""
-        self.entry.acted(message.at, monotonic_ns())
+        self.entry.acted(message.at)
 
     def chance(self, message: Outgoing) -> random.Random:
         """Return the random generator for a message."""

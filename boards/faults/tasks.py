@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic_ns
 from typing import TYPE_CHECKING, Protocol, cast
@@ -40,7 +40,7 @@ class ExtraComputing:
     def burn(self, tick: int) -> None:
         """Compute until the time that the step returns."""
         now = monotonic_ns()
-        self.entry.acted(tick, now)
+        self.entry.acted(tick)
         end = self.until(self, tick, now)
         while monotonic_ns() < end:
             pass
@@ -111,11 +111,10 @@ class TaskFaults:
         for load in self.loads:
             load.burn(tick)
 
-    def count(self, places: Sequence[int], tick: int) -> None:
-        """Count that the arm's faults at these indices of the injected sequence have acted."""
-        now = monotonic_ns()
-        for place in places:
-            self._arm[place].acted(tick, now)
+    def count(self, acted: Mapping[int, bool], tick: int) -> None:
+        """Note what the arm's faults have done in a cycle: see `Executor.acted`."""
+        for place, shows in acted.items():
+            self._arm[place].acted(tick, shows)
 
 
 def take_core(segment: Segment, entry: FaultEntry) -> None:
@@ -134,7 +133,7 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
         # passed, or the run has not started, sleep briefly: at this priority a busy wait would starve all others.
         time.sleep(min(wait_ns * 1e-9 if wait_ns > 0 else LEAST_S, LOOK_S))
     end = clock.time_of(entry[Entry.UNTIL])
-    entry.acted(clock.now(), time.monotonic_ns())
+    entry.acted(clock.now())
     while time.monotonic_ns() < end and not clock.is_stopped:
         pass
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -37,6 +37,7 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int) -> int:
     bus = _opened(segment, wiring)
     os.eventfd_write(attention, 1)
     try:
+        bus.await_turn()
         # Imported here, not in the crate: a program may import anything, and the crate must stay single-threaded.
         find_class(wiring.target, HostProgram)(wiring.context).run(bus)
     except SystemExit as end:

@@ -14,20 +14,26 @@ from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.wiring import HostWiring
 
 COMMAND_ID = "id"
 WORD = 8
+LONGEST_S = 1e9
 _Port = TypeVar("_Port")
 
 
 class HostBus:
-    """The ports of one host board. Opening it claims the board: a second process is refused with `MailboxError`."""
+    """The ports of one host board. Opening it claims the board: a second process is refused with `MailboxError`.
+
+    A paced program runs in turns, in lockstep, while its adapter waits: see `rack.boards.adapters.bus_adapter`.
+    """
 
     def __init__(self, segment: Segment, wiring: HostWiring) -> None:
-        self._segment, self._words = segment, segment.words
+        self._segment, self._words, self._wiring = segment, segment.words, wiring
+        layout = segment.layout
+        self._is_paced = self._words[System.LOCKSTEP] and layout.pacers(layout.task(wiring.board))
         self.block = segment.block(wiring.board)
         self._claim = _claim(segment, wiring.board)
         self._inlets = {port: HostInlet(segment, mailbox) for port, mailbox in wiring.inputs.items()}
@@ -40,13 +46,18 @@ class HostBus:
             raise
         self._semaphore = wake_semaphore(segment.rack, wiring.board)
         self.block[Block.PID] = os.getpid()
-        self.block[Block.LOST] = 0
+        self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
 
     @property
     def tick(self) -> int:
-        """The clock's tick."""
-        return self._words[System.TICK]
+        """The clock's tick; of a paced program that of the cycle in which it runs."""
+        return self.block[Block.RELEASED] if self._is_paced else self._words[System.TICK]
+
+    @property
+    def time_s(self) -> float:
+        """Time since some moment, s: of a paced program simulated time."""
+        return self.tick * self._wiring.context.tick_s if self._is_paced else time.monotonic()
 
     @property
     def is_over(self) -> bool:
@@ -55,6 +66,12 @@ class HostBus:
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until a message arrives; False when none has after the timeout, or when the run ends."""
+        if self._is_paced:
+            ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
+            self.block[Block.WAITS_UNTIL] = self.tick + max(1, ticks)
+            self._end_turn()
+            self.await_turn()
+            return not self.block[Block.WAITS_UNTIL]
         deadline = time.monotonic() + timeout_s
         while not self.is_over:
             left = deadline - time.monotonic()
@@ -63,6 +80,20 @@ class HostBus:
             if left <= CHECK_S:
                 return False
         return False
+
+    def await_turn(self) -> None:
+        """Wait until the program may run, or the run ends. In real time it always may."""
+        block = self.block
+        # The clock admits the successor of a lost process. Read first: it clears this word last.
+        while self._is_paced and (block[Block.LOST] or block[Block.DONE] == block[Block.RELEASED]) and not self.is_over:
+            self._semaphore.acquire(CHECK_S)
+
+    def _end_turn(self) -> None:
+        """Let the adapter go on."""
+        block = self.block
+        block[Block.DEADLINE] = self.tick + self._wiring.computing
+        block[Block.DONE] = block[Block.RELEASED]
+        done_semaphore(self._segment.rack, self._wiring.board).release()
 
     def read(self, port: str) -> Reading:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the mailbox keeps them."""
@@ -112,6 +143,8 @@ class HostBus:
     def finish(self) -> None:
         """Declare the program's work done, as its return does."""
         self.block[Block.STATE] = TaskState.ENDED
+        if self._is_paced:
+            self._end_turn()
 
     def close(self) -> None:
         """Give the board up: another process may open it."""
@@ -137,16 +170,12 @@ class HostInlet:
 
 
 def _claim(segment: Segment, board: str) -> ByteLock:
-    claim = ByteLock(segment, _claim_address(segment, board))
+    claim = ByteLock(segment, segment.map.blocks[board] + WORD * Block.PID)
     if not claim.take():
         claim.close()
         pid = segment.block(board)[Block.PID]
         raise MailboxError(f"host board '{board}' is run by process {pid} already; permitted: one")
     return claim
-
-
-def _claim_address(segment: Segment, board: str) -> int:
-    return segment.map.blocks[board] + 8 * Block.PID
 
 
 def _of(ports: Mapping[str, _Port], port: str) -> _Port:

@@ -99,10 +99,10 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
     """Take the processor and run the system clock."""
     pin(wiring.core)
-    is_realtime = set_priority(wiring.priority) and wiring.priority > 0
+    set_priority(wiring.priority)
     # Not touched: every board waits for the clock's start, and its lead over the grid has room for a page fault.
     lock_memory()
-    with cores_kept_awake() if is_realtime else nullcontext():
+    with cores_kept_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention)
     return 0
 

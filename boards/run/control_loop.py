@@ -22,7 +22,7 @@ from rack.boards.run.task import ClockGuard, Task, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
-_DEMAND, _DEMANDS = int(System.DEMAND), tuple(Demand)
+_DEMAND, _CLOCK_SKIPPED, _DEMANDS = int(System.DEMAND), int(System.CLOCK_SKIPPED), tuple(Demand)
 
 
 class VirtualControlLoop(Task):
@@ -42,7 +42,7 @@ class VirtualControlLoop(Task):
     def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
-        self._guard = ClockGuard(segment, self.alarms, self.spec.every) if wiring.guards_clock else None
+        self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
         self._has_cycled = False
         self._due = segment.layout.due(self.spec)
         times = wiring.transfer
@@ -76,6 +76,9 @@ class VirtualControlLoop(Task):
         watch.start(tick, self.next_cycle.skipped)
         if watch.is_late:
             self._handle_delay(tick)
+        guard = self._guard
+        if guard is not None and self.words[_CLOCK_SKIPPED] != guard.reported:
+            guard.report_skipped(tick)
         if self.inputs.reads_plan:
             self.exchange(tick)
             watch.plan_ns = monotonic_ns()
@@ -92,7 +95,7 @@ class VirtualControlLoop(Task):
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since, self._has_cycled = tick, True
         if self._guard is not None:
-            self._guard.check(tick, self.next_cycle.skipped)
+            self._guard.check_release(tick)
 
     def process(self, tick: int) -> None:
         """Let the level process, given the demand on the arm; then report its findings and the faults that acted."""

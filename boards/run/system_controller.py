@@ -44,7 +44,7 @@ class SystemController:
     def begin(self, tick: int) -> None:
         """Do the work due before the tasks of `tick` are released."""
         words, faults, desk = self._words, self._faults, self._desk
-        if faults.open or words[_INJECTED] != faults.injected:
+        if faults.open or faults.awaited or words[_INJECTED] != faults.injected:
             faults.advance(tick)
         if desk.waiting or words[_REQUESTED] != desk.requested:
             desk.advance(tick)
@@ -59,10 +59,11 @@ class SystemController:
         """Let restarted boards rejoin, latch for those given up, and set the demand for all other losses."""
         words = self._words
         seen = words[_LOSSES], self._driver.watchdog.losses
-        lost = [task for task in self._driver.tasks if task.lost_tick >= 0]
-        for task in lost:
-            self._handle_loss(task, tick)
-        lost = [task for task in lost if task.lost_tick >= 0]
+        processes = self._driver.processes
+        for task in processes:
+            if task.lost_tick >= 0:
+                self._handle_loss(task, tick)
+        lost = [task for task in processes if task.lost_tick >= 0]
         # Read before they are acted on: a change in between is handled at the next tick.
         emergency, peer = words[_EMERGENCY], words[_PEER_STOP]
         self._set_demand(lost, tick)
@@ -79,6 +80,10 @@ class SystemController:
             self._driver.settle()
             task.rejoin()
             self._driver.alarms.ring(tick, Alarm.REJOINED, task.index, away)
+        elif task.is_given_up and task.spec.role == "host":
+            # From this tick on its adapter reports that.
+            self._driver.settle()
+            task.rejoin()
         elif task.is_given_up:
             # Even if the latch is already set, as it is before the start.
             self._words[_EMERGENCY] = 1
@@ -192,5 +197,7 @@ def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: A
     """Return the clock driver for the run's mode."""
     if not wiring.lockstep:
         return RealtimeDriver(segment, ended, alarms)
-    at_once = not all(mailbox.is_repeatable for mailbox in segment.layout.mailboxes)
-    return LockstepDriver(segment, ended, at_once, wiring.history, alarms)
+    layout = segment.layout
+    one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
+    one_at_a_time |= any(len(layout.pacers(host)) > 1 for host in layout.hosts)
+    return LockstepDriver(segment, ended, one_at_a_time, wiring.history, alarms)

@@ -22,8 +22,8 @@ from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
 # Plain integers for the hot path.
-_FAULTS, _TICK_NS, _TICK, _CLOCK_SKIPPED = (
-    int(word) for word in (System.FAULTS, System.TICK_NS, System.TICK, System.CLOCK_SKIPPED)
+_FAULTS, _TICK_NS, _TICK, _CLOCK_SKIPPED, _SKIPPED_FROM = (
+    int(System[name]) for name in ("FAULTS", "TICK_NS", "TICK", "CLOCK_SKIPPED", "SKIPPED_FROM")
 )
 PUNCTUAL_TICKS = 20
 """Number of punctual ticks that ends an episode of late ones."""
@@ -83,27 +83,33 @@ class Task(ABC):
 
 
 class ClockGuard:
-    """A fast task's check of the clock, whenever a cycle begins late: did the clock release it late, or skip ticks?
+    """A fast task's check of the clock: has it skipped ticks and, if a cycle begins late, has it released it late?
 
-    A missing release counts as skipped by the clock, not by the task, if the clock has counted it as skipped.
+    Most skips cost a task that does not cycle in every tick no release, and make none of its cycles late: only the
+    clock's count shows them. `reported`: how much of it this task has reported, in this process or before a restart.
     """
 
-    def __init__(self, segment: Segment, alarms: AlarmWriter, every: int) -> None:
-        self._words = segment.words
+    def __init__(self, segment: Segment, alarms: AlarmWriter, block: memoryview) -> None:
+        self._words, self._block = segment.words, block
         self._clock = SystemClock(segment)
-        self._alarms, self._every = alarms, every
+        self._alarms = alarms
         self._late_ns = self._clock.period_ns // 2
-        self._skipped = self._words[_CLOCK_SKIPPED]
+        self.reported = self._block[Block.CLOCK_SKIPPED]
         self._quiet_from = 0
 
-    def check(self, tick: int, skipped: int) -> None:
-        """Check the clock in the cycle released at `tick`, after `skipped` missed releases."""
+    def report_skipped(self, tick: int) -> None:
+        """Report the ticks skipped since the last report, in the cycle released at `tick`."""
         words = self._words
-        # Ticks skipped earlier cost the task no release.
-        by_clock = min(words[_CLOCK_SKIPPED] - self._skipped, skipped * self._every)
-        self._skipped = words[_CLOCK_SKIPPED]
-        if by_clock:
-            self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=by_clock, since=tick - by_clock)
+        since = words[_SKIPPED_FROM]
+        # A task may begin so late that the clock has skipped ticks since its release: that is for its next cycle.
+        if tick >= since:
+            counted = words[_CLOCK_SKIPPED]
+            self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since)
+            self.reported = self._block[Block.CLOCK_SKIPPED] = counted
+
+    def check_release(self, tick: int) -> None:
+        """Check whether the clock was late, in a cycle released at `tick` that begins late."""
+        words = self._words
         late_ns = words[_TICK_NS] - self._clock.time_of(tick)
         # Checked after the read: the time is this tick's only if the clock has not advanced meanwhile.
         if self._clock.is_lockstep or words[_TICK] != tick:

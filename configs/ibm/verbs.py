@@ -1,80 +1,31 @@
-"""The programming side: verbs that start and stop motions, and new verbs made of them.
+"""The programming side: verbs that start motions on the real-time side, and a new verb made of two of them.
 
-A verb is started, runs on the real-time side, and ends or is stopped. `GuardedLine` is made of two others, without a
-change to either: a line, and a guard that watches a sensor through the bridge and stops the line.
+`guarded_line` is a line and a guard, without a change to either; the guard travels with the line's request.
 """
 
-from collections import deque
-from collections.abc import Callable, Sequence
-
-import numpy as np
+from collections.abc import Sequence
 
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.joint_messages import ARM_STATUS
 from rack.levels.level import Input
 from rack.levels.trajectory.commands import Motions
-from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS
+from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, RequestEnd
 
-PRESSED, WINDOW = 6.0, 12
-"""Change of a joint's torque that counts as touch, N m, and the samples within which it must happen."""
-STEADY = 0.15
-"""Part of a guarded move that it needs to reach its speed."""
+PRESSED = 6.0
+"""Change of a joint's torque that counts as touch, N m."""
+LEAST = 0.01
+"""Opening of the gripper below which it holds no block, m."""
 PLACE = (0.70, 0.30)
 """Where the blocks go, m."""
 SLOW = 0.03
 """Speed of a guarded move, m/s."""
 
 
-class Verb:
-    """A motion on the real-time side: started, then running until it ends or is stopped."""
-
-    def __init__(self, motions: Motions, begin: Callable[[], int]) -> None:
-        self.motions, self._begin = motions, begin
-        self.request = 0
-
-    def start(self) -> "Verb":
-        """Start it: the motion is queued, and begins when those before it have ended."""
-        self.request = self._begin()
-        return self
-
-    def stop(self) -> None:
-        """Stop it, with all that is queued: the arm ramps to rest."""
-        self.motions.wait(self.motions.cancel())
-
-    def run(self) -> None:
-        """Start it, and wait for its end."""
-        self.start().motions.wait(self.request)
-
-
-class Guard:
-    """Watches the arm's torques, which pass the bridge in every fourth of its cycles, during one motion."""
-
-    def __init__(self, bus: Bus, request: int) -> None:
-        self._bus, self._request = bus, request
-        self._past: deque[np.ndarray] = deque(maxlen=WINDOW)
-
-    def is_pressed(self) -> bool:
-        """Return whether a torque has just changed by more than slow motion explains."""
-        motion, sensors = self._bus.read("motion").value, self._bus.read("sensors")
-        if motion.current != self._request or motion.progress < STEADY or not sensors.is_new:
-            return False
-        self._past += [np.array(message.torque) for message in (*sensors.earlier, sensors.value)]
-        return len(self._past) == WINDOW and bool(np.abs(self._past[-1] - self._past[0]).max() > PRESSED)
-
-
-class GuardedLine:
-    """A new verb: a line of the tool that stops where the arm meets something."""
-
-    def __init__(self, line: Verb, bus: Bus) -> None:
-        self._line, self._bus = line, bus
-
-    def run(self) -> bool:
-        """Run the line under guard; return whether it was stopped."""
-        guard = Guard(self._bus, self._line.start().request)
-        touched = not self._line.motions.wait(self._line.request, until=guard.is_pressed)
-        if touched:
-            self._line.stop()
-        return touched
+def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> bool:
+    """Move the tool along a line that ends where the arm meets something; return whether it did."""
+    line = motions.line(goal, guard=PRESSED, segment=seconds)
+    motions.wait(line)
+    return motions.end_of(line) is RequestEnd.GUARDED
 
 
 class Assembly(HostProgram):
@@ -87,22 +38,24 @@ class Assembly(HostProgram):
         """Carry both blocks."""
         motions = Motions(bus, self.context.robot, self.context.scene)
         for block in ("block1", "block2"):
-            self._fetch(motions, block)
-            touched = self._lower(motions, bus, PLACE)
+            self._fetch(motions, bus, block)
+            touched = self._lower(motions)
+            motions.wait(motions.release())
             print(f"{block}: {'touched at' if touched else 'no touch down to'} {motions.where()[2]:.4f} m")
-            motions.release()
-            Verb(motions, lambda: motions.line((*PLACE, 0.70))).run()
+            motions.wait(motions.line((*PLACE, 0.70)))
         motions.wait(motions.move())
 
-    def _fetch(self, motions: Motions, block: str) -> None:
+    def _fetch(self, motions: Motions, bus: Bus, block: str) -> None:
         motions.release()
         motions.line((0.0, 0.0, 0.15), body=block)
         motions.line((0.0, 0.0, 0.0), body=block)
-        motions.grip()
+        motions.wait(motions.grip())
+        opening = bus.read("sensors").value.opening
+        if opening < LEAST:
+            raise RuntimeError(f"{block}: the gripper closed to {1e3 * opening:.1f} mm, on nothing")
         motions.wait(motions.line((0.0, 0.0, 0.20), body=block))
 
-    def _lower(self, motions: Motions, bus: Bus, place: Sequence[float]) -> bool:
-        above, below = (*place, 0.62), (*place, 0.44)
-        Verb(motions, lambda: motions.line(above)).run()
-        line = Verb(motions, lambda: motions.line(below, segment=(above[2] - below[2]) / SLOW))
-        return GuardedLine(line, bus).run()
+    def _lower(self, motions: Motions) -> bool:
+        above, below = (*PLACE, 0.62), (*PLACE, 0.44)
+        motions.wait(motions.line(above))
+        return guarded_line(motions, below, (above[2] - below[2]) / SLOW)

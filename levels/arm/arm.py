@@ -23,8 +23,6 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig, named_class
 
-PATIENCE_CYCLES = 2
-"""Torque cycles for which motors keep the last command when none comes; then the brakes engage."""
 TORQUE_MARGIN = 1.001
 """Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits itself."""
 
@@ -62,7 +60,8 @@ class Arm(Plant, ABC):
     def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
         """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is for random noise."""
         super().__init__(cell)
-        self.patience = PATIENCE_CYCLES * every  # ticks without a command after which the brakes must engage
+        # Ticks without a command after which the brakes must engage.
+        self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
         self.waited = self.patience
         self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
         self.grip_force = 0.0  # N: given to the gripper last

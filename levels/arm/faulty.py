@@ -27,9 +27,9 @@ TURNS_FROM = 5.0 * FRICTION_SPEED
 
 
 class FaultyLink:
-    """Implements `Link` with injected faults. `acted` collects the indices of those that act, for `Executor.acted`."""
+    """Implements `Link` with injected faults. `acted` collects those that act, for `Executor.acted`."""
 
-    def __init__(self, arm: Arm, cell: Cell, every: int, acted: list[int]) -> None:
+    def __init__(self, arm: Arm, cell: Cell, every: int, acted: dict[int, bool]) -> None:
         """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell."""
         self._arm, self._every, self._acted = arm, every, acted
         self._limits = limits = cell.bounds.torque
@@ -48,6 +48,7 @@ class FaultyLink:
         active = [
             ActiveFault(place, fault, self._joints(fault), self._every, self._kept)
             for place, fault in enumerate(faults)
+            if self._joints(fault).any()
         ]
         for gone in self._kept.keys() - {a.key for a in active}:
             del self._kept[gone]
@@ -70,9 +71,9 @@ class FaultyLink:
         """Return the newest sample with the faults applied."""
         sample = self._arm.sense()
         for step, active in self._sensors:
-            sample, acts = step.act(sample, active)
-            if acts:
-                self._acted.append(active.place)
+            sample, shows = step.act(sample, active)
+            if shows is not None:
+                self._acted[active.place] = shows
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
@@ -84,8 +85,9 @@ class FaultyLink:
             asked = np.abs(self._arm.torque)
             hidden = self._hidden + self._pushed()
             for part, active in self._motors:
-                if (asked - part * self._limits > hidden)[active.joints].any():
-                    self._acted.append(active.place)
+                missing = (asked - part * self._limits)[active.joints]
+                if (missing > 0.0).any():
+                    self._acted[active.place] = bool((missing > hidden[active.joints]).any())
         return found
 
     def _pushed(self) -> Array | float:
@@ -100,5 +102,5 @@ class FaultyLink:
         np.copyto(corrupt, torque)
         for step, active in self._commands:
             np.copyto(corrupt, step.act(torque, self._limits, active), where=active.joints)
-            self._acted.append(active.place)
+            self._acted[active.place] = True
         return corrupt

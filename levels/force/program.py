@@ -12,7 +12,7 @@ from pydantic import Field
 from rack.levels.algebra import Array, norm
 from rack.levels.force.contact import AXIS_NAMES, Axis, misfit
 from rack.levels.level import Program
-from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
+from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, Vector
 
 MAX_COSINE = 1e-3
 """Axes that are closer to a right angle than this span a frame."""
@@ -21,8 +21,8 @@ MAX_COSINE = 1e-3
 class FrameConfig(Table):
     """`[task.frame.<name>]`: a task frame by two of its axes, in the world's frame, of any length."""
 
-    x: tuple[Finite, Finite, Finite] = Field(description="its x axis")
-    z: tuple[Finite, Finite, Finite] = Field(description="its z axis, at a right angle to x")
+    x: Vector = Field(description="its x axis")
+    z: Vector = Field(description="its z axis, at a right angle to x")
 
     def objection(self) -> str:
         """Return why the axes are no frame; empty: they are one."""

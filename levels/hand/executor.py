@@ -53,7 +53,7 @@ class HandExecutor(Executor):
         if cell.hand is None:
             raise LevelError("robot.hand is missing: this board drives a hand")
         self.hand = SimulatedHand(cell, context.scene, context.clock_ns, context.every, context.seed)
-        self.tensions = Tensions(context, cell.hand)
+        self.tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
         self._started = False  # the first cycle has begun
         self._closed_at: int | None = 0  # tick of the first status that said so; None: the valves are open
@@ -61,7 +61,7 @@ class HandExecutor(Executor):
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
         self._wrong: Alarm | None = None  # last cycle's finding about a tension
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
-        self._torn: tuple[int, ...] = ()  # indices of the injected faults that tear tendons
+        self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
         self._shown: tuple[Any, ...] | None = None  # what seldom changes, in the last status
 
     @classmethod
@@ -95,7 +95,7 @@ class HandExecutor(Executor):
         for fault, own in zip(faults, struck, strict=True):
             torn[int(fault.parameters["side"])] |= own
         self.hand.tear(torn)
-        self._torn = tuple(place for place, own in enumerate(struck) if own.any())
+        self._torn = {place: True for place, own in enumerate(struck) if own.any()}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
@@ -108,7 +108,7 @@ class HandExecutor(Executor):
             self.orders.take(read.operator)
         sample = hand.sense()
         self.findings += self._slack.look(sample.tension, hand.wanted)
-        self.acted += self._torn
+        self.acted |= self._torn
         self._drive(read, tick)
         self._report(write.status, sample, tick)
         self.orders.report(write.status, self.tensions.rests_on)

@@ -8,11 +8,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rack.levels.level import Program
-from rack.levels.tables import Finite, HandConfig, Positive, RobotConfig, SceneConfig, Table
+from rack.levels.tables import Finite, HandConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 MAX_STEPS = 100
 
-Point = tuple[Finite, Finite, Finite]
 Posture = Mapping[str, tuple[Finite, ...]]
 
 
@@ -32,7 +31,7 @@ class CloseStep(Table):
 
     do: Literal["close"] = Field("close", description="the kind of step")
     object: str = Field(description="object of the scene")
-    points: Mapping[str, Point] = Field(
+    points: Mapping[str, Vector] = Field(
         {}, description="where the tips would go if nothing were in the way, in the object's frame, m, by finger"
     )
     depth: Positive = Field(0.01, le=0.2, description="distance of such a point from a planned contact, inwards, m")
@@ -53,7 +52,7 @@ class ShiftStep(Table):
     """Move the object with the fingers."""
 
     do: Literal["shift"] = Field("shift", description="the kind of step")
-    by: Point = Field(description="way of the object in the world's frame, m")
+    by: Vector = Field(description="way of the object in the world's frame, m")
     seconds: Positive = Field(1.0, description="time that it takes, s")
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
-from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, LevelContext, Ports, Reading
 from rack.levels.operator import BELOW_LOST, Operation, Orders
@@ -47,7 +46,7 @@ class HandLoop(Executor):
         self.driven: NDArray[np.bool_]  # (joints,) or (fingers,), as in the status: those of this board
         self._above, self._period = ", ".join(context.above), max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
-        self._oldest = (1 + PATIENCE_CYCLES) * slowest  # ticks, of a status of the hand
+        self._oldest = slowest + self.cell.patience.ticks(slowest, context.tick_s)  # ticks, of a status of the hand
         self._taken = 0  # tick at which `command` came
         self._rejected = ""  # why the newest command is not followed
         self._held = False  # by an operator, in the last cycle

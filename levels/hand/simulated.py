@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.arm.drives import CoarseSensors
 from rack.levels.arm.simulation import Simulation
 from rack.levels.hand.messages import EXTENSOR, FLEXOR
@@ -40,7 +39,8 @@ class SimulatedHand(Simulation):
         super().__init__(cell)
         assert cell.hand is not None, "it is a hand"
         self.hand = hand = cell.hand
-        self.patience = PATIENCE_CYCLES * every  # ticks without a command after which the valves close
+        # Ticks without a command after which the valves close.
+        self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
         self.waited = self.patience
         self._palm = np.array(self._data.site_xmat[cell.tool]).reshape(3, 3)
         self._start_with(_carrying(cell, self._data))

@@ -7,43 +7,26 @@ from collections.abc import Mapping
 import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.arm.arm import PATIENCE_CYCLES
+from rack.levels.arm.above import CommandsAbove
 from rack.levels.hand.messages import EXTENSOR
-from rack.levels.level import Finding, LevelContext, Reading, Verdict
+from rack.levels.level import Finding, LevelContext, Reading
 from rack.levels.robot.hand import Hand
+from rack.levels.robot.limits import MotorPatience
 
 MARGIN = 1e-3
 """Part of its largest tension by which one may miss its limits without count: rounding of whoever kept them."""
 
 
-class Tensions:
+class Tensions(CommandsAbove):
     """Joins the `TENSION_COMMAND`s of the boards above, each for the joints that it drives."""
 
-    def __init__(self, context: LevelContext, hand: Hand) -> None:
-        # A tension rests on a status of a cycle ago. It takes a cycle of its board, and one of the board that gave that
-        # the torque; then the valves keep it.
-        self.oldest = {  # ticks, by board
-            board: context.every + (2 + PATIENCE_CYCLES) * pace.every for board, pace in context.above.items()
-        }
+    def __init__(self, context: LevelContext, hand: Hand, patience: MotorPatience) -> None:
+        # A tension takes a cycle of its board, and one of the board that gave that the torque.
+        super().__init__(context, patience, 2, "tensions", "valves closed")
         self._joints, self._low, self._high = context.robot.joints, hand.least, hand.most
         self._margin = MARGIN * hand.most
         self.tension = np.zeros((2, len(hand.most)))  # N
         self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
-
-    def missing(self, tensions: Mapping[str, Reading], tick: int, since: int) -> str:
-        """Return why tensions are missing at `tick`; empty: all are fresh, and rest on a status of `since` or later."""
-        all_know = True
-        for board, oldest in self.oldest.items():
-            value, verdict, is_lost, _ = tensions[board]
-            if is_lost:
-                return f"board '{board}' is lost: valves closed until it is back"
-            sampled = -1 if verdict is Verdict.NONE else value.sampled
-            if sampled < 0:
-                return f"no tensions from board '{board}' yet"
-            if tick - sampled > oldest:
-                return f"tensions of board '{board}' are stale: they rest on a status more than {oldest} ticks old"
-            all_know = all_know and sampled >= since
-        return "" if all_know else "valves closed until the boards above have seen it"
 
     def join(self, tensions: Mapping[str, Reading]) -> None:
         """Set `tension` and `rests_on`, while nothing is `missing`."""

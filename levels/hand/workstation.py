@@ -1,12 +1,12 @@
 """The workstation of a hand: it plans the grasp, and draws the hand. A program of the host side.
 
 It reads messages through the bus adapter, and sends plans the same way. The counts of the boards, which no message
-carries, it reads in the crate's memory, word by word at their bus addresses: the adapter maps it for its host.
+carries, it reads in the crate's memory, word by word at their bus addresses: the adapter maps it for its host. They are
+for the picture alone: other boards may be writing them, in lockstep too.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ class WorkstationParams(Table):
     picture: str | None = Field(
         None, description="SVG file, replaced as the hand moves; {rack} stands for the rack's name; default: none"
     )
-    every_s: Positive = Field(0.2, description="time between pictures, s; by the wall clock")
+    every_s: Positive = Field(0.2, description="time between pictures, s")
 
 
 class Workstation(HostProgram):
@@ -75,8 +75,8 @@ class Workstation(HostProgram):
         while not bus.is_over:
             bus.wait(self._params.every_s)
             self.plan(bus)
-            if time.monotonic() >= self._next_s:
-                self._next_s = time.monotonic() + self._params.every_s
+            if bus.time_s >= self._next_s:
+                self._next_s = bus.time_s + self._params.every_s
                 self.draw(bus)
 
     def plan(self, bus: Bus) -> PlannedGrasp | None:

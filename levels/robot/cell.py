@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
 from rack.levels.robot.hand import Hand, find_hand, fit_tendons
-from rack.levels.robot.limits import Bounds, Encoders, Limits, joint_bounds, planned_limits
+from rack.levels.robot.limits import Bounds, Encoders, Limits, MotorPatience, joint_bounds, patience_of, planned_limits
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.robot.wrist import Wrist, find_wrist
@@ -54,6 +54,7 @@ class Cell:
     encoders: Encoders  # resolution and noise of its sensors
     wrist: Wrist | None  # force/torque sensor; None: there is none
     hand: Hand | None  # None for an arm
+    patience: MotorPatience  # of its motors, or valves
 
     def start(self) -> mujoco.MjData:
         """Return data of the start: the arm at home, the gripper open, objects where the model puts them."""
@@ -119,6 +120,10 @@ def index(
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
     wrist = find_wrist(model, robot.wrist, moved)
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[joints]], data.qvel[model.jnt_dofadr[joints]] = robot.home, robot.velocity
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_energyVel(model, data)
     return Cell(
         model=model,
         qpos=model.jnt_qposadr[joints].astype(int),
@@ -148,6 +153,7 @@ def index(
         encoders=Encoders.of(robot),
         wrist=wrist,
         hand=hand,
+        patience=patience_of(robot, bounds, data.energy[1]),
     )
 
 

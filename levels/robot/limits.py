@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,6 +26,12 @@ MAX_RESTING_CONTACT_PART = 0.1
 """The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
 MIN_TURNING_JOINTS = 2
 """Fewest turning joints at which an arm moves enough for a push to show."""
+PATIENCE_PART = 0.25
+"""Largest part by which motors that keep their last torque may add to a stop from full speed; see `patience_of`."""
+LEAST_CYCLES = 2
+"""Torque cycles for which motors keep their last torque by default, at least: one late cycle must not brake the arm."""
+MAX_PATIENCE_S = 0.01
+"""Longest time by default, however slow or weak the arm: no torque for so long is no stall of a cycle or two."""
 SIGMAS = 6.0
 """Standard deviations of noise that a monitor allows for: less than one sample in a billion exceeds them."""
 
@@ -79,6 +86,32 @@ class Encoders:
     def speed_off(self) -> NDArray[np.float64]:
         """Largest error of a good velocity, (joints,), rad/s."""
         return self.off / EDGE_TIMING_S
+
+
+class MotorPatience(NamedTuple):
+    """The time for which motors keep their last torque when none comes; then the brakes engage."""
+
+    seconds: float
+    least: int  # torque cycles that it lasts in any case
+
+    def ticks(self, every: int, tick_s: float) -> int:
+        """Return it in ticks: whole torque cycles of `every` ticks of `tick_s` each."""
+        # A millionth of a cycle more: 5 ms are two cycles of 2.5 ms, whichever way those are rounded.
+        return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.least)
+
+
+def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
+    """Return the patience of an arm whose joints, all at full speed at home, have kinetic energy `energy_j`.
+
+    By default it is the time in which a stop from full speed grows by at most `PATIENCE_PART`: by what the joints turn
+    at that speed, of the angle in which the brakes stop them; and by what all motors put in at full torque, of the
+    energy that the brakes take in any case. (The limits hold without it: the limit gate passes every tick.)
+    """
+    if robot.patience_ms is not None:
+        return MotorPatience(robot.patience_ms * 1e-3, 1)
+    stops_s = 0.5 * np.min(bounds.velocity / robot.acceleration)
+    gains_s = energy_j / np.sum(bounds.torque * bounds.velocity)
+    return MotorPatience(min(PATIENCE_PART * float(min(stops_s, gains_s)), MAX_PATIENCE_S), LEAST_CYCLES)
 
 
 def joint_bounds(

@@ -46,7 +46,7 @@ class ArmExecutor(ArmDriver):
     def __init__(self, context: LevelContext, params: ArmParams | None = None) -> None:
         super().__init__(context, read_params(ArmParams, context.params) if params is None else params)
         limits = self.cell.limits
-        self.joints = JointTorques(context, len(limits.velocity))
+        self.joints = JointTorques(context, self.cell)
         self.orders = Orders(self.commands)
         rest_s = float(np.max(limits.velocity / limits.acceleration))
         self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values(), default=0)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rack.backplane.message import Message, State
+from rack.backplane.watch.alarms import AT_START, BY_DEMAND, NO_TORQUE
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
@@ -166,7 +167,7 @@ class ArmDriver(Executor):
             self._drive(sensed, reaction, missed, tick)
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
-        self._brakes.after_cycle(tick, self.findings)
+        self._brakes.after_cycle(tick, self.findings, BY_DEMAND if self.demand else self.stopping.cause)
         self._report(write, sensed, reaction)
         self.orders.report(write.status, self.rests_on)
         self.arm.save(write.state)
@@ -194,7 +195,7 @@ class ArmDriver(Executor):
             self.stopping.recall(before)
             self.started()
         if self.arm.braked:
-            self._brakes.start(self.arm.tick)
+            self._brakes.start(self.arm.tick, AT_START if before is None else NO_TORQUE)
         self.arm.step(tick - self.arm.tick)
         self._brakes.after_waiting(tick, self.findings)
         self._started = self.abandoned = True

@@ -11,7 +11,6 @@ from pydantic import Field
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.joint_messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS, JOINT_TORQUE
 from rack.levels.level import Executor, Input, LevelContext, Ports, Verdict
 from rack.levels.messages import Error
@@ -79,7 +78,8 @@ class JointServo(Executor):
         self._unmodified: Array = np.zeros(7 * len(robot.joints))  # what the law sets for its modifications
         self._grip = Grip(robot.gripper) if params.gripper and robot.gripper is not None else None
         below = max(pace.every for pace in context.below.values())
-        self._oldest = (1 + PATIENCE_CYCLES) * below  # ticks, of a status
+        # Ticks, of a status: while its board stalls for less, the arm goes on with the last torques.
+        self._oldest = below + cell.patience.ticks(below, context.tick_s)
         self._sample: Array = np.zeros(0)  # numbers of a status of the arm, and of the messages to write
         self._shown_numbers: tuple[Array, ...] = ()
         self._offered: Message | None = None  # reference whose loads are not yet taken

@@ -9,23 +9,22 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import PATIENCE_CYCLES
+from rack.levels.arm.above import CommandsAbove
 from rack.levels.compiled import compiled
-from rack.levels.level import LevelContext, Reading, Verdict
+from rack.levels.level import LevelContext, Reading
+from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
 from rack.levels.robot.engine import one_view
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import numbers
 
 
-class JointTorques:
+class JointTorques(CommandsAbove):
     """Adds up the `JOINT_TORQUE`s of the boards above; each is 0 for the joints of other boards."""
 
-    def __init__(self, context: LevelContext, joints: int) -> None:
-        # A torque rests on a status of a cycle ago and takes a cycle of its board; then the motors keep it.
-        self.oldest = {  # ticks, by board
-            board: context.every + (1 + PATIENCE_CYCLES) * pace.every for board, pace in context.above.items()
-        }
+    def __init__(self, context: LevelContext, cell: Cell) -> None:
+        super().__init__(context, cell.patience, 1, "torque", "braked")
+        joints = len(cell.home)
         self._sum = np.zeros(3 * joints + 5)  # the fields of a `JOINT_TORQUE` from `torque` to `payload_offset`
         self.torque = self._sum[:joints]  # (joints,), N m
         self._offset = self._sum[-3:]
@@ -46,22 +45,15 @@ class JointTorques:
         """The mass in the gripper, as the boards know it."""
         return Payload(float(self._sum[-4]), self._offset)
 
-    def missing(self, torques: Mapping[str, Reading], tick: int, since: int) -> str:
-        """Return why torques are missing at `tick`; empty: all are fresh, and rest on a status of `since` or later."""
-        all_know = True
-        for board, oldest in self.oldest.items():
-            value, verdict, is_lost, _ = torques[board]
-            if is_lost:
-                return f"board '{board}' is lost: braked until it is back"
-            sampled = -1 if verdict is Verdict.NONE else value.sampled
-            if sampled < 0:
-                return f"no torque from board '{board}' yet"
-            if tick - sampled > oldest:
-                return f"torque of board '{board}' is stale: it rests on a status more than {oldest} ticks old"
-            all_know = all_know and sampled >= since
-            if self._messages.get(board) is not value:
-                self._see(board, value)
-        return "" if all_know else "braked until the boards above have seen it"
+    def missing(self, commands: Mapping[str, Reading], tick: int, since: int) -> str:
+        """Return why torques are missing, as `CommandsAbove`; if none is, find their numbers."""
+        why = super().missing(commands, tick, since)
+        if not why:
+            for board in self.oldest:
+                value = commands[board].value
+                if self._messages.get(board) is not value:
+                    self._see(board, value)
+        return why
 
     def add_up(self) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""

@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from rack.backplane.message import Message
-from rack.backplane.watch.alarms import Alarm
+from rack.backplane.watch.alarms import NO_TORQUE, Alarm
 from rack.backplane.words import Demand
 from rack.levels.arm import Arm
 from rack.levels.level import Finding
@@ -57,6 +57,7 @@ class Stopping:
         self._most = max(round(params.patience / tick_s), every)
         self.refused: Finding | None = None  # the last cycle's torque, if the arm refused it
         self.error = Error.NONE  # latched fault
+        self.cause = Error.NONE  # fault that keeps the arm from its set points
         self.reason = ""  # why the arm does not follow its set points, in one line; empty: it does
         self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
         self._kept = 0  # ticks for which faults have kept the arm from its set points
@@ -121,7 +122,8 @@ class Stopping:
             return Reaction.BRAKE
         sound = self.refused is None and self._retry_at is None and self._struck_until is None
         if sound and not (sensors.faulty or demand):
-            self._kept, self.reason = max(self._kept - passed, 0) if self._kept else 0, ""
+            self._kept = max(self._kept - passed, 0) if self._kept else 0
+            self.cause, self.reason = Error.NONE, ""
             return Reaction.NONE
         reaction, cause = self._weigh(sensors, tick)
         if cause is None:
@@ -135,11 +137,12 @@ class Stopping:
         elif cause is not None:
             self._wait_for(cause, tick)
         else:
-            self.reason = ""
+            self.cause, self.reason = Error.NONE, ""
         return max(reaction, DEMANDED[demand]) if demand else reaction
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
-        """Set `reason`: the fault that must end, and the tick at which it is latched."""
+        """Set `cause` and `reason`: the fault that must end, and the tick at which it is latched."""
+        self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
@@ -177,35 +180,39 @@ class Stopping:
 
     def _latch(self, cause: Cause) -> Reaction:
         """Latch the fault: the brakes stay engaged."""
-        self.error, self.reason = cause.error, f"{cause.text}; not over within {self._params.patience:g} s"
+        self.error = self.cause = cause.error
+        self.reason = f"{cause.text}; not over within {self._params.patience:g} s"
         self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
         return Reaction.BRAKE
 
 
 class BrakeLog:
-    """Reports when the brakes of an arm engage and release."""
+    """Reports when the brakes of an arm engage and release, each time, however short; and why."""
 
     def __init__(self, arm: Arm, every: int) -> None:
         self._arm, self._every = arm, every
-        self._engaged_at: int | None = None
+        self._engaged: tuple[int, int] | None = None  # why, see `Alarm.BRAKES_CLOSED`, and at which tick
 
-    def start(self, tick: int) -> None:
-        """Begin at `tick`, with brakes engaged because no torque has been given yet."""
-        self._engaged_at = tick
+    def start(self, tick: int, why: int) -> None:
+        """Begin at `tick` with brakes engaged: no torque has been given yet, or none since a restart."""
+        self._engaged = why, tick
 
     def after_waiting(self, tick: int, findings: list[Finding]) -> None:
         """Report brakes that engaged, up to `tick`, because no torques came."""
-        if self._arm.braked and self._engaged_at is None:
-            missed = self._arm.waited - self._every
-            self._engaged_at = tick
-            findings.append(Finding(Alarm.BRAKES_CLOSED, -1, missed))
+        arm = self._arm
+        if arm.braked and self._engaged is None:
+            # The arm itself engaged them, between two cycles.
+            self._engaged = NO_TORQUE, tick - max(arm.waited - arm.patience, 1)
+            findings.append(Finding(Alarm.BRAKES_CLOSED, NO_TORQUE, arm.waited - self._every))
 
-    def after_cycle(self, tick: int, findings: list[Finding]) -> None:
-        """Report what the cycle at `tick` did to the brakes."""
-        if not self._arm.braked:
-            if self._engaged_at is not None and tick > self._engaged_at:
-                findings.append(Finding(Alarm.BRAKES_OPENED, -1, tick - self._engaged_at))
-            self._engaged_at = None
-        elif self._engaged_at is None:
-            self._engaged_at = tick
-            findings.append(Finding(Alarm.BRAKES_CLOSED, -1, 0))
+    def after_cycle(self, tick: int, findings: list[Finding], why: int) -> None:
+        """Report what the cycle at `tick` did to the brakes; `why`: it engages them for this."""
+        if self._arm.braked:
+            if self._engaged is None:
+                self._engaged = why, tick
+                findings.append(Finding(Alarm.BRAKES_CLOSED, why))
+        elif self._engaged is not None:
+            cause, since = self._engaged
+            self._engaged = None
+            if tick > since:
+                findings.append(Finding(Alarm.BRAKES_OPENED, cause, tick - since))

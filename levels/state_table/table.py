@@ -37,7 +37,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, ValidationError
 from rack.backplane.message import REASON_BYTES, State
 from rack.levels.errors import LevelError
 from rack.levels.state_table.vocabulary import NAME_BYTES, Vocabulary
-from rack.levels.tables import Finite, Positive, Table
+from rack.levels.tables import Positive, Table, Vector
 
 MAX_FILE_BYTES = 200_000
 ROW_NAME_BYTES = 48
@@ -55,7 +55,7 @@ def _listed(value: Any) -> Any:
 
 Words = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 States = Annotated[tuple[Name, ...], BeforeValidator(_listed)]
-Place = Annotated[tuple[Finite, Finite, Finite], BeforeValidator(_listed)]
+Place = Annotated[Vector, BeforeValidator(_listed)]
 
 
 SAME = "same"

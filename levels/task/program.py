@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from rack.levels.errors import ProgramError
 from rack.levels.level import Program
-from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
+from rack.levels.tables import Finite, GoalConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
-Vector = tuple[Finite, Finite, Finite]
 ROUNDING_S = 1e-9
 """Margin of times against deadlines: ticks times the clock's period are not exact."""
 DOWN = (0.0, 0.0, -1.0)
@@ -82,6 +80,12 @@ class TaskConfig(Program):
         (), description="actions, done in their order"
     )
 
+    def goals(self) -> Iterator[GoalConfig]:
+        """Yield where transfers take objects."""
+        for action in self.action:
+            if isinstance(action, Transfer):
+                yield GoalConfig(object=action.object, position=action.to)
+
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
         for k, action in enumerate(self.action if robot is not None else ()):
@@ -105,17 +109,7 @@ class TaskParams(Table):
     )
 
 
-def read_program(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> TaskConfig:
-    """Return the program in the `[task]` table. Raises `ProgramError`, with one line per mistake."""
-    try:
-        program = TaskConfig.model_validate(table)
-    except ValidationError as error:
-        lines = [f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
-        raise ProgramError("\n".join(lines)) from error
-    misfits = [f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)]
-    if misfits:
-        raise ProgramError("\n".join(misfits))
-    return program
+read_program = TaskConfig.read
 
 
 def _misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:

@@ -117,7 +117,7 @@ def distribution(values: np.ndarray) -> Distribution | None:
 
 
 class Occupation:
-    """When a core was occupied: a union of intervals, ns, which may overlap."""
+    """When a core was occupied: a union of intervals. `starts` and `ends` are those of the union, ns, shape (n,)."""
 
     def __init__(self, starts: np.ndarray, ends: np.ndarray) -> None:
         """Take intervals from `starts` to `ends`, each of shape (n,), in any order."""
@@ -126,9 +126,9 @@ class Occupation:
         # An interval that begins after the end of all before it begins a new block.
         first = np.ones(len(starts), bool)
         first[1:] = starts[1:] > ends[:-1]
-        self._starts = starts[first]
-        self._ends = ends[np.roll(first, -1)] if len(ends) else ends
-        self._before = np.concatenate(([0], np.cumsum(self._ends - self._starts)))
+        self.starts = starts[first]
+        self.ends = ends[np.roll(first, -1)] if len(ends) else ends
+        self._before = np.concatenate(([0], np.cumsum(self.ends - self.starts)))
 
     @classmethod
     def of(cls, rows: np.ndarray) -> Occupation:
@@ -141,8 +141,8 @@ class Occupation:
         """Return the union of several."""
         none = np.empty(0, np.int64)
         return cls(
-            np.concatenate([none, *(each._starts for each in many)]),
-            np.concatenate([none, *(each._ends for each in many)]),
+            np.concatenate([none, *(each.starts for each in many)]),
+            np.concatenate([none, *(each.ends for each in many)]),
         )
 
     def within(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -151,11 +151,11 @@ class Occupation:
 
     def _until(self, times: np.ndarray) -> np.ndarray:
         """Return the occupied time before each of `times`."""
-        begun = np.searchsorted(self._starts, times, side="right")
-        if not len(self._starts):
+        begun = np.searchsorted(self.starts, times, side="right")
+        if not len(self.starts):
             return np.zeros(np.shape(times), np.int64)
         newest = np.maximum(begun - 1, 0)
-        beyond = np.clip(self._ends[newest] - times, 0, None)
+        beyond = np.clip(self.ends[newest] - times, 0, None)
         return np.asarray(np.where(begun > 0, self._before[begun] - beyond, 0))
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import runpy
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -75,14 +74,18 @@ class Motions:
         quaternion: Sequence[float] = DOWN,
         body: str = "",
         live: bool = False,
+        guard: float = 0.0,
         **times: float,
     ) -> int:
-        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows."""
+        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows.
+
+        With a `guard`, N m, it ends GUARDED where a joint's torque changes by more: the arm met something.
+        """
         if body and body not in self._bodies:
             raise LevelError(f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}")
         row = self._bodies.index(body) if body else WORLD
         pose = {"position": position, "quaternion": quaternion}
-        return self._request(kind=MotionKind.POSE, body=row, live=live, **pose, **times)
+        return self._request(kind=MotionKind.POSE, body=row, live=live, touch=guard, **pose, **times)
 
     def stay(self, seconds: float) -> int:
         """Stay at the goal before."""
@@ -140,7 +143,7 @@ class Motions:
     def _look(self) -> None:
         """Wait for news; send the requests again that are lost: nothing is under way, and not all are done."""
         self._bus.wait(LOOK_S)
-        status, now = self._bus.read("motion").value, time.monotonic()
+        status, now = self._bus.read("motion").value, self._bus.time_s
         self._open = {number: request for number, request in self._open.items() if number > status.done}
         if status.current or not self._open:
             self._idle_since = None

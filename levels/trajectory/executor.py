@@ -16,6 +16,7 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import read_params
 from rack.levels.trajectory.boards import HANDOVER_CYCLES, JointBoards
 from rack.levels.trajectory.goal import WorldSight
+from rack.levels.trajectory.guard import TouchGuard
 from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATE, MOTION_STATUS
 from rack.levels.trajectory.motion import SampledMotion
 from rack.levels.trajectory.requests import Agenda
@@ -63,6 +64,7 @@ class TrajectoryExecutor(Executor):
         self._motion.rest_at(cell.home)
         self._work = self.work(self._agenda, self._motion, tools)
         self._boards = JointBoards(robot.joints)
+        self._guard = TouchGuard(context.period_s)
         self._orders = Orders(self.commands)
         self._dynamics = Dynamics(cell)
         if robot.gripper is not None:
@@ -92,6 +94,7 @@ class TrajectoryExecutor(Executor):
         self._follow_boards(read)
         if cancelled:
             self._work.cancel()
+        self._watch(read, cycles)
         hold = self._orders.standing is Operation.HOLD
         # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the boards hold.
         for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
@@ -117,6 +120,16 @@ class TrajectoryExecutor(Executor):
             self._motion.rest_at(self._boards.position)
         elif before and not self._boards.in_step:
             self._work.interrupt()
+
+    def _watch(self, read: Ports, cycles: int) -> None:
+        """End the request under way if its guard is struck; `cycles` since the last one."""
+        current, leg = self._agenda.current, self._motion.leg
+        # At half its speed the arm has long broken away from rest, where friction changes torques.
+        steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
+        if current is None or not current.is_guarded or not steady:
+            self._guard.begin_anew()
+        elif self._guard.is_struck(read.boards, current.touch):
+            self._work.end_guarded()
 
     def _due(self, tick: int) -> int:
         return tick + LEAD_CYCLES * self.context.every

@@ -51,6 +51,7 @@ MOTION_REQUEST = command(
     Field("segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"),
     Field("opening", "f8", "m", "gripper joint position to go to, for GRIP"),
     Field("force", "f8", "N", "largest gripper force, for GRIP"),
+    Field("touch", "f8", "N m", "lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard"),
 )
 """`id` numbers requests, rising by one from 1 in the order of the queue; one not above those taken is a repetition."""
 

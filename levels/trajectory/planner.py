@@ -31,7 +31,6 @@ from rack.levels.trajectory.program import (
     MoveStep,
     StayStep,
     Step,
-    read_motions,
 )
 
 BATCH = 2
@@ -56,7 +55,7 @@ class RequestExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._count = len(read_motions(context.task, context.robot, context.scene))
+        self._count = len(self.program.read(context.task, context.robot, context.scene).step)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report the requests done."""
@@ -90,7 +89,7 @@ class RequestPlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._steps = read_motions(context.task, context.robot, context.scene)
+        self._steps = self.program.read(context.task, context.robot, context.scene).step
         self._ahead = read_params(PlanningParams, context.params).ahead
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._ik, self._home = InverseKinematics(cell, context.seed), cell.home

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from rack.levels.errors import ProgramError
 from rack.levels.level import Program
-from rack.levels.tables import Finite, NotNegative, Positive, RobotConfig, SceneConfig, Table
+from rack.levels.tables import Finite, NotNegative, Positive, RobotConfig, SceneConfig, Table, Vector
 
 MAX_REQUESTS = 200
 
-Place = tuple[Finite, Finite, Finite]
 Turn = tuple[Finite, Finite, Finite, Finite]
 
 
@@ -35,7 +33,7 @@ class MoveStep(MotionStep):
 
     do: Literal["move"] = Field("move", description="the kind of step")
     joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
-    position: Place | None = Field(None, description="of the tool, m")
+    position: Vector | None = Field(None, description="of the tool, m")
     quaternion: Turn | None = Field(None, description="of the tool, as w, x, y, z; as at home when not given")
 
     @model_validator(mode="after")
@@ -51,7 +49,7 @@ class LineStep(MotionStep):
     """Move the tool along a straight line, to a pose in the world or in the frame of a body, which it may follow."""
 
     do: Literal["line"] = Field("line", description="the kind of step")
-    position: Place = Field(description="of the tool, m, in the frame of `body`")
+    position: Vector = Field(description="of the tool, m, in the frame of `body`")
     quaternion: Turn | None = Field(
         None, description="of the tool, as w, x, y, z, in that frame; as at home by default"
     )
@@ -115,15 +113,3 @@ class MotionProgram(Program):
                 yield f"step[{k}].body", step.body, why
             if isinstance(step, GripStep) and robot.gripper is None:
                 yield f"step[{k}].do", step.do, "the robot has no gripper"
-
-
-def read_motions(table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> tuple[Step, ...]:
-    """Return the steps in the `[task]` table. Raises `ProgramError`, with one line per mistake."""
-    try:
-        program = MotionProgram.model_validate(table)
-    except ValidationError as error:
-        lines = [f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
-        raise ProgramError("\n".join(lines)) from error
-    if misfits := [f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)]:
-        raise ProgramError("\n".join(misfits))
-    return program.step

@@ -34,6 +34,7 @@ class MotionRequest(NamedTuple):
     segment: float
     opening: float
     force: float
+    touch: float
     operator: int
     record: np.ndarray  # the whole
 
@@ -44,12 +45,17 @@ class MotionRequest(NamedTuple):
         goal = pose(r["position"], r["quaternion"])
         one = int(r["id"]), int(r["kind"]), np.array(r["joints"]), goal, int(r["body"]), bool(r["live"])
         times = float(r["acceleration"]), float(r["segment"])
-        return cls(*one, *times, float(r["opening"]), float(r["force"]), int(r["operator"]), r)
+        return cls(*one, *times, float(r["opening"]), float(r["force"]), float(r["touch"]), int(r["operator"]), r)
 
     @property
     def moves(self) -> bool:
         """Whether it moves the arm."""
         return self.kind in MOTIONS
+
+    @property
+    def is_guarded(self) -> bool:
+        """Whether a touch ends it."""
+        return self.kind == MotionKind.POSE and self.touch != 0.0
 
     def misfit(self, ranges: Array) -> str:
         """Return why no arm could do it; empty: it may be possible. `ranges` (joints, 2), rad."""
@@ -61,6 +67,9 @@ class MotionRequest(NamedTuple):
         place, turn = self.record["position"], self.record["quaternion"]
         if self.kind == MotionKind.POSE and not (np.isfinite(place).all() and np.isfinite(turn).all() and turn.any()):
             return "the pose is not finite, or its quaternion is zero"
+        # Written so that NaN is one.
+        if not self.touch >= 0.0:
+            return f"a guard of {self.touch:g} N m; permitted: 0 or more"
         if self.kind == MotionKind.JOINTS:
             # Written so that NaN is outside.
             outside = ~((self.joints >= ranges[:, 0]) & (self.joints <= ranges[:, 1]))

@@ -59,9 +59,15 @@ class RequestWork:
         self._interrupted, self.goal = True, None
 
     def cancel(self) -> None:
-        """Ramp to rest; the agenda is empty but for the CANCEL."""
+        """Ramp to rest; no request is under way but a CANCEL."""
         self._left, self._interrupted, self.goal = 1.0, False, None
         self.motion.stop()
+
+    def end_guarded(self) -> None:
+        """End the request under way, GUARDED: the arm ramps to rest, and goes on from there with the next one."""
+        self.agenda.end(RequestEnd.GUARDED)
+        self.agenda.goal = None  # the arm is not there
+        self.cancel()
 
     def step(self, time_s: float, hold: bool) -> None:
         """Go on to the sample at `time_s`; with `hold`, ramp to rest."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from time import monotonic_ns
+
 import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
@@ -40,11 +42,17 @@ def test_a_task_finds_its_own_active_faults(make_bus: MakeBus) -> None:
     assert [entry.index for entry in table.staged((Stage.WAITING,))] == [0]
 
 
-def test_the_first_time_that_a_fault_acts_is_kept(make_bus: MakeBus) -> None:
-    entry = FaultTable(make_bus()).add(Injection(0, 0))
-    entry.acted(9, 100)
-    entry.acted(10, 200)
-    assert [entry[word] for word in (Entry.STRUCK_TICK, Entry.STRUCK_NS, Entry.COUNT)] == [9, 100, 2]
+def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(make_bus: MakeBus) -> None:
+    entry, before = FaultTable(make_bus()).add(Injection(0, 0)), monotonic_ns()
+    entry.acted(9, shows=False)
+    first = entry[Entry.STRUCK_NS]
+    assert before <= first <= monotonic_ns()
+    assert (entry[Entry.STRUCK_TICK], entry[Entry.COUNT]) == (9, 0)
+    for tick in (12, 15):
+        entry.acted(tick)
+    entry.acted(16, shows=False)
+    words = (Entry.STRUCK_TICK, Entry.STRUCK_NS, Entry.HIDDEN, Entry.COUNT)
+    assert [entry[word] for word in words] == [9, first, 12 - 9, 2]
 
 
 def test_a_full_table_refuses(make_bus: MakeBus) -> None:

@@ -73,7 +73,8 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(tmp_path: Path, monkeypa
     device.touch()
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
     before = descriptors()
-    with cores_kept_awake():
+    with cores_kept_awake() as refusal:
+        assert refusal == ""
         assert device.read_bytes() == bytes(4)
         assert descriptors() == before + 1
     assert descriptors() == before
@@ -81,7 +82,8 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(tmp_path: Path, monkeypa
 
 def test_cores_sleep_as_usual_where_the_request_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
-    entered = False
-    with cores_kept_awake():
-        entered = True
-    assert entered
+    reason = ""
+    with cores_kept_awake() as refusal:
+        reason = refusal
+    assert reason == f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or directory"
+    assert not (tmp_path / "missing").exists()

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import time
+from collections.abc import Mapping
 from enum import IntEnum
 
 from rack.backplane.message import Field, State, command, status
+from rack.backplane.segment import Segment
+from rack.boards.adapters import bus_adapter
+from rack.boards.adapters.bus_adapter import BusAdapter
+from rack.boards.adapters.entries import Rows
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Executor, Input, Ports
 
@@ -66,12 +72,14 @@ class Counting(Host):
 
 
 class Flooding(Host):
-    """Sends for ever, and never reads."""
+    """Sends for ever more than the ring holds, and never reads."""
 
     def run(self, bus: Bus) -> None:
-        """Send without a pause."""
+        """Send as often as it is let."""
         while not bus.is_over:
-            bus.send("numbers", value=1.0)
+            for _ in range(200):
+                bus.send("numbers", value=1.0)
+            bus.wait(0.001)
 
 
 class Deaf(Host):
@@ -107,6 +115,49 @@ class Silent(Host):
     def run(self, bus: Bus) -> None:
         """Wait for what never comes."""
         time.sleep(3600)
+
+
+class Waiting(Host):
+    """Sends one number, and waits."""
+
+    def run(self, bus: Bus) -> None:
+        """Send, and wait until the run ends."""
+        bus.send("numbers", value=1.0)
+        super().run(bus)
+
+
+class Slow(Host):
+    """Sends 40 numbers that hold what it sees, and computes up to `lag` seconds for each."""
+
+    inputs = {**Host.inputs, "again": Input(SUM, "second.sum")}
+
+    def run(self, bus: Bus) -> None:
+        """Compute, send, wait; end once all were added."""
+        while bus.sent("numbers") < 40:
+            time.sleep(random.uniform(0.0, self.context.params["lag"]))
+            seen = bus.read("sum").value.sum + bus.read("again").value.last
+            bus.send("numbers", value=seen % 7.0 + bus.time_s + bus.tick)
+            bus.wait(0.03)
+        while bus.read("sum").value.last < bus.sent("numbers") and not bus.is_over:
+            bus.wait(1.0)
+
+
+class Lingering(Host):
+    """Is done at once, and stays."""
+
+    def run(self, bus: Bus) -> None:
+        """Declare the work done; end with the rack."""
+        bus.finish()
+        time.sleep(3600)
+
+
+class HastyAdapter(BusAdapter):
+    """A bus adapter that waits for a program for a second at most."""
+
+    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
+        """Shorten the bound."""
+        bus_adapter.LONGEST_S = 1.0
+        super().attach(segment, entries)
 
 
 class Ending(Host):

@@ -1,4 +1,4 @@
-"""A level above boards that servo joints: it moves every joint smoothly to and fro."""
+"""A level above boards that servo joints: it moves every joint smoothly to and fro. And an arm whose board stalls."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import PRIMITIVE_STATUS
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.servo import ArmExecutor
+from rack.levels.servo.control import ArmParams
+from rack.levels.tables import read_params
 
 AWAY_RAD = 0.15
 """Distance of every joint from home at the other end."""
@@ -55,3 +58,33 @@ class Swing(Executor):
         command.acceleration = way * 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / LASTS_S**2
         inertia, command.load = self._dynamics.terms(command.position, command.velocity)
         command.inertia = np.diagonal(inertia)
+
+
+class Waiting(Swing):
+    """Holds for ever."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Hold."""
+        write.status.state, write.status.reason = State.HOLDING, "it does not feel like it"
+
+
+class StallingParams(ArmParams):
+    """The last `stall` of every `period` cycles are missed."""
+
+    stall: int
+    period: int = 400
+
+
+class StallingArm(ArmExecutor):
+    """Drives the arm, but stalls again and again, as if the host took its core away."""
+
+    params = StallingParams
+
+    def __init__(self, context: LevelContext) -> None:
+        self._given = read_params(StallingParams, context.params)
+        super().__init__(context, self._given)
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Drive the arm, unless it stalls: its messages are those of the last cycle then."""
+        if tick % self._given.period < self._given.period - self._given.stall:
+            super().process(read, write, tick)

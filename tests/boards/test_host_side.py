@@ -95,8 +95,8 @@ def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: M
 def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_is_without_them(
     config: MakeConfig,
 ) -> None:
-    text = others(hung="Silent", failed="Failing", finished="Ending", killed="Silent")
-    settings = ("board.bridge.ends_run=false", "host.program.program=host_programs:Silent")
+    text = others(hung="Waiting", failed="Failing", finished="Ending", killed="Waiting")
+    settings = ("board.bridge.ends_run=false", "host.program.program=host_programs:Console")
     settings += ("host.failed={ restarts = 1, restarts_within_s = 1e6 }",)
     with Rack(config(*settings, text=text)) as rack:
         rack.start()
@@ -146,14 +146,14 @@ def test_what_is_improper_is_refused_at_the_bridge(config: MakeConfig) -> None:
 
 def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(config: MakeConfig) -> None:
     # The fixture checks that no process is left.
-    with Rack(config("host.program.program=host_programs:Deaf", text=HOSTED)) as rack:
+    with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=HOSTED)) as rack:
         rack.start()
         watch(rack, lambda: status(rack.segment, "adder").sum > 0)
 
 
 def test_a_stopped_program_is_found_killed_and_started_again(config: MakeConfig) -> None:
     text = HOSTED + '\n[[fault]]\nkind = "hang"\nboard = "program"\nwhen = "adder.status.last == 1"\n'
-    with Rack(config("host.program.program=host_programs:Deaf", text=text)) as rack:
+    with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=text)) as rack:
         rack.start()
         watch(rack, lambda: "rejoined" in codes(rack, "program"))
     assert [code for code in codes(rack, "program") if code in ENDS] == ["died", "restart", "rejoined"]

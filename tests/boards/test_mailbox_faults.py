@@ -80,3 +80,28 @@ def test_the_bus_counters_continue_after_a_restart(config: MakeConfig) -> None:
         # Of its 101 cycles the dead process had accounted for 64: it does so in every 64th.
         accounted = block[Block.CYCLES] - 101 + 64
         assert block[Block.READS] == block[Block.WRITES] == accounted > 64
+
+
+def flows(config: RackConfig, *faults: dict[str, Any]) -> list[tuple[int, str, float]]:
+    """Run a rack with faults; return when messages were seen to flow again, of which mailbox, and after how long."""
+    given = config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
+    with Rack(given) as rack:
+        rack.run(1.0)
+        return [(event.tick, event.subject, event.value) for event in rack.events if event.code == "flows"]
+
+
+@pytest.mark.parametrize("kind", KINDS_OF_WRITERS)
+def test_messages_are_seen_to_flow_again_after_a_fault(config: MakeConfig, kind: str) -> None:
+    over = 102 if kind == "masquerade" else 181
+    # The first message after it is visible a tick later, and seen at the beginning of the next.
+    assert flows(config(), fault(kind, "wave", 101)) == [(over + 2, "wave.status", 2.0)]
+
+
+def test_no_messages_flow_after_a_fault_without_an_end(config: MakeConfig) -> None:
+    assert flows(config(), {"kind": "mute", "board": "wave", "tick": 101}) == []
+
+
+def test_a_restarted_clock_sees_messages_flow_again_too(config: MakeConfig) -> None:
+    kill = {"kind": "kill", "board": "clock", "tick": 182}
+    ((tick, mailbox, _),) = flows(config(), fault("mute", "wave", 101), kill)
+    assert (tick >= 183, mailbox) == (True, "wave.status")

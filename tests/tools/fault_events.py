@@ -39,6 +39,11 @@ def found(tick: int, code: str, board: str, subject: str = "") -> Event:
     return event(tick, "detection", code, board, subject)
 
 
+def flows(tick: int, mailbox: str = "lower.status") -> Event:
+    """Return the recovery of a mailbox whose messages flow again."""
+    return event(tick, "recovery", "flows", "clock", mailbox)
+
+
 def strike(kind: str, board: str, tick: int, ends: int = -1, place: int = 0, **more: Any) -> Strike:
     """Return a fault that struck at the beginning of a tick, and is over at `ends`; once, where that is not said."""
     number = KINDS["kill" if kind == EXTERNAL else kind].number

@@ -186,3 +186,13 @@ def test_the_static_schedule_is_in_the_json_document() -> None:
     assert (found["minor_ms"], found["major_ms"]) == (4, 8)
     assert [(core["core"], core["frames"]) for core in found["cores"]] == [(1, [0]), (1, [1])]
     assert [place["board"] for place in found["cores"][1]["places"]] == ["fast", "odd"]
+
+
+def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
+    words = ("nasrem", "--set", "robot.patience_ms=10")
+    (line,) = (line for line in check(*words, "--verbose").stdout.splitlines() if line.startswith("patience: "))
+    assert line.startswith("patience: 'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms). ")
+    assert "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque put in 10.372 J" in line
+    assert "patience" not in check(*words).stdout
+    (found,) = json.loads(check(*words, "--json").stdout)["patience"]
+    assert (found["board"], found["ms"], found["cycles"], found["energy_j"]) == ("servo", 10.0, 4, 10.372)

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from rack.backplane.fault_table import NEVER
 from rack.boards.events import Event
 from rack.tools.faults.ending import EXTERNAL, Strike
 from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge
-from tests.tools.fault_events import LAYOUT, TICK_NS, event, found, strike
+from tests.tools.fault_events import LAYOUT, TICK_NS, box, event, flows, found, strike
 
 END = event(10_000, "end", "")
 
@@ -286,8 +287,55 @@ def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() 
 
 
 def test_what_is_latched_is_no_reaction_to_a_fault_that_cannot_be() -> None:
-    muted = judged(strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"))
+    muted = judged(strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"), flows(152))
     assert (muted.reactions, muted.is_recovered) == ((), True)
+
+
+@pytest.mark.parametrize(
+    ("seen", "recovered", "after"),
+    [
+        ([], False, None),
+        ([flows(149)], False, None),
+        ([flows(152, "upper.command")], False, None),
+        ([flows(152)], True, 52),
+        ([flows(149), flows(252)], True, 152),
+        ([flows(253)], False, 153),
+    ],
+    ids=["never", "before its end", "another mailbox", "soon", "in time", "too late"],
+)
+def test_struck_messages_are_recovered_from_when_they_flow_again(
+    seen: list[Event], recovered: bool, after: int | None
+) -> None:
+    # A message is due a tick after the end, and read a tick later; then a quarter of a second.
+    fault = judged(strike("mute", "lower", 100, 150), found(107, "mute", "upper", "lower.status"), *seen)
+    assert (fault.seen, fault.is_recovered, fault.recovery, fault.recovery_bound) == (
+        *("detected", recovered, after),
+        50 + 1 + 1 + 100,
+    )
+
+
+def test_nothing_recovers_from_a_fault_of_messages_without_an_end() -> None:
+    silent, mute = strike("mute", "lower", 100, NEVER), found(107, "mute", "upper", "lower.status")
+    fault = judge([silent], [flows(99), mute, event(200, "end", "")], REAL_TIME).faults[0]
+    assert (fault.seen, fault.struck, fault.is_recovered) == ("detected", 100, False)
+    # One that was to end says nothing yet.
+    assert judge([replace(silent, ends=900)], [mute, event(200, "end", "")], REAL_TIME).faults[0].seen == "not struck"
+
+
+def test_a_plan_is_recovered_from_whenever_the_next_one_comes_and_undecided_without_one() -> None:
+    layout = replace(LAYOUT, mailboxes=(*LAYOUT.mailboxes, box("lower.plan", "lower.planner", "lower", 4)))
+    forged = replace(strike("masquerade", "lower.planner", 100), mailboxes=("lower.plan",))
+    run = Circumstances(layout, offset_ns=0)
+    late = verdict([forged], flows(9000, "lower.plan"), run=run).faults[0]
+    assert (late.is_recovered, late.recovery) == (True, 8900)
+    assert verdict([forged], run=run).faults[0].seen == "not struck"
+
+
+@pytest.mark.parametrize(("tick", "within"), [(118, True), (127, True), (128, False)])
+def test_the_delay_of_a_fault_counts_from_its_strike_and_its_bound_from_when_it_shows(tick: int, within: bool) -> None:
+    weak = replace(strike("actuator-saturated", "lower", 100, 150), hidden=15, count=30)
+    fault = judged(weak, found(tick, "actuator", "lower", "elbow"))
+    assert (fault.struck, fault.delay, fault.bound, fault.is_within) == (100, tick - 100, 15 + 12, within)
 
 
 def test_misses_that_no_fault_explains_are_counted_apart_from_detections() -> None:
@@ -343,12 +391,13 @@ def test_no_motor_at_fault_explains_an_alarm_about_another() -> None:
 
 
 def test_a_fault_of_the_arm_that_is_found_has_struck_however_slight_it_was() -> None:
-    slight = replace(strike("actuator-off", "lower", 100, 150), tick=-1, count=0)
+    slight = replace(strike("actuator-off", "lower", 100, 150), count=0)
     own, other = found(104, "actuator", "lower", "elbow"), found(104, "sensor_range", "lower", "elbow")
     found_out = verdict([slight], own, other)
-    assert (found_out.faults[0].seen, found_out.faults[0].struck) == ("detected", 104)
+    fault = found_out.faults[0]
+    assert (fault.seen, fault.struck, fault.delay, fault.bound) == ("detected", 100, 4, None)
     assert found_out.unexplained == (other,)
-    # Found before it counts as acting: it has struck then, and what was done about it is not of the fault before.
-    stuck = replace(strike("sensor-stuck", "lower", 100, 150), tick=107)
-    assert verdict([stuck], found(102, "sensor_stuck", "lower", "elbow")).faults[0].struck == 102
-    assert verdict([slight], found(160, "actuator", "lower", "elbow")).faults[0].seen == "not struck"
+    # What is found after its end is of the next one.
+    after = strike("actuator-off", "lower", 156, 170, place=1, joint="elbow")
+    first, second = verdict([slight, after], found(160, "actuator", "lower", "elbow")).faults
+    assert (first.seen, second.seen, second.delay) == ("not struck", "detected", 4)

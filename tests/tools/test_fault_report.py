@@ -80,6 +80,22 @@ def test_a_detection_without_a_fault_is_shown_as_one(report: Report) -> None:
     assert "| 7    | upper    | gap | a message is missing |" in lines
 
 
+@pytest.mark.parametrize(("lasts", "recovered"), [(', for = "50ms"', "ms"), ("", "not recovered")])
+def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
+    tmp_path: Path, rack_name: str, lasts: str, recovered: str
+) -> None:
+    from tests.conftest import SMALL
+
+    (tmp_path / "small.toml").write_text(SMALL)
+    mute = f'fault=[{{ kind = "mute", board = "lower", tick = 80{lasts} }}]'
+    run_rack(load(tmp_path / "small.toml", [f"name={rack_name}", mute]), 2.0, tmp_path / "run", Display())
+    report = write_report(tmp_path / "run")[0]
+    (fault,) = report["faults"]
+    assert (fault["seen"], fault["found_as"], fault["is_recovered"]) == ("detected", "mute", bool(lasts))
+    row = next(line for line in markdown(report).splitlines() if line.startswith("| mute"))
+    assert row.strip("| ").endswith(recovered)
+
+
 def test_a_run_without_faults_has_no_such_section(report: Report) -> None:
     plain = markdown({**report, "faults": [], "restarts": {}})
     assert "Faults" not in plain

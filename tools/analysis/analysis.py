@@ -116,8 +116,8 @@ class Analysis:
 
     @property
     def judged_breaches(self) -> tuple[Breach, ...]:
-        """The breaches outside the start-up of a process, the worst first."""
-        return tuple(breach for breach in self.breaches if not breach.is_start_up)
+        """The breaches of cycles that are judged, the worst first."""
+        return tuple(breach for breach in self.breaches if breach.is_judged)
 
 
 def _paired(predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]) -> list[Pair]:

@@ -68,13 +68,15 @@ class Broken:
 
 @dataclass(frozen=True)
 class Breach:
-    """A cycle that broke equations. `excess` is its overrun as a multiple of the time available, for sorting."""
+    """A cycle that broke equations. `excess` is its overrun as a multiple of the time available, for sorting.
+
+    `is_judged` excludes what `Cycles.is_judged` does."""
 
     task: str
     tick: int
     broken: tuple[Broken, ...]
     excess: float
-    is_start_up: bool
+    is_judged: bool
     sharing: CoreSharing
 
 
@@ -100,7 +102,7 @@ def _breaches_of(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> It
                 _broken(rule, int(row), count) for rule, failed in zip(rules, fails[:, row], strict=True) if failed
             ),
             excess=float(excess[row]),
-            is_start_up=not cycles.is_judged[row],
+            is_judged=bool(cycles.is_judged[row]),
             sharing=sharing,
         )
 

@@ -77,14 +77,14 @@ def _breach(breach: Breach, clock_ns: int) -> Document:
         "task": breach.task,
         "tick": breach.tick,
         "time_s": round(breach.tick * clock_ns * 1e-9, 6),
-        "start_up": breach.is_start_up,
+        "judged": breach.is_judged,
         "equations": [asdict(broken) for broken in breach.broken],
         "core": asdict(breach.sharing) | {"text": breach.sharing.text()},
     }
 
 
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:
-    """Return the times of one task without its start-up, ms; lateness and response are None in lockstep."""
+    """Return the times of the judged cycles of one task, ms; lateness and response are None in lockstep."""
     judged, is_lockstep = cycles.is_judged, rack.is_lockstep
     rows, gaps = cycles.rows[judged], gaps_ns(cycles.rows[judged])
     missed, skipped = counts(rows)
@@ -93,7 +93,8 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
         "core": cycles.core,
         "priority": cycles.priority,
         "cycles": len(rows),
-        "start_up": len(cycles.rows) - len(rows),
+        "start_up": len(cycles.rows) - len(rows) - cycles.stalled,
+        "stalled": cycles.stalled,
         "missed": missed,
         "skipped": skipped,
         "used_ms": distribution(cycles.used_ns[judged] * MS),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from rack.boards.config.timing import tick_ns
 from rack.levels.force.messages import FORCE_STATUS, WRENCH
 from rack.levels.hand.messages import HAND_STATUS
 from rack.levels.joint_messages import DRIVING
-from rack.levels.messages import TASK_STATUS
+from rack.levels.messages import SCENE, TASK_STATUS
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
     communication_ns,
@@ -37,8 +37,17 @@ from rack.tools.runs.interrupts import interrupts
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.queues import queues
 from rack.tools.runs.recording import Recording
+from rack.tools.runs.stalls import stalls_of
 
 Report = dict[str, Any]
+FALLING_M_S = 0.05
+"""Speed from which an object falls: a grip that slips, or fingers that lower it, are slower."""
+BOUNCE = 2
+"""Samples between the parts of one fall."""
+SETTLE = 20
+"""Samples after a fall in which the object comes to rest: at first it sinks into what it landed on, or bounces."""
+LEAST_M = 0.005
+"""Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part along."""
 ENTRY_COUNTS = ("passed", "refused", "overtaken", "full", "waiting")
 
 
@@ -71,6 +80,7 @@ def report_of(recording: Recording) -> Report:
         "folder": str(recording.folder),
         "misses": found,
         "steal": steal(recording),
+        "stalls": asdict(stalls_of(recording)[0]),
         "frequency_mhz": frequency(recording),
         "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
         "holds": holds(recording),
@@ -81,6 +91,7 @@ def report_of(recording: Recording) -> Report:
         "entries": _entries(recording),
         "network": network(recording),
         "task": _task_outcome(recording),
+        "objects": list(_objects(recording, config)),
         "motion": _motion(recording),
         "hand": _hand(recording, config),
         "force": _force(recording),
@@ -94,8 +105,9 @@ def report_of(recording: Recording) -> Report:
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
     unknown = (
-        *("misses", "steal", "frequency_mhz", "notes", "holds", "state_tables", "faults", "unexplained", "restarts"),
-        *("system_response", "entries", "network", "task", "motion", "hand", "force", "queues", "interrupts"),
+        *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
+        *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
+        *("task", "motion", "hand", "force", "queues", "interrupts"),
         "rows_lost",
     )
     layout = wire(config)
@@ -116,6 +128,7 @@ def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
         "worked": ended.get("worked", False),
         "outcome": outcome or None,
         "digest": outcome.get("digest"),
+        "objects": outcome.get("objects", []),
         "simulated_s": round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
         "wall_s": round(ended.get("wall_s", 0.0), 6),
         "clock_skipped": ended.get("clock_skipped", 0),
@@ -166,14 +179,14 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
     by_the_clock: Report = {
         "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
         "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),
-        "largest_gap_ms": round(float(gaps.max()) * 1e-6, 6) if len(gaps) else None,
+        "largest_gap_ms": _rounded(gaps.max() * 1e-6) if len(gaps) else None,
         "alpha_ms": None,
         "deviation_ms": None,
     }
     if len(cycles):
         times = execution_ns(cycles).tolist(), communication_ns(cycles).tolist()
-        by_the_clock["alpha_ms"] = round(residual_bound_ns(slice_ns, *times) * 1e-6, 6)
-        by_the_clock["deviation_ms"] = round(residual_deviation_ns(*times) * 1e-6, 6)
+        by_the_clock["alpha_ms"] = _rounded(residual_bound_ns(slice_ns, *times) * 1e-6)
+        by_the_clock["deviation_ms"] = _rounded(residual_deviation_ns(*times) * 1e-6)
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * 1e-6,
@@ -210,6 +223,30 @@ def _task_outcome(recording: Recording) -> Report | None:
     return {"state": State(int(last("state"))).name.lower(), "reason": str(last("reason")), **counts}
 
 
+def _objects(recording: Recording, config: RackConfig) -> Iterator[Report]:
+    """Yield where each object that has a goal ended, and its falls."""
+    for end in recording.ended.get("outcome", {}).get("objects", ()):
+        row = config.scene.objects.index(end["object"])
+        yield {**end, "drops": list(_drops(recording, row))}
+
+
+def _drops(recording: Recording, row: int) -> Iterator[Report]:
+    """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the tool."""
+    mailbox = _mailbox_of(recording, SCENE.name)
+    if mailbox is None:
+        return
+    ticks, place = recording.signal(mailbox, "tick"), recording.signal(mailbox, "position")[:, row]
+    # What moves and turns with the tool keeps its distance from it.
+    away = np.linalg.norm(place - recording.signal(mailbox, "tool_position"), axis=1)
+    height, least = place[:, 2], FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
+    falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(away))) > least)
+    first = falling[np.diff(falling, prepend=-BOUNCE - 1) > BOUNCE]
+    last = falling[np.diff(falling, append=len(ticks) + BOUNCE) > BOUNCE] + 1
+    for begin, end in zip(first, last, strict=True):
+        if (fallen := height[begin] - height[end:][:SETTLE][-1]) > LEAST_M:
+            yield {"tick": int(ticks[begin]), "mm": _rounded(fallen * 1e3)}
+
+
 def _motion(recording: Recording) -> Report | None:
     """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set points, or None."""
     mailbox = _mailbox_of(recording, *DRIVING)
@@ -217,11 +254,24 @@ def _motion(recording: Recording) -> Report | None:
         return None
     error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
     return {
-        "tracking_rms_mrad": round(float(np.sqrt(np.mean(error**2))), 6),
-        "tracking_peak_mrad": round(float(np.abs(error).max()), 6),
-        **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
-        "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
+        "tracking_rms_mrad": _rms(error),
+        "tracking_peak_mrad": _rounded(np.abs(error).max()),
+        **_counts(recording, mailbox),
     }
+
+
+def _counts(recording: Recording, mailbox: str) -> Report:
+    """Return what a board that drives an arm or a hand has counted."""
+    names = {name: name for name in ("touches", "violations", "pushed")} | {"clipped_cycles": "clipped"}
+    return {key: int(recording.signal(mailbox, name)[-1]) for key, name in names.items()}
+
+
+def _rms(error: np.ndarray) -> float:
+    return _rounded(np.sqrt(np.mean(error**2)))
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 6)
 
 
 def _hand(recording: Recording, config: RackConfig) -> Report | None:
@@ -231,17 +281,16 @@ def _hand(recording: Recording, config: RackConfig) -> Report | None:
         return None
     tension, force = recording.signal(mailbox, "tension"), recording.signal(mailbox, "force")
     error = tension - recording.signal(mailbox, "wanted")
-    most = np.sqrt((force**2).sum(axis=2)).max(axis=0)
+    most = np.linalg.norm(force, axis=2).max(axis=0)
     fingers = [finger.name for finger in config.robot.hand.finger]
     return {
-        "tension_rms_n": round(float(np.sqrt(np.mean(error**2))), 6),
-        "tension_peak_n": round(float(np.abs(error).max()), 6),
-        "least_tension_n": round(float(tension.min()), 6),
-        "largest_tension_n": round(float(tension.max()), 6),
-        "largest_force_n": {finger: round(float(value), 6) for finger, value in zip(fingers, most, strict=True)},
+        "tension_rms_n": _rms(error),
+        "tension_peak_n": _rounded(np.abs(error).max()),
+        "least_tension_n": _rounded(tension.min()),
+        "largest_tension_n": _rounded(tension.max()),
+        "largest_force_n": {finger: _rounded(value) for finger, value in zip(fingers, most, strict=True)},
         "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
-        **{name: int(recording.signal(mailbox, name)[-1]) for name in ("touches", "violations", "pushed")},
-        "clipped_cycles": int(recording.signal(mailbox, "clipped")[-1]),
+        **_counts(recording, mailbox),
     }
 
 
@@ -251,17 +300,17 @@ def _force(recording: Recording) -> Report | None:
     if wrench is None:
         return None
     halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)
-    force, torque = np.sqrt((halves**2).sum(axis=2)).max(axis=0)
+    force, torque = np.linalg.norm(halves, axis=2).max(axis=0)
     error = np.zeros(0)
     if status is not None:
         # The tool exerts the opposite of what it feels.
         off = recording.signal(status, "wanted") + recording.signal(status, "wrench")
         error = off[:, :3][recording.signal(status, "selected")[:, :3] == 1]
     return {
-        "largest_force_n": round(float(force), 6),
-        "largest_torque_nm": round(float(torque), 6),
+        "largest_force_n": _rounded(force),
+        "largest_torque_nm": _rounded(torque),
         "exceeded_cycles": int(recording.signal(wrench, "exceeded")[-1]),
-        "force_rms_n": round(float(np.sqrt(np.mean(error**2))), 6) if len(error) else None,
+        "force_rms_n": _rms(error) if len(error) else None,
     }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
+from rack.boards.events import Braking, braked_text
 from rack.tools.console.tables import decimal, figure, markdown_table, table
 from rack.tools.runs.history import counted
 from rack.tools.runs.holds import resume_command
@@ -75,6 +76,8 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
         f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
     )
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
+    if found := outcome.get("brakings"):
+        yield f"- {braked_text([Braking(**one) for one in found])}"
     yield from (f"- {note}" for note in report["notes"])
     yield from _machine(report)
     if report["recording"] != "complete":
@@ -83,6 +86,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
         yield f"- the recorder lost rows: {lost}"
     yield from _against(report.get("against"))
     yield from _task(report["task"])
+    yield from _objects(report["objects"])
     yield from _motion(report["motion"])
     yield from _hand(report["hand"])
     yield from _force(report["force"])
@@ -150,12 +154,19 @@ def _first(rows: Sequence[Any], which: str) -> str:
 
 
 def _machine(report: Report) -> Iterator[str]:
-    """Yield what the machine did to its cores: time that the hypervisor took, and changes of frequency."""
-    steal, frequency = report["steal"], report["frequency_mhz"] or {}
+    """Yield what the machine did to its cores: when they were away, by whom if that is known; changes of frequency."""
+    steal, stalls, frequency = report["steal"], report["stalls"], report["frequency_mhz"] or {}
+    lost = f"of {stalls['lost']} lost cycles were due meanwhile"
     if steal["ms"]:
         cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
-        during = f"{steal['missed_during']} of {steal['missed']} misses came meanwhile"
-        yield f"- the hypervisor took {cores} of the run (steal); {during}"
+        yield f"- the hypervisor took {cores} of the run (steal); {stalls['during_steal']} {lost}"
+    for away in stalls["absences"]:
+        times = f"stalls: {away['times']}, longest {away['longest_ms']:.3g} ms"
+        nothing = f"core {away['core']} ran nothing of the rack though it was due, without steal"
+        yield f"- {nothing} ({times}); {away['lost']} {lost}"
+    if quota := stalls["quota"]:
+        causes = [*(f"the cycle of {level}" for level in quota["levels"]), "a quota of the host"]
+        yield f"- {quota['together']} of {quota['stalls']} stalls end at one phase of 100 ms: {' or '.join(causes)}"
     changed = {core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED * mhz["min"]}
     if changed:
         cores = ", ".join(f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz" for core, mhz in changed.items())
@@ -193,6 +204,7 @@ def _fault_row(fault: Report) -> list[str]:
     found = f"{fault['found_as']} by {fault['found_by']}" if fault["seen"] == "detected" else fault["seen"]
     in_ms = fault["bound_ms"] is not None
     unit, after, bound = ("ms", "delay_ms", "bound_ms") if in_ms else ("cycles", "delay_cycles", "bound_cycles")
+    recovered = "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms"
     return [
         fault["kind"],
         f"{fault['board']} {subject}".strip(),
@@ -200,7 +212,7 @@ def _fault_row(fault: Report) -> list[str]:
         found,
         *("-" if fault[key] is None else f"{fault[key]:.3g} {unit}" for key in (after, bound)),
         ", ".join(fault["reactions"]) or "-",
-        "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms",
+        recovered if fault["is_recovered"] else "not recovered",
     ]
 
 
@@ -230,6 +242,18 @@ def _task(task: Report | None) -> Iterator[str]:
     if task is not None:
         done = f"{task['action']} of {task['actions']} actions, {task['moves_done']} of {task['moves']} elemental moves"
         yield from ("", f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}.")
+
+
+def _objects(objects: Sequence[Report]) -> Iterator[str]:
+    """Yield how far each object ended from its goal, and its falls."""
+    for entry in objects:
+        off = f"{entry['off_mm']:.1f} mm from its goal (tolerance {entry['tolerance_mm']:g} mm)"
+        yield f"Object {entry['object']} ended {off}."
+        for drop in entry.get("drops", ()):
+            yield (
+                f"Object {entry['object']} was let go {drop['mm']:.0f} mm above what it landed on, "
+                f"at tick {drop['tick']}."
+            )
 
 
 def _motion(motion: Report | None) -> Iterator[str]:

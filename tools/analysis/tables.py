@@ -72,6 +72,8 @@ def _head(analysis: Analysis) -> Iterator[str]:
     if restarted := restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
     yield f"the first {START_UP_S:g} s of each process are not judged; t_cs is {config.timing.context_switch_ms:g} ms"
+    if stalled := ", ".join(f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled):
+        yield f"cycles with a stall in them are not judged: {stalled}"
     yield from (f"{count} rows of {name} were lost" for name, count in analysis.recording.lost.items() if count)
 
 
@@ -130,15 +132,15 @@ def _relation(relation: EquationVerdict | Broken) -> str:
 
 def _broken_cycles(analysis: Analysis) -> Iterator[str]:
     judged, tick_s = analysis.judged_breaches, analysis.recording.layout.clock_ns * 1e-9
-    starting = len(analysis.breaches) - len(judged)
+    others = len(analysis.breaches) - len(judged)
     yield ""
     if not judged:
-        yield f"No cycle broke an equation by its own numbers, except {starting} in start-ups."
+        yield f"No cycle broke an equation by its own numbers, except {others} in start-ups and stalls."
         return
     yield "Cycles that broke an equation by their own numbers:"
     for task in dict.fromkeys(breach.task for breach in judged):
         yield f"  {_counted(task, judged, int(analysis.cycles[task].is_judged.sum()))}"
-    yield f"  in start-ups: {starting}"
+    yield f"  in start-ups and stalls: {others}"
     shown = judged[:SHOWN]
     yield ""
     yield f"The worst {len(shown)}, with the use of their core:"

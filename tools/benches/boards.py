@@ -22,7 +22,7 @@ from rack.boards.config import loads
 from rack.tools.benches import relay
 from rack.tools.benches.chain import LONGEST, PRIORITY, Chain
 from rack.tools.benches.chain_figures import RATE_HZ, Boards, ChainFigures
-from rack.tools.benches.checkout import RackCommand, checkout, this_rack
+from rack.tools.benches.checkout import RackCommand, both_racks
 from rack.tools.benches.comparison import turns
 from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.benches.observed import Observed, Runs, missed_share, observe
@@ -47,7 +47,7 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
     peers = () if absent else cores
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-bench-")))
-        racks = [this_rack(), *([] if against is None else [stack.enter_context(checkout(against))])]
+        racks = stack.enter_context(both_racks(against))
         chains = [
             _ChainRuns(Chain(count, RATE_HZ), runs, peers, list(_configs(count, racks, folder))) for count in counts
         ]
@@ -55,7 +55,7 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
         for chain in chains:
             progress.begin(f"boards: {chain.chain.boards}")
             chain.measure()
-            progress.end(chain.lasts_s, "done", ())
+            progress.end(chain.lasts_s)
         return Boards(
             tuple(chain.figures() for chain in chains), tuple(rack.name for rack in racks), len(cores), absent
         )

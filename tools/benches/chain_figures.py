@@ -130,8 +130,12 @@ class Boards:
         cycles = ", ".join(map(str, sorted({*one.responses, *one.lockstep_responses})))
         costs = [one.lockstep_us[tree] for tree in self.trees]
         return [
-            *(str(one.boards), decimal(one.processor_us, 1), decimal(one.processor_us / one.boards, 1), *shares),
-            *("held" if one.held else "not held", f"{cycles}{'' if one.exact else ' INEXACT'}"),
+            str(one.boards),
+            decimal(one.processor_us, 1),
+            decimal(one.processor_us / one.boards, 1),
+            *shares,
+            "held" if one.held else "not held",
+            f"{cycles}{'' if one.exact else ' INEXACT'}",
             *(decimal(cost, 1) for cost in costs),
             *([decimal(costs[0] / costs[1], 2)] if len(costs) > 1 else []),
         ]
@@ -151,7 +155,6 @@ class Boards:
                 if fit:
                     ends = np.array([0, self.counts[-1]])
                     costs.plot(ends, fit.base_us + fit.board_us * ends, color=colour, linewidth=0.8)
-            costs.set_xlim(0, self.counts[-1] + 1)
             costs.set_ylim(0, None)
             costs.set_ylabel("us a tick")
             shares.plot(
@@ -160,10 +163,10 @@ class Boards:
             if self.absent is None:
                 late = [100 * (one.late or 0.0) for one in self.figures]
                 shares.plot(self.counts, late, "s-", color=PEER, label="cyclictest: late by a cycle")
-            shares.set_xlim(0, self.counts[-1] + 1)
             shares.set_ylim(0, max(0.5, 130 * max(max(one.missed, one.late or 0.0) for one in self.figures)))
             shares.set_ylabel("% of the cycles")
             for axes in (costs, shares):
+                axes.set_xlim(0, self.counts[-1] + 1)
                 axes.set_xlabel("boards")
                 axes.set_xticks(self.counts)
                 axes.grid(color=SPREAD, linewidth=0.4)

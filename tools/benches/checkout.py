@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -84,6 +84,14 @@ def checkout(tree: Path) -> Iterator[RackCommand]:
         changes = {"PYTHONPATH": os.pathsep.join(filter(None, path)), "PYTHONSAFEPATH": "1"}
         package = "rack." if entry.startswith("rack.") else ""
         yield RackCommand(tree.resolve().name, _argv(entry), {**os.environ, **changes}, package)
+
+
+@contextmanager
+def both_racks(against: Path | None) -> Iterator[list[RackCommand]]:
+    """Give the command line of this tree, and after it that of the checkout `against`, if there is one."""
+    with ExitStack() as stack:
+        others = [] if against is None else [stack.enter_context(checkout(against))]
+        yield [this_rack(), *others]
 
 
 def _argv(entry: str) -> tuple[str, ...]:

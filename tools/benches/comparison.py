@@ -112,6 +112,7 @@ class Comparison:
     """All samples of a bench. `baselines` names the contestant of each case that the others are compared with.
 
     `name` is one word, as in the command; `title` says what is measured. A case without a baseline has no ratios.
+    `conclusion` is what follows from the figures, in one line; empty: nothing.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Comparison:
     samples: tuple[Sample, ...]
     baselines: Mapping[str, str]
     absent: tuple[Absent, ...] = ()
+    conclusion: str = ""
 
     @property
     def cases(self) -> list[str]:
@@ -153,6 +155,7 @@ class Comparison:
             "baselines": dict(self.baselines),
             "samples": [self._figures(sample) for sample in self.samples],
             "absent": [asdict(one) for one in self.absent],
+            "conclusion": self.conclusion,
         }
 
     def _figures(self, sample: Sample) -> dict[str, Any]:
@@ -168,6 +171,8 @@ class Comparison:
         yield from table(head, rows, width, ("count", "worst", "p99 ratio", "best"))
         for one in self.absent:
             yield one.line
+        if self.conclusion:
+            yield self.conclusion
 
     def _row(self, sample: Sample) -> list[str]:
         figures = [shown(getattr(sample, name)) for name in ("median", "p99", "best", "worst")]

@@ -21,7 +21,7 @@ import numpy as np
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Occupation, unit_times
 from rack.tools.benches.apart import apart
-from rack.tools.benches.checkout import THIS, RackCommand, checkout, this_rack
+from rack.tools.benches.checkout import THIS, RackCommand, both_racks
 from rack.tools.benches.comparison import Comparison, Sample, shown, turns
 from rack.tools.benches.empty import write_empty_rack
 from rack.tools.benches.physics import SERVO, ReplayPace, replay
@@ -131,13 +131,16 @@ class CycleCosts:
             for part, colour in zip(PARTS, COLOURS, strict=True):
                 axes.barh(row, one.parts[part], left=left, height=0.6, color=colour)
                 if part == "process" and physics is not None:
-                    style: dict[str, Any] = {
-                        "facecolor": "none",
-                        "edgecolor": PHYSICS,
-                        "hatch": HATCH,
-                        "linewidth": 0.0,
-                    }
-                    axes.barh(row, physics.median, left=left, height=0.6, **style)
+                    axes.barh(
+                        row,
+                        physics.median,
+                        left=left,
+                        height=0.6,
+                        facecolor="none",
+                        edgecolor=PHYSICS,
+                        hatch=HATCH,
+                        linewidth=0.0,
+                    )
                 left += one.parts[part]
             axes.annotate(self._words(one), (end, row), (3, 0), textcoords="offset points", va="center", fontsize=7)
         axes.set_yticks(range(len(own)), [one.who for one in own])
@@ -180,13 +183,13 @@ def measure(against: Path | None, seconds: float, rounds: int, progress: Progres
     `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run fails.
     """
     with ExitStack() as stack:
-        commands = [this_rack()] + ([stack.enter_context(checkout(against))] if against is not None else [])
+        commands = stack.enter_context(both_racks(against))
         runs = CycleRuns(seconds, Path(stack.enter_context(TemporaryDirectory())), share)
         progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
         for turn, (kind, command) in turns([(kind, command) for kind in KINDS for command in commands], rounds):
             progress.begin(f"{kind.config}, {kind.mode}, {command.name}: round {turn + 1} of {rounds}")
             runs.run(kind, command)
-            progress.end(seconds + LAUNCH_S, "done", ())
+            progress.end(seconds + LAUNCH_S)
         return costs(runs.found, commands[-1].name if len(commands) > 1 else None)
 
 

@@ -59,11 +59,11 @@ def permits_fifo() -> bool:
 def cyclictest(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every wake, us, shape (n,): smallest first, a thread at a time.
 
-    Raises `Failure` if it cannot run.
+    It leaves idle cores as they are, as a rack does by default (`--laptop`). Raises `Failure` if it cannot run.
     """
     with TemporaryDirectory(prefix="rack-bench-") as folder:
         path = Path(folder) / "found.json"
-        command = [CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo"]
+        command = [CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop"]
         command += [f"--affinity={','.join(map(str, grid.cores))}", f"--threads={len(grid.cores)}"]
         command += [f"--priority={grid.priority}", f"--interval={grid.period_ns // 1000}", "--distance=0"]
         command += [f"--loops={grid.wakes}", f"--histogram={LONGEST_US}", f"--json={path}"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,13 +14,11 @@ from rack.levels.hand.messages import GraspKind
 from rack.levels.timing.rack import spanned
 from rack.levels.timing.trace_times import counts
 from rack.tools.benches.hand_figures import HandBench, HandFigures, LinkFigures
+from rack.tools.benches.observed import Recorded, record
 from rack.tools.console.progress import Progress
 from rack.tools.runs.cycles import cycles_of
-from rack.tools.runs.display import Display
-from rack.tools.runs.entries import recorded_entries
 from rack.tools.runs.exchange_times import ExchangeTimes, exchange_times
 from rack.tools.runs.interrupts import interrupts
-from rack.tools.runs.launch import RunResult, run_rack
 from rack.tools.runs.recording import Recording
 
 RACKS = ("hic", "condor")
@@ -34,41 +31,27 @@ SETTLED_S = 0.3
 """Simulated time after the end of a pull in which the object comes back."""
 
 
-@dataclass(frozen=True)
-class _Ran:
-    """One run of a rack."""
-
-    result: RunResult
-    recording: Recording
-
-
 def measure(rounds: int, share: bool, progress: Progress, racks: Sequence[str] = RACKS) -> HandBench:
-    """Run both racks by turns, in real time, then in lockstep with the same entries; return their figures."""
+    """Run both racks by turns, in real time, then in lockstep; return their figures."""
     progress.total(2 * len(racks) * rounds * (ABOUT_S + LAUNCH_S))
-    found: dict[tuple[str, str], list[_Ran]] = {(rack, mode): [] for rack in racks for mode in MODES}
+    found: dict[tuple[str, str], list[Recorded]] = {(rack, mode): [] for rack in racks for mode in MODES}
     with TemporaryDirectory(prefix="rack-bench-") as scratch:
         for turn in range(rounds):
             for rack in racks if turn % 2 == 0 else reversed(racks):
-                first = Path(scratch) / f"{rack}-{turn}"
                 for mode in MODES:
                     progress.begin(f"{rack}: {mode}, run {turn + 1} of {rounds}")
-                    entered = first.with_suffix(".realtime") if mode == "lockstep" else None
-                    ran = _run(rack, first.with_suffix(f".{mode}"), share, entered)
+                    ran = _run(rack, mode, Path(scratch) / f"{rack}-{turn}.{mode}", share)
                     found[rack, mode].append(ran)
-                    progress.end(ABOUT_S + LAUNCH_S, "done" if ran.result.worked else ran.result.failure(), ())
+                    progress.end(ABOUT_S + LAUNCH_S, "done" if ran.result.worked else ran.result.failure())
         return HandBench(tuple(_figures(rack, mode, ran) for (rack, mode), ran in found.items()))
 
 
-def _run(rack: str, folder: Path, share: bool, entered: Path | None) -> _Ran:
-    """Run a rack in real time; in lockstep if what entered in the run in folder `entered` is to enter again."""
-    mode = "realtime" if entered is None else "lockstep"
+def _run(rack: str, mode: str, folder: Path, share: bool) -> Recorded:
     config = load(rack, [f"name=hand-{os.getpid()}", f"clock.mode={mode}", "clock.speed=1.0"])
-    entries = recorded_entries(config, entered) if entered is not None and config.host else None
-    result = run_rack(config, None, folder, Display(), share=share, entries=entries)
-    return _Ran(result, Recording(folder))
+    return record(config, None, folder, share)
 
 
-def _figures(rack: str, mode: str, runs: Sequence[_Ran]) -> HandFigures:
+def _figures(rack: str, mode: str, runs: Sequence[Recorded]) -> HandFigures:
     shifts = [shift for ran in runs if (shift := shift_mm(ran.recording)) is not None]
     misses = [counts(rows) for ran in runs for rows in ran.recording.cycles.values()]
     costs = np.array([_costs_ms(ran.recording) for ran in runs]).max(axis=0)

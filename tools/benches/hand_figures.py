@@ -106,9 +106,15 @@ class HandBench:
             for one in self.figures:
                 for link in (link for link in one.links if link.message == message):
                     yield [
-                        *(message, one.name, f"{link.writers} > {link.readers}", link.protocol, f"{link.period_ms:g}"),
-                        *(decimal(link.jitter_p50_ms), decimal(link.jitter_max_ms)),
-                        *(decimal(link.age_p50_ms), decimal(link.age_max_ms)),
+                        message,
+                        one.name,
+                        f"{link.writers} > {link.readers}",
+                        link.protocol,
+                        f"{link.period_ms:g}",
+                        decimal(link.jitter_p50_ms),
+                        decimal(link.jitter_max_ms),
+                        decimal(link.age_p50_ms),
+                        decimal(link.age_max_ms),
                         *map(str, (link.sent, link.lost, link.overtaken)),
                     ]
 
@@ -169,8 +175,12 @@ class HandBench:
 
 def _rack_row(one: HandFigures) -> Sequence[str]:
     times = (one.exchange_ms, one.process_ms, one.handler_ms)
-    shifts = (decimal(one.shift_mm, 2), decimal(one.left_mm, 2))
     return [
-        *(one.name, *shifts, *(f"{time:.1f}" for time in times)),
-        *(str(one.missed), str(one.cycles), "failed" if one.failure else "done"),
+        one.name,
+        decimal(one.shift_mm, 2),
+        decimal(one.left_mm, 2),
+        *(f"{time:.1f}" for time in times),
+        str(one.missed),
+        str(one.cycles),
+        "failed" if one.failure else "done",
     ]

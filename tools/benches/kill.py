@@ -13,7 +13,7 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
-from rack.levels.arm.arm import PATIENCE_CYCLES
+from rack.levels.robot.cell import build_cell
 from rack.tools.benches.comparison import Sample
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
@@ -43,6 +43,8 @@ class Killing:
             raise Failure(f"{name}: no arm whose brakes could engage", 2)
         self.boards = servo, above[0]
         self._config = config
+        cell = build_cell(config.robot, config.scene, config.clock_ns)
+        self._patience = cell.patience.ticks(config.every(servo), config.clock_ns * 1e-9)
         self._random = Random(kills)
 
     def samples(self, board: str, expected_s: float) -> Iterator[Sample]:
@@ -63,7 +65,7 @@ class Killing:
             rack.stop("measured")
             while rack.watch(LOOK_S):
                 continue
-        self._progress.end(self._kills * expected_s, "done", ())
+        self._progress.end(self._kills * expected_s)
         cycle_s = config.every(self.boards[0]) * rack.segment.words[System.PERIOD_NS] * 1e-9
         for what, times in found.items():
             yield Sample(f"{board} killed", what, tuple(1e3 * seconds for seconds in times), "ms")
@@ -106,8 +108,7 @@ class Killing:
         """
         if not braked.value:
             return braked.time_ns - offset_ns
-        patience = PATIENCE_CYCLES * self._config.every(self.boards[0])
-        return SystemClock(rack.segment).time_of(braked.tick - int(braked.value) + patience)
+        return SystemClock(rack.segment).time_of(braked.tick - int(braked.value) + self._patience)
 
 
 def _watch(rack: Rack, seconds: float, is_over: Callable[[], bool]) -> None:

@@ -69,7 +69,7 @@ def measure(runs: LanRuns, progress: Progress) -> LanFigures:
                     # The others count all the same.
                     ended = str(failure)
                     absent.append(Absent(f"{who} with {count} racks", ended))
-                progress.end(bench.cost_s(count), ended, ())
+                progress.end(bench.cost_s(count), ended)
             if lacks is None:
                 bench.wake(count)
     return bench.figures(absent)

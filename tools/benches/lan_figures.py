@@ -125,8 +125,7 @@ class LanFigures:
             axes.plot(racks, p99s, "--", color=colour, linewidth=0.7)
         axes.set_xscale("log", base=2)
         axes.set_yscale("log")
-        axes.set_xticks(
-            sorted({number for _, number, _ in found}), sorted({str(number) for _, number, _ in found}, key=int)
-        )
+        counts = sorted({number for _, number, _ in found})
+        axes.set_xticks(counts, map(str, counts))
         axes.legend(frameon=False, fontsize=6)
         axes.spines[["top", "right"]].set_visible(False)

@@ -11,7 +11,6 @@ from dataclasses import asdict
 from pathlib import Path
 from subprocess import PIPE
 from tempfile import TemporaryDirectory, TemporaryFile
-from types import TracebackType
 from typing import Any, Self
 
 from rack.backplane.process import readable
@@ -61,9 +60,7 @@ class Group:
         self._coordinator.notices.clear()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end()
 
     def _end(self) -> None:

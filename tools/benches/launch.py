@@ -7,7 +7,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ import pyarrow.parquet as pq
 
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.tools.benches.checkout import RackCommand, checkout, this_rack
+from rack.tools.benches.checkout import RackCommand, both_racks
 from rack.tools.benches.comparison import Comparison, Sample, interleaved
 from rack.tools.benches.kill import Killing
 from rack.tools.console.answer import Failure
@@ -50,18 +49,16 @@ def measure(name: str, counts: LaunchCounts, against: Path | None, share: bool, 
     """
     rounds, kills = counts
     progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
-    own = this_rack()
-    with ExitStack() as stack:
-        other = None if against is None else stack.enter_context(checkout(against))
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        trees = [own, *([] if other is None else [other])]
+    with both_racks(against) as trees, tempfile.TemporaryDirectory() as folder:
         progress.begin("launches and commands")
-        samples = list(_samples(name, trees, ShortRuns(folder, share), rounds))
-        progress.end(rounds * ROUND_S, "done", ())
+        samples = list(_samples(name, trees, ShortRuns(Path(folder), share), rounds))
+        progress.end(rounds * ROUND_S)
     killing = Killing(name, kills, progress)
     samples += [sample for board in killing.boards for sample in killing.samples(board, KILL_S)]
     cases = dict.fromkeys(sample.case for sample in samples if sample.who == INTERPRETER)
-    baselines = dict.fromkeys(cases, INTERPRETER) | ({} if other is None else {LAUNCH: other.name})
+    baselines = dict.fromkeys(cases, INTERPRETER)
+    if against is not None:
+        baselines[LAUNCH] = trees[-1].name
     return Comparison("launch", "launches, short commands, and reactions to a kill", tuple(samples), baselines)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from rack.boards.config import load, resolve
 from rack.tools.benches.apart import apart
 from rack.tools.benches.bare import BareRun, run_bare
-from rack.tools.benches.checkout import RackCommand, checkout, this_rack
+from rack.tools.benches.checkout import RackCommand, both_racks, this_rack
 from rack.tools.benches.comparison import Comparison, Sample, shown, turns
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
@@ -75,8 +74,7 @@ def measure(against: Path | None, racks: Mapping[str, float | None], rounds: int
 
     Raises `Failure` if a run fails, or if the levels without a rack did other work.
     """
-    with ExitStack() as stack:
-        commands = [this_rack()] + ([stack.enter_context(checkout(against))] if against is not None else [])
+    with both_racks(against) as commands:
         names = [command.name for command in commands]
         progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
         found: dict[tuple[str, str], list[float]] = {}
@@ -84,13 +82,13 @@ def measure(against: Path | None, racks: Mapping[str, float | None], rounds: int
             progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
             with TemporaryDirectory() as folder:
                 ticks = _check(rack, seconds, Path(folder) / "run")
-            progress.end(EXPECTED_S, "equal", ())
+            progress.end(EXPECTED_S, "equal")
             ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
             ways[BARE] = partial(_run_bare, rack, ticks)
             for turn, who in turns(list(ways), rounds):
                 progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
                 found.setdefault((rack, who), []).append(ways[who]())
-                progress.end(EXPECTED_S, "done", ())
+                progress.end(EXPECTED_S)
     return speeds(found, names)
 
 

@@ -75,7 +75,7 @@ def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Compariso
     for case in cases:
         progress.begin(case.name)
         samples += _measure_case(case, present, rounds)
-        progress.end(CASE_S, "done", ())
+        progress.end(CASE_S)
     absent = tuple(one for one in missing.values() if one is not None)
     return compare(samples, absent)
 

@@ -14,9 +14,9 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from rack.backplane.process import is_alive, readable, start_time
@@ -78,9 +78,7 @@ class Lab:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._close()
 
     def _build(self) -> None:
@@ -196,7 +194,8 @@ def _end(names: Sequence[str]) -> None:
         while (inside := _inside(names)) and time.monotonic() < deadline:
             roots = {pid for pid, parent in inside.items() if how is signal.SIGKILL or parent not in inside}
             for pid in roots - struck:
-                _strike(pid, how)
+                with suppress(ProcessLookupError):
+                    os.kill(pid, how)
             struck |= roots
             _await_end(next(iter(inside)))
 
@@ -217,13 +216,6 @@ def _inside(names: Sequence[str]) -> dict[int, int]:
             # It has ended, or is none of ours: not even root may look at every process.
             continue
     return found
-
-
-def _strike(pid: int, how: signal.Signals) -> None:
-    try:
-        os.kill(pid, how)
-    except ProcessLookupError:
-        return
 
 
 def _await_end(pid: int) -> None:

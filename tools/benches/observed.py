@@ -1,9 +1,10 @@
-"""A rack run for its trace alone: the host side reads the rings, and no recorder takes processor time."""
+"""A rack run by a bench: recorded, or for its trace alone, when no recorder takes processor time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +18,10 @@ from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Outcome
-from rack.boards.wiring import Entries
 from rack.levels.timing.trace_times import is_missed
+from rack.tools.runs.display import Display
+from rack.tools.runs.launch import RunResult, run_rack
+from rack.tools.runs.recording import Recording
 
 READ_S = {"realtime": 0.5, "lockstep": 0.02}
 """Wall-clock time between two readings: the rings hold two seconds of simulated time."""
@@ -32,6 +35,24 @@ class Runs(NamedTuple):
     seconds: float
     rounds: int
     share: bool = False
+
+
+class Recorded(NamedTuple):
+    """How a run went, and its recording."""
+
+    result: RunResult
+    recording: Recording
+
+
+def record(
+    config: RackConfig,
+    seconds: float | None,
+    folder: Path,
+    share: bool = True,
+) -> Recorded:
+    """Run a rack as `run_rack` does, which raises, record it into `folder`, and show nothing."""
+    result = run_rack(config, seconds, folder, Display(), share=share)
+    return Recorded(result, Recording(folder))
 
 
 class Deed(NamedTuple):
@@ -83,15 +104,13 @@ def observe(
     seconds: float,
     share: bool,
     mailboxes: Sequence[str] = (),
-    entries: Mapping[str, Entries] | None = None,
     deeds: Sequence[Deed] = (),
 ) -> Observed:
-    """Run a rack for `seconds` of simulated time, or until its task ends.
+    """Run a rack for `seconds` of simulated time, or until its task ends, and read its rings on the host side.
 
-    `deeds` are in the order of their ticks. `share` and `entries` are as in `Rack`, which raises if another rack holds
-    a core.
+    `deeds` are in the order of their ticks. `share` is as in `Rack`, which raises if another rack holds a core.
     """
-    with Rack(config, share=share, entries=entries) as rack:
+    with Rack(config, share=share) as rack:
         segment, ahead = rack.segment, list(deeds)
         tasks = [task.name for task in segment.layout.tasks]
         rings: dict[str, Ring] = {name: trace_ring(segment, name) for name in tasks}

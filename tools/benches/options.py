@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import typer
 
 from rack.tools.console.answer import print_json
 from rack.tools.console.parameters import config_names
+
+if TYPE_CHECKING:
+    from rack.tools.console.progress import Progress
 
 Config = Annotated[
     str,
@@ -30,6 +33,8 @@ Rates = Annotated[
     typer.Option("--rate", metavar="HZ", min=1, max=10_000, help="rate; may be given several times"),
 ]
 Rounds = Annotated[int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")]
+RackRounds = Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")]
+Seconds = Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")]
 
 
 class BenchResult(Protocol):
@@ -45,16 +50,23 @@ class BenchResult(Protocol):
         """Write its pictures into `folder`; return their paths."""
 
 
-def show(found: BenchResult, plot: Path | None, as_json: bool) -> None:
-    """Print what a bench has found and, if asked for, plot it."""
+Found = TypeVar("Found", bound=BenchResult)
+
+
+def show(measure: Callable[[Progress], Found], plot: Path | None, as_json: bool) -> Found:
+    """Measure, with the progress on the terminal; print what was found and, if asked for, plot it. Return it."""
+    from rack.tools.console.progress import progress_for
     from rack.tools.console.tables import terminal_width
 
+    with progress_for(as_json) as progress:
+        found = measure(progress)
     print_found(found.document(), found.lines(terminal_width()), as_json)
     if plot is not None:
         plot.mkdir(parents=True, exist_ok=True)
         paths = found.plot(plot)
         if not as_json:
             print(f"pictures: {', '.join(map(str, paths))}")
+    return found
 
 
 def print_found(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:

@@ -15,11 +15,10 @@ from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wi
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
 from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
+from rack.tools.benches.observed import record
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import figure, table
-from rack.tools.runs.display import display_for
-from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 
 LAUNCH_S = 3.0
@@ -114,15 +113,9 @@ def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[
         for turn in range(rounds):
             for number, (partition, rack) in enumerate(racks.items()):
                 progress.begin(f"{partition.name}, run {turn + 1} of {rounds}")
-                runs[partition].append(_run(rack, seconds, Path(folder) / f"{number}-{turn}"))
-                progress.end(seconds + LAUNCH_S, "done", ())
+                runs[partition].append(record(rack, seconds, Path(folder) / f"{number}-{turn}").recording)
+                progress.end(seconds + LAUNCH_S)
         return [_figures(partition, racks[partition], found) for partition, found in runs.items()]
-
-
-def _run(config: RackConfig, seconds: float, folder: Path) -> Recording:
-    with display_for(silent=True) as display:
-        run_rack(config, seconds, folder, display)
-    return Recording(folder)
 
 
 def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]) -> PartitionFigures:

@@ -194,7 +194,7 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
             else:
                 ran.append(observe(rack, runs.seconds, runs.share))
         figures.append(_figures(rate_hz, board, ran, np.concatenate(late) if late else None, grid.period_ns))
-        progress.end(each_s, figures[-1].verdict, ())
+        progress.end(each_s, figures[-1].verdict)
     return Rates(name, board, core, tuple(figures), absent)
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.process import processor_ns
-from rack.backplane.segment import Segment
+from rack.backplane.ring import Ring
 from rack.backplane.trace import trace_ring
 from rack.boards import Rack
 from rack.boards.config import load
@@ -47,22 +47,10 @@ class RecordingCost:
 
 
 class _Sample(NamedTuple):
-    """Trace records as read by `Meter`, again and again, and the recorder's share of a core."""
+    """Trace records of every task, read again and again, and the recorder's share of a core."""
 
     readings: list[list[np.ndarray]]
     recorder_percent: float
-
-
-class Meter:
-    """Reads the traces of a running rack, phase by phase."""
-
-    def __init__(self, segment: Segment) -> None:
-        tasks = sorted(segment.layout.tasks, key=lambda task: task.every)
-        self._rings = [trace_ring(segment, task.name) for task in tasks]
-
-    def read(self) -> list[np.ndarray]:
-        """Return the trace records since the last call, of the fastest task first."""
-        return [ring.drain().rows for ring in self._rings]
 
 
 def measure(name: str) -> list[RecordingCost]:
@@ -76,15 +64,17 @@ def measure(name: str) -> list[RecordingCost]:
     found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
     with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
         rack.start()
-        meter = Meter(rack.segment)
+        # The fastest task first: its lateness is shown.
+        tasks = sorted(rack.segment.layout.tasks, key=lambda task: task.every)
+        rings = [trace_ring(rack.segment, task.name) for task in tasks]
         _watch(rack, SETTLE_S)
         for turn in range(ROUNDS):
             for phase in PHASES:
                 with _recorder(rack, phase, Path(folder) / f"{phase}-{turn}") as pid:
                     _watch(rack, SETTLE_S)
-                    meter.read()
+                    _drained(rings)
                     used_ns, began_ns = _processor_ns(pid), time.monotonic_ns()
-                    readings = [_reading(rack, meter) for _ in range(round(PHASE_S))]
+                    readings = [_reading(rack, rings) for _ in range(round(PHASE_S))]
                     share = 100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
                     found[phase].append(_Sample(readings, share))
         rack.stop("measured")
@@ -93,10 +83,15 @@ def measure(name: str) -> list[RecordingCost]:
     return [_cost(phase, samples) for phase, samples in found.items()]
 
 
-def _reading(rack: Rack, meter: Meter) -> list[np.ndarray]:
+def _reading(rack: Rack, rings: Sequence[Ring]) -> list[np.ndarray]:
     # The rings hold two seconds.
     _watch(rack, 1.0)
-    return meter.read()
+    return _drained(rings)
+
+
+def _drained(rings: Sequence[Ring]) -> list[np.ndarray]:
+    """Return the trace records since the last call, task by task."""
+    return [ring.drain().rows for ring in rings]
 
 
 @contextmanager
@@ -149,7 +144,10 @@ def lines_of(costs: Sequence[RecordingCost], width: int | None = None) -> Iterat
     head = ["phase", "cycles", "missed", "skipped", "late p50, ms", "p99", "p99.9", "max", "recorder, % of a core"]
     rows = [
         [
-            *(cost.phase, str(cost.cycles), str(cost.missed), str(cost.skipped)),
+            cost.phase,
+            str(cost.cycles),
+            str(cost.missed),
+            str(cost.skipped),
             *(figure(cost.lateness_ms, name) for name in ("p50", "p99", "p99_9", "max")),
             decimal(cost.recorder_percent, 1),
         ]

@@ -25,7 +25,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
 from rack.tools.runs.recording import Recording
-from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
+from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, plot, response_of
 
 RUN_S = 24.0
 """Simulated time of one run, at most."""
@@ -96,6 +96,10 @@ class ResponseBench:
             command = f"command {twin.serial} to {twin.level}, given at tick {twin.given}"
             yield f"without {command}, the torque differs {where}; predicted: {twin.predicted}"
 
+    def plot(self, folder: Path) -> list[Path]:
+        """Write response.png and response.svg into `folder`; return their paths."""
+        return plot(self.response, folder)
+
 
 class ResponseRuns:
     """Runs racks of one config until enough responses are measured. Raises `Failure` if none can be."""
@@ -122,7 +126,7 @@ class ResponseRuns:
                 run = self._run(self._draw(left + left % 2), Path(scratch) / str(self._runs))
                 response = response_of(run.recording)
                 measured = len(response.measured) if response is not None else 0
-                self._progress.end(LOCKSTEP_RUN_S, f"{measured} responses", [])
+                self._progress.end(LOCKSTEP_RUN_S, f"{measured} responses")
                 fruitless = 0 if measured else fruitless + 1
                 if fruitless == FRUITLESS:
                     raise Failure(f"{self._name}: {FRUITLESS} runs without a response to any command")
@@ -153,7 +157,7 @@ class ResponseRuns:
             self._progress.begin(f"twin without command {command.serial} to {command.level}")
             status = _status(response, command.level)
             yield compare(self._config, run, command, status, scratch / f"{self._runs}-{command.serial}")
-            self._progress.end(0.7 * LOCKSTEP_RUN_S, "compared", [])
+            self._progress.end(0.7 * LOCKSTEP_RUN_S, "compared")
 
 
 def _together(found: Sequence[OperatorResponse]) -> OperatorResponse:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.memory import lock_memory
-from rack.backplane.process import cores_kept_awake, die_with_parent, pin, set_priority
+from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.tools.benches.cyclictest import WakeGrid
 from rack.tools.console.answer import Failure
 
@@ -43,11 +43,6 @@ def _sleep(parent: int, grid: WakeGrid, late_ns: Any) -> None:
     pin(grid.cores[0])
     set_priority(grid.priority)
     lock_memory()
-    with cores_kept_awake():
-        _wake_on(grid, late_ns)
-
-
-def _wake_on(grid: WakeGrid, late_ns: Any) -> None:
     period, monotonic_ns, sleep = grid.period_ns, time.monotonic_ns, time.sleep
     epoch = monotonic_ns() + HEAD_START_NS
     at = 0

@@ -79,7 +79,8 @@ def iceoryx2_publish_subscribe(dtype: np.dtype, readers: int) -> Iterator[Transp
 
     def taker(subscriber: Any) -> Callable[[int], Message]:
         received = Message(dtype)
-        place, size, receive = _address(received), dtype.itemsize, subscriber.receive
+        place = ctypes.addressof(ctypes.c_char.from_buffer(received.raw))
+        size, receive = dtype.itemsize, subscriber.receive
 
         def take(tick: int) -> Message:
             ctypes.memmove(place, receive().payload_ptr, size)
@@ -288,7 +289,3 @@ def _structure(dtype: np.dtype) -> type[ctypes.Structure]:
     """Return a C structure of the size and alignment of a message."""
     words = ctypes.c_uint64 * (dtype.itemsize // 8)
     return type("Message", (ctypes.Structure,), {"_fields_": [("words", words)]})
-
-
-def _address(message: Message) -> int:
-    return ctypes.addressof(ctypes.c_char.from_buffer(message.raw))

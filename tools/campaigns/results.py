@@ -16,7 +16,7 @@ from rack.boards.faults.kind import KINDS
 from rack.tools.campaigns.plan import Plan
 from rack.tools.campaigns.statistics import rate
 from rack.tools.campaigns.trial import Trial
-from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, Seen, judge
+from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge
 
 Ended = Literal["task done", "safely stopped", "not armed", "neither"]
 MISS = "miss"
@@ -222,25 +222,24 @@ def misses_of(runs: Sequence[TrialResult]) -> dict[str, int]:
 
 def _refused(trial: Trial) -> tuple[Judgement, ...]:
     """Return the judgements of faults that prevent a launch: the refusal is their detection."""
-    return tuple(
-        Judgement(
-            kind=table["kind"],
-            board=table["board"],
-            struck=0 if KINDS[table["kind"]].where == "start" else -1,
-            seen=_seen_at_start(table, trial),
-            found_by="the Rack",
-            found_as="not armed",
-            is_within=_seen_at_start(table, trial) == "detected",
-            reactions=("not armed",),
-        )
-        for table in trial.plan.faults
+    return tuple(_at_start(table["kind"], table["board"], trial) for table in trial.plan.faults)
+
+
+def _at_start(kind: str, board: str, trial: Trial) -> Judgement:
+    if KINDS[kind].where != "start":
+        return Judgement(kind, board, -1, "not struck")
+    is_found = f"'{board}'" in trial.refused
+    return Judgement(
+        kind=kind,
+        board=board,
+        struck=0,
+        seen="detected" if is_found else "missed",
+        found_by="the Rack",
+        found_as="not armed",
+        is_within=is_found,
+        reactions=("not armed",),
+        is_recovered=trial.again is not None and trial.again.worked,
     )
-
-
-def _seen_at_start(table: Any, trial: Trial) -> Seen:
-    if KINDS[table["kind"]].where != "start":
-        return "not struck"
-    return "detected" if f"'{table['board']}'" in trial.refused else "missed"
 
 
 def _shortfalls(fault: Judgement) -> Iterator[str]:
@@ -249,14 +248,11 @@ def _shortfalls(fault: Judgement) -> Iterator[str]:
     if fault.seen == "missed":
         yield f"{strike}: not detected"
     if fault.seen == "detected" and not fault.is_within:
-        by_time = fault.bound_ms is not None
-        after = (
-            f"{fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
-            if by_time
-            else f"{fault.delay} ticks; bound {fault.bound}"
-        )
+        after = f"{fault.delay} ticks; bound {fault.bound}"
+        if fault.bound_ms is not None:
+            after = f"{fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
         yield f"{strike}: {fault.found_as} by {fault.found_by} after {after}"
     yield from (f"{strike}: no {code.replace('_', ' ')} follows" for code in fault.lacking)
     if not fault.is_recovered:
         undone = f"undone after {fault.recovery} ticks" if fault.recovery is not None else "never undone"
-        yield f"{strike}: {', '.join(fault.reactions)} {undone}; bound {fault.recovery_bound}"
+        yield f"{strike}: {', '.join(fault.reactions) or 'loss of messages'} {undone}; bound {fault.recovery_bound}"

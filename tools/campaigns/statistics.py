@@ -83,6 +83,7 @@ def spread(values: Sequence[float]) -> Figures | None:
 def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> Figures:
     seen = [fault for fault in faults if fault.seen == "detected"]
     counts = totals(faults)
+    parts = [part_of_bound(fault.delay, fault.bound, fault.delay_ms, fault.bound_ms) for fault in seen]
     bounds = [fault.bound for fault in faults if fault.bound is not None]
     return {
         **counts,
@@ -92,7 +93,7 @@ def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> Figures:
         "ticks": spread([f.delay for f in seen if f.delay is not None]),
         "bound_ticks": {"least": min(bounds), "most": max(bounds)} if bounds else None,
         # How near to its bound each came: 1 is the bound.
-        "part_of_bound": spread([part for f in seen if (part := _part(f)) is not None]),
+        "part_of_bound": spread([part for part in parts if part is not None]),
         "ms": spread([f.delay_ms for f in seen if f.delay_ms is not None]),
         "reactions": sorted({name for fault in faults for name in fault.reactions}),
         "recovery_ms": spread([_ms(f.recovery, clock_ns) or 0.0 for f in seen if f.recovery is not None]),
@@ -104,10 +105,6 @@ def part_of_bound(delay: int | None, bound: int | None, delay_ms: float | None, 
     if bound_ms is not None and delay_ms is not None:
         return delay_ms / bound_ms
     return delay / bound if bound and delay is not None else None
-
-
-def _part(fault: Judgement) -> float | None:
-    return part_of_bound(fault.delay, fault.bound, fault.delay_ms, fault.bound_ms)
 
 
 def _ms(ticks: int | None, clock_ns: int) -> float | None:

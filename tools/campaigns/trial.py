@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
@@ -36,6 +36,8 @@ RESTART_S = 2.0
 """Longest time of a restart in real time: a planner with its libraries takes 1.5 s."""
 LOOK_S = 0.001
 """Time between two looks at the tick in lockstep, which has no grid to sleep on."""
+AGAIN_S = 2.0
+"""Simulated time of the run that follows a refused launch: each task has its cycles."""
 RETRY_S = 0.02
 """Time after which a kill is tried again where the board is being restarted."""
 
@@ -110,9 +112,9 @@ class Killer:
 class Trial:
     """A trial that was made. `refused` is the reason why the rack did not launch, else empty.
 
-    `left` is everything that it left behind. `levels` holds the last state of each level; `is_late`: one gave up
-    because it could not meet a time. `moving` are obstacles that move. `offset_ns` turns CLOCK_MONOTONIC into the
-    events' CLOCK_REALTIME.
+    `again`: how a run without its faults ended, right after it was refused. `left` is everything that it left behind.
+    `levels` holds the last state of each level; `is_late`: one gave up because it could not meet a time. `moving` are
+    obstacles that move. `offset_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
     """
 
     plan: Plan
@@ -130,6 +132,7 @@ class Trial:
     is_late: bool = False
     moving: tuple[str, ...] = ()
     is_interrupted: bool = False
+    again: Outcome | None = None
 
 
 def run_trial(config: RackConfig, plan: Plan, rack_name: str, ticks: int, seconds: float | None) -> Trial:
@@ -153,6 +156,9 @@ def run_trial(config: RackConfig, plan: Plan, rack_name: str, ticks: int, second
         raise
     except (BackplaneError, BoardError) as error:
         refused = str(error)
+    again = None
+    if refused and plan.faults:
+        again = run_trial(config, replace(plan, faults=()), rack_name, ticks, AGAIN_S).outcome
     return Trial(
         plan=plan,
         layout=rack.segment.layout if hasattr(rack, "segment") else None,
@@ -169,6 +175,7 @@ def run_trial(config: RackConfig, plan: Plan, rack_name: str, ticks: int, second
         is_late=late,
         moving=tuple(motion.body for motion in config.scene.motion),
         is_interrupted=INTERRUPT.number != 0,
+        again=again,
     )
 
 

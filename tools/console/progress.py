@@ -36,7 +36,7 @@ class Progress:
         self._bar.update(self._task, description=text)
         self._print(text)
 
-    def end(self, seconds: float, ended: str, shortfalls: Sequence[str]) -> None:
+    def end(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
         """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its shortfalls."""
         self._bar.update(self._task, advance=seconds)
         for line in () if self._bar.disable else shortfalls:

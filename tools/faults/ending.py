@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
-from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.backplane.segment import Segment
+from rack.boards.events import statuses
+from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import KINDS, Kind
 from rack.levels.messages import Error
@@ -41,9 +41,10 @@ class Killed:
 class Strike:
     """A fault as the fault table holds it at the end of the run.
 
-    `began` and `ends` are its ticks (-1: it did not begin, it did not end), `tick` and `time_ns` (CLOCK_MONOTONIC)
-    those at which it first acted (-1: it did not), `count` is how often it acted. `mailboxes` are those concerned;
-    `joint` is a name, or "" for none or all.
+    `began` is its tick, -1: it did not begin; `ends` that of its end, in the run or planned, or `NEVER`. `tick` and
+    `time_ns` (CLOCK_MONOTONIC) are those at which it first acted, however little (-1: it did not). `count` is how often
+    it acted so much that it must be found, and `hidden` the ticks from `tick` to the first time. `mailboxes` are those
+    concerned; `joint` is a name, or "" for none or all.
     """
 
     fault: int
@@ -54,6 +55,7 @@ class Strike:
     tick: int
     time_ns: int = 0
     count: int = 1
+    hidden: int = 0
     mailboxes: tuple[str, ...] = ()
     joint: str = ""
     size: float | None = None
@@ -83,18 +85,18 @@ def strikes(segment: Segment, joints: Sequence[str], kills: Sequence[Killed]) ->
 
 def arm_of(segment: Segment) -> ArmEnd:
     """Return the arm of a rack as its levels last reported it; a rack without one violates no limit."""
-    seen = [arm for box in segment.layout.mailboxes for arm in _arms(segment, box)]
+    seen = [status for _, status in statuses(segment, "violations")]
     return ArmEnd(
-        violations=max((arm.violations for arm in seen), default=0),
-        touches=max((arm.touches for arm in seen), default=0),
-        is_at_rest=all(arm.is_at_rest for arm in seen),
+        violations=max((int(arm.violations) for arm in seen), default=0),
+        touches=max((int(arm.touches) for arm in seen), default=0),
+        is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in seen),
     )
 
 
 def levels_of(segment: Segment) -> str:
     """Return the last state of each level, with its reason, as one readable text."""
     states = []
-    for writer, status in _statuses(segment):
+    for writer, status in statuses(segment, "reason"):
         state, reason = State(status.state).name.lower(), status.reason
         states.append(f"{writer} {state}{f' ({reason})' if reason else ''}")
     return ", ".join(states)
@@ -102,43 +104,32 @@ def levels_of(segment: Segment) -> str:
 
 def is_late(segment: Segment) -> bool:
     """Return whether a level gave up because it cannot meet a time."""
-    return any(status.state == State.ERROR and status.error == Error.TOO_LATE for _, status in _statuses(segment))
-
-
-def _statuses(segment: Segment) -> Iterator[tuple[str, Message]]:
-    """Yield the newest status of each level, with its writer."""
-    for box in segment.layout.mailboxes:
-        units = {field.name: field.unit for field in box.fields}
-        # The state of an arm's simulation is not a level's.
-        if units.get("state") != State.__name__ or "reason" not in units:
-            continue
-        if (status := open_observer(segment, box.name).peek()).is_there:
-            yield box.writer, status.value
+    return any(s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error"))
 
 
 def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTable) -> Strike:
     entry, layout = table.entries[index], segment.layout
     kind = KINDS[entry[Entry.KIND]]
     values, board = kind.values(entry), board_of(entry, layout)
-    box, joint = entry[Entry.MAILBOX], int(values.get("joint", -1))
+    joint = int(values.get("joint", -1))
     begun = entry.stage != Stage.WAITING
     return Strike(
         fault=index,
         kind=kind.name,
         board=board,
         began=entry[Entry.FROM] if begun else -1,
-        ends=entry[Entry.UNTIL] if entry.stage == Stage.OVER else -1,
+        ends=entry[Entry.UNTIL],
         tick=entry[Entry.STRUCK_TICK],
         time_ns=entry[Entry.STRUCK_NS],
         count=entry[Entry.COUNT],
-        mailboxes=(layout.mailboxes[box].name,) if box >= 0 else _written(segment, board),
+        hidden=entry[Entry.HIDDEN],
+        mailboxes=tuple(box.name for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board)),
         joint=joints[joint] if 0 <= joint < len(joints) else "",
         size=values.get("size"),
         injection=Injection(
             kind=entry[Entry.KIND],
             task=entry[Entry.TASK],
-            mailbox=box,
-            tick=entry[Entry.FROM],
+            mailbox=entry[Entry.MAILBOX],
             ticks=entry[Entry.TICKS],
             phase=entry[Entry.PHASE],
             seed=entry[Entry.SEED],
@@ -156,23 +147,5 @@ def _killed(segment: Segment, kill: Killed) -> Strike:
         ends=kill.tick,
         tick=kill.tick,
         time_ns=kill.time_ns,
-        mailboxes=_written(segment, kill.board),
+        mailboxes=tuple(box.name for box in struck_mailboxes(segment.layout, -1, kill.board)),
     )
-
-
-def _written(segment: Segment, board: str) -> tuple[str, ...]:
-    return tuple(box.name for box in segment.layout.mailboxes if box.writer == board)
-
-
-def _arms(segment: Segment, box: MailboxSpec) -> Iterator[ArmEnd]:
-    names = {field.name for field in box.fields}
-    if not {"position", "velocity", "torque"} <= names:
-        return
-    status = open_observer(segment, box.name).peek()
-    if status.is_there:
-        value = status.value
-        yield ArmEnd(
-            violations=int(value.violations) if "violations" in names else 0,
-            touches=int(value.touches) if "touches" in names else 0,
-            is_at_rest=bool(np.abs(value.velocity).max() < AT_REST),
-        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,11 +13,16 @@ from rack.boards.faults.describe import ALL_JOINTS
 from rack.boards.faults.kind import DIED, Where
 from rack.tools.faults.ending import Strike
 
+
+def _codes(alarms: Iterable[Alarm]) -> set[str]:
+    return {alarm.name.lower() for alarm in alarms}
+
+
 FOUND = ("detection", "miss", DIED)
 """Kinds of events that can be a detection."""
-MAILBOX_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL}
-CLOCK_ALARMS = {alarm.name.lower() for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE}
-TASK_ALARMS = {alarm.name.lower() for alarm in (Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED)}
+MAILBOX_ALARMS = _codes(alarm for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL)
+CLOCK_ALARMS = _codes(alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE)
+TASK_ALARMS = _codes((Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
 BRAKES = "brakes_closed"
 LATCHED = "latched"
 """Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
@@ -80,10 +85,6 @@ def explains(strike: Strike, event: Event) -> bool:
     return event.code in _codes(follows.own).union(strike.record.codes) and is_about(event, strike)
 
 
-def _codes(alarms: Sequence[Alarm]) -> set[str]:
-    return {alarm.name.lower() for alarm in alarms}
-
-
 def is_about(event: Event, strike: Strike) -> bool:
     """Return whether an event is about the target of a fault: its mailboxes, its task, its joint."""
     if event.code == DIED:
@@ -117,6 +118,7 @@ class SkippedTicks:
 class Aftermath(NamedTuple):
     """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone.
 
+    Lost messages are undone when a good one, made after the fault, was seen in each mailbox that owes one.
     `lacking`: codes of reactions that must follow a fault of this kind, and did not; brakes that were engaged when it
     struck cannot be engaged again.
     """
@@ -127,8 +129,11 @@ class Aftermath(NamedTuple):
     lacking: tuple[str, ...] = ()
 
 
-def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermath:
-    """Return the reactions to a fault and their end; reactions from tick `horizon` on are not to it."""
+def aftermath(strike: Strike, events: Sequence[Event], horizon: int, owed: Sequence[str]) -> Aftermath:
+    """Return the reactions to a fault and their end; reactions from tick `horizon` on are not to it.
+
+    `owed`: mailboxes that must have a new message after it.
+    """
     if strike.tick < 0:
         return Aftermath()
     after = [event for event in events if event.tick >= strike.tick]
@@ -136,13 +141,14 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int) -> Aftermat
     to_fault = (e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck))
     reactions = [e for e in to_fault if e.tick < horizon and _can_react(strike, e)]
     undone = [_undone(reaction, after) for reaction in reactions]
+    flows = {e.subject: e.tick for e in reversed(after) if e.code == "flows" and e.tick >= strike.ends}
+    undone += [flows.get(mailbox) for mailbox in owed]
     names = tuple(dict.fromkeys(event.code for event in reactions))
     required = strike.record.consequence.reactions
     lacking = tuple(c for c in required if c not in names and not (c == BRAKES and _are_engaged(strike.tick, events)))
-    last = max((tick for tick in undone if tick is not None), default=None)
-    if None in undone or last is None:
-        return Aftermath(names, None not in undone, None, lacking)
-    return Aftermath(names, True, last - strike.tick, lacking)
+    is_undone = None not in undone
+    last = max(filter(None, undone), default=strike.tick)
+    return Aftermath(names, is_undone, last - strike.tick if is_undone and undone else None, lacking)
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:

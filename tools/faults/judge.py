@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from rack.backplane.fault_table import Injection
+from pydantic import TypeAdapter
+
+from rack.backplane.fault_table import NEVER, Injection
 from rack.backplane.layout import Layout
 from rack.boards.events import Event
 from rack.boards.faults.bounds import MEMORY_NS, RACK_NS, cycle_ticks, last_read
@@ -36,9 +38,9 @@ class Judgement:
     """The judgement of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the task's cycle.
 
     `is_judged`: False for a size below the one from which its kind must be found. `recovery` is the time from the
-    strike until every reaction is undone; None: there was none, or it was not undone. `recovery_bound` is counted from
-    the strike too. `lacking` are required reactions that did not follow. `is_latched`: the kind may end the task, and
-    it did.
+    strike until every reaction is undone and struck messages flow again; None: there was nothing to recover from, or it
+    was not seen. `bound` and `recovery_bound` are counted from the strike too. `lacking` are required reactions that
+    did not follow. `is_latched`: the kind may end the task, and it did.
     """
 
     kind: str
@@ -105,8 +107,7 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
 class _Judge:
     def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
         self._events, self._run, self._layout = events, run, run.layout
-        shown = [_shown(strike, events) for strike in strikes]
-        self._strikes = sorted(shown, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
+        self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._skipped = SkippedTicks(events)
@@ -120,14 +121,15 @@ class _Judge:
         for place, strike in enumerate(self._strikes):
             found = self._detections(strike, windows[place][1], used)
             best = min((d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None)
-            if best is not None:
+            if best:
                 used.add(id(best.event))
             elif self._is_brief(strike):
                 strike = replace(strike, tick=-1)
             horizon = self._horizon(place, windows[place][1])
             judgement = self._judgement(strike, best, horizon)
-            if not judgement.is_recovered and self._last < strike.tick + (judgement.recovery_bound or 0):
-                # The run ended too early to decide: a campaign draws it again.
+            is_too_early = self._last < strike.tick + (judgement.recovery_bound or 0)
+            if not judgement.is_recovered and is_too_early and strike.ends < NEVER:
+                # The run ended too early to decide: a campaign draws it again. A fault without an end has no recovery.
                 judgement = self._judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]
@@ -135,10 +137,14 @@ class _Judge:
         return FaultVerdict(tuple(judged), detections, tuple(event for event in stray if event.kind == "miss"))
 
     def _bound(self, strike: Strike, reader: str | None) -> int | None:
-        """Return the ticks within which a fault must be found, by a reader or, None, by any process."""
+        """Return the ticks from its strike within which a fault must be found, by a reader or, None, by any process.
+
+        One that never shows need not be found.
+        """
         task = self._tasks.index(strike.board) if strike.board in self._tasks else -1
         injection = strike.injection or Injection(strike.record.number, task)
-        return strike.record.bound_ticks(injection, self._layout, reader)
+        bound = strike.record.bound_ticks(injection, self._layout, reader)
+        return bound + strike.hidden if bound is not None and strike.count else None
 
     def _recovery(self, strike: Strike) -> int:
         return strike.record.recovery_ticks(strike.board, self._layout, self._run.restart_s)
@@ -156,11 +162,24 @@ class _Judge:
         # A task that hangs is killed as soon as that is found, however long it was to hang.
         if strike.record.consequence.ends_process:
             return strike.tick
-        return strike.ends if strike.ends >= 0 else self._last
+        return min(strike.ends, self._last)
 
     def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
+        if not strike.count:
+            # It need not be found: whatever is found after its end is of something else.
+            until = min(until, strike.ends)
         fitting = (e for e in self._events if e.tick <= until and fits(e, strike) and id(e) not in used)
         return [self._detection(event, strike) for event in fitting]
+
+    def _owed(self, strike: Strike) -> tuple[str, ...]:
+        """Return the mailboxes that must have a new message after a fault: those that are periodic, or else all."""
+        struck = strike.mailboxes if strike.record.takes_mailbox else ()
+        return tuple(filter(self._is_periodic, struck)) or struck
+
+    def _is_periodic(self, mailbox: str) -> bool:
+        """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a host board's."""
+        box = self._layout.mailbox(mailbox)
+        return self._layout.task(box.writer).role == "executor" and box.protocol != "queue" and not box.max_age
 
     def _is_of(self, late: Detection, place: int) -> bool:
         """Return whether a detection, too late for one fault, is in time for one that struck after it."""
@@ -168,10 +187,11 @@ class _Judge:
         return not late.is_within and any(self._detection(late.event, strike).is_within for strike in after)
 
     def _is_brief(self, strike: Strike) -> bool:
-        """Return whether a fault of the arm acted in fewer cycles than it may take to be found."""
-        if strike.tick < 0 or strike.record.where != "arm":
+        """Return whether a fault of the arm never showed, or in fewer cycles than it may take to be found."""
+        if strike.record.where != "arm":
             return False
-        return strike.count * self._cycles[strike.board] < (self._bound(strike, None) or 0)
+        until = strike.hidden + strike.count * self._cycles[strike.board]
+        return not strike.count or until < (self._bound(strike, None) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
         delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
@@ -198,15 +218,18 @@ class _Judge:
         return min([*later, last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
-        record, after = strike.record, aftermath(strike, self._events, horizon)
-        seen: Seen = "not struck" if strike.tick < 0 else "missed" if best is None else "detected"
-        found = best.event.tick if best is not None else strike.tick
+        record, owed = strike.record, self._owed(strike)
+        after = aftermath(strike, self._events, horizon, owed)
+        found = best.event.tick if best else strike.tick
         # Ticks from the strike within which every reaction must be undone.
         bound = max(self._ends(strike), found) - strike.tick + self._recovery(strike)
         # Some kinds may end the task with an error.
         is_latched = record.consequence.latches and self._run.has_failed and LATCHED in after.reactions
+        if not all(map(self._is_periodic, owed)):
+            # Nothing says when its writer has something to write.
+            bound = self._last + 1 - strike.tick
         is_undone = after.is_undone and (after.recovery or 0) <= bound
-        return Judgement(
+        judgement = Judgement(
             kind=strike.kind,
             board=strike.board,
             mailbox=strike.mailboxes[0] if record.takes_mailbox and len(strike.mailboxes) == 1 else "",
@@ -214,22 +237,29 @@ class _Judge:
             size=strike.size,
             began=strike.began,
             struck=strike.tick,
-            seen=seen,
+            seen="not struck" if strike.tick < 0 else "missed",
             is_judged=record.visible_from is None or (strike.size or 0.0) >= record.visible_from,
             cycle=cycle_ticks(self._layout, strike.board),
-            found_by=best.event.board if best and best.event.kind != DIED else "the Rack" if best else "",
-            found_as=(best.event.code or best.event.kind) if best else "",
-            delay=best.delay if best else None,
-            delay_ms=None if best is None or best.delay_ms is None else round(best.delay_ms, 3),
-            bound=best.bound if best else self._bound(strike, None),
-            bound_ms=best.bound_ms if best else None,
-            is_within=best is not None and best.is_within,
+            bound=self._bound(strike, None),
             reactions=after.reactions,
             is_recovered=is_latched or is_undone,
             recovery=after.recovery,
             recovery_bound=bound,
             lacking=() if strike.tick < 0 else after.lacking,
             is_latched=is_latched,
+        )
+        if best is None:
+            return judgement
+        return replace(
+            judgement,
+            seen="detected",
+            found_by="the Rack" if best.event.kind == DIED else best.event.board,
+            found_as=best.event.code or best.event.kind,
+            delay=best.delay,
+            delay_ms=None if best.delay_ms is None else round(best.delay_ms, 3),
+            bound=best.bound,
+            bound_ms=best.bound_ms,
+            is_within=best.is_within,
         )
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
@@ -248,24 +278,11 @@ class _Judge:
         return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
 
-def _shown(strike: Strike, events: Sequence[Event]) -> Strike:
-    """Return a fault of the arm as having struck no later than it was found.
-
-    It counts as acting from a certain difference to the truth; finding it at a smaller difference is right as well.
-    """
-    if strike.began < 0 or strike.record.where != "arm":
-        return strike
-    begun = replace(strike, tick=strike.began)
-    last = strike.tick if strike.tick >= 0 else strike.ends
-    found = min((e.tick for e in events if fits(e, begun) and (last < 0 or e.tick <= last)), default=strike.tick)
-    return strike if found == strike.tick else replace(strike, tick=found, count=max(1, strike.count))
-
-
 def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     """Return every fault injected into a run, detections that none explains, and restarts by task, by its events."""
     events = [Event(**event) for event in recorded if "tick" in event]
     ended: Mapping[str, Any] = next((event for event in recorded if event["kind"] == "outcome"), {})
-    strikes = [_strike(entry) for entry in ended.get("faults", [])]
+    strikes = TypeAdapter(tuple[Strike, ...]).validate_python(ended.get("faults", ()))
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
     verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep))
     restarts = Counter(event.board for event in events if event.code == "restart")
@@ -278,11 +295,6 @@ def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
         ],
         "restarts": dict(restarts),
     }
-
-
-def _strike(entry: Mapping[str, Any]) -> Strike:
-    injection = {**entry["injection"], "parameters": tuple(entry["injection"]["parameters"]), "when": None}
-    return Strike(**{**entry, "mailboxes": tuple(entry["mailboxes"]), "injection": Injection(**injection)})
 
 
 def _row(found: Judgement, layout: Layout) -> Report:

@@ -111,11 +111,6 @@ class Mirror(Segment):
         ring = self._rings[self.map.mailboxes[mailbox] + 8 * Box.HEAD]
         ring.most = ring.depth
 
-    def follow_all(self) -> None:
-        """Fetch every message of every mailbox from now on, as a recorder needs them."""
-        for name in self.map.mailboxes:
-            self.follow(name)
-
     def refresh(self) -> None:
         """Fetch what has changed since the last call."""
         news, answer = self._fetch(self._watched)

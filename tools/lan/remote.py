@@ -5,7 +5,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from types import TracebackType
 from typing import Self
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
@@ -49,12 +48,12 @@ class RemoteRack:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
         """End the session."""
-        self._racks.__exit__(None, None, None)
+        self._racks.__exit__()
 
     def refresh(self) -> bool:
         """Fetch what has changed; False when the rack is gone, or does not answer any more."""

@@ -31,6 +31,7 @@ def main() -> None:
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
     from rack.tools.recorder.recorder import Recorder, SafeSink
+    from rack.tools.runs.recorder_process import UNWRITABLE
 
     # It takes half a second. A thread begins with it while the rack is being launched.
     Thread(target=_import_viewer, daemon=True).start()
@@ -42,11 +43,18 @@ def main() -> None:
     # A run in real time need not wait for the libraries of the viewer, unless the user wants to look on from the start.
     in_background = port is None and not segment.words[System.LOCKSTEP]
     view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
-    with Recorder(segment, Path(folder), view) as recorder:
-        _tell("recording")
-        recorder.follow(until=sys.stdin.fileno())
-        if sys.stdin.readline():
-            view.hurry()
+    try:
+        with Recorder(segment, Path(folder), view) as recorder:
+            _tell("recording")
+            recorder.follow(until=sys.stdin.fileno())
+            if sys.stdin.readline():
+                view.hurry()
+    except OSError as error:
+        # The text of pyarrow's own errors is long.
+        why = os.strerror(error.errno) if error.errno else error
+        ended = f"{folder}: {why}: the recording ends at tick {segment.words[System.FOLLOWER_TICK]}"
+        print(ended, file=sys.stderr, flush=True)
+        os._exit(UNWRITABLE)
 
 
 def _import_viewer() -> None:

@@ -13,14 +13,12 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
-from rack.backplane.trace import trace_ring
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.runs.cores import UNMEASURED, CoreMeter
-from rack.tools.runs.spool import Frame, RunFiles, Spool
+from rack.tools.runs.spool import Frame, RunFiles, Spool, rings
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
@@ -53,6 +51,8 @@ class SafeSink:
     def __init__(self, opened: Callable[[], Sink], tell: Callable[[str], None], in_background: bool = False) -> None:
         self._tell = tell
         self._sink: Sink | None = None
+        # Kept: the viewer's library waits, maybe for ever, where a stream is dropped whose file could not be written.
+        self._failed: Sink | None = None
         self._waiting: list[Callable[[Sink], None]] = []
         # A daemon: a process in a hurry does not wait for it.
         self._opening = Thread(target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True)
@@ -98,7 +98,7 @@ class SafeSink:
         try:
             call()
         except Exception as error:
-            self._sink = None
+            self._sink, self._failed = None, self._sink
             self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
 
 
@@ -123,21 +123,20 @@ class Recorder:
         self._spool = Spool(folder, layout, segment.launch)
         self._files = RunFiles(folder, layout, segment.launch)
         self._spool.resume(self._files.add)
-        traces = {task.name: trace_ring(segment, task.name) for task in layout.tasks}
-        mailboxes = {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in layout.timed}
-        self._rings = traces | mailboxes
+        self._rings = rings(segment)
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)
         # Lockstep has no deadlines that the machine could break; the cores of another machine are not seen.
         self._cores = None if self._words[System.LOCKSTEP] or refresh is not None else CoreMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
-        self._is_follower = follower == os.getpid() or not is_alive(follower)
-        # All rows up to here are in the spool's file; a recorder that continues another still has to read those after.
-        continues = any(self._files.taken.values())
-        self._safe_tick = self._words[System.FOLLOWER_TICK if continues else System.TICK]
+        is_awaited = follower == os.getpid()
+        self._is_follower = is_awaited or not is_alive(follower)
+        # All rows up to here are in the spool's file. The launcher's recorder still has to read those after, even if
+        # the one before it died with no row in the file; another one begins now.
+        self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
         self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
-        self._report_progress(self._safe_tick)
+        self._report_progress()
 
     def __enter__(self) -> Self:
         return self
@@ -156,6 +155,8 @@ class Recorder:
             self._files.add(Frame(name, rows, lost))
             if self._view is not None:
                 self._view.add(name, rows)
+        if self._is_follower:
+            self._words[System.FOLLOWER_DRAINED] = tick
         # A killed recorder loses the rows that are not in its file: lockstep must not run far ahead of it.
         is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
         if self._spool.flush(now=is_late):
@@ -164,12 +165,12 @@ class Recorder:
             self._cores.look()
         if self._view is not None:
             self._view.advance(tick, self._files.lost)
-        self._report_progress(self._safe_tick)
+        self._report_progress()
 
-    def _report_progress(self, tick: int) -> None:
+    def _report_progress(self) -> None:
         """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost after a delay."""
         if self._is_follower:
-            self._words[System.FOLLOWER_TICK] = tick
+            self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
     def follow(self, until: int | None = None) -> None:

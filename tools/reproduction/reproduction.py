@@ -22,10 +22,10 @@ from rack.tools.reproduction.experiments.experiment import (
     made,
     program,
 )
-from rack.tools.reproduction.html import html
+from rack.tools.reproduction.html import MARKS, html, rulings
 from rack.tools.reproduction.markdown import markdown
 from rack.tools.reproduction.sections import application, comparison, conclusion, gantt, model, opening, time, timing
-from rack.tools.reproduction.sections.page import Page, text
+from rack.tools.reproduction.sections.page import Page, plain, text
 from rack.tools.reproduction.sections.statement import Chapter
 
 CHAPTERS: tuple[Chapter, ...] = (
@@ -62,8 +62,7 @@ def forget(wanted: Sequence[Chapter], folder: Path) -> None:
 
 
 def reproduce(wanted: Sequence[Chapter], workshop: Workshop, progress: Progress) -> Page:
-    """Make what is still to be made for these chapters, and return the page of all chapters, written into the "
-    "folder."""
+    """Make what is still to be made for these chapters; return the page of all, written into the folder."""
     workshop.prepare()
     results = {one.name: found for one in experiments(CHAPTERS) if (found := kept(one, workshop.folder))}
     needed = [one for one in experiments(wanted) if one.name not in results]
@@ -87,7 +86,7 @@ def _make(
         progress.begin(f"{number} of {len(needed)}: {one.about}")
         try:
             results[one.name] = found = made(one, workshop)
-            progress.end(one.seconds, found.lacking or f"done in {found.took_s:.0f} s", ())
+            progress.end(one.seconds, found.lacking or f"done in {found.took_s:.0f} s")
         except PROJECT as error:
             reasons[one.name] = str(error)
             progress.end(one.seconds, "failed", [f"{one.name}: {error}"])
@@ -128,9 +127,6 @@ def worked(page: Page, wanted: Sequence[Chapter]) -> bool:
 
 def summary(page: Page, folder: Path) -> list[str]:
     """Return the page in a few lines for the terminal."""
-    from rack.tools.reproduction.html import MARKS, rulings
-    from rack.tools.reproduction.sections.page import plain
-
     lines = [f"{MARKS[claim.tested.ruling]} {plain(claim.title)}: {claim.tested.ruling.value}" for claim in page.claims]
     counted = ", ".join(f"{count} {ruling[2:]}" for ruling, count, _ in rulings(page).rows)
     return [*lines, "", counted, f"{folder}/{FILES[0]}, {FILES[1]}"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from rack.backplane.layout import TaskSpec
 from rack.levels.timing.tasks import Budget
 from rack.levels.timing.trace_times import Occupation, overhead_ns, plans, unit_times
 from rack.tools.runs.recording import Recording
+from rack.tools.runs.stalls import stalls_of
 
 START_UP_S = 0.1
 """Simulated time after the start of a process in which its cycles are not judged.
@@ -30,7 +30,8 @@ class Cycles:
     """The cycles of one task, oldest first; of a planner only those that made a plan.
 
     `rows` are the trace records, shape (n,). `parts` are processor times, ns, shape (n, 4): C, R, X, W of an executor;
-    0, reading, P, U of a planner. `is_judged` excludes the start-up of a process, bool, shape (n,).
+    0, reading, P, U of a planner. `is_judged` excludes the start-up of a process, and the `stalled` cycles: those in
+    which the core may have been away (see `stalls_of`); bool, shape (n,).
     `core` and `priority` are those that the task obtained; `overhead_ns` is the processor time of a cycle outside its
     parts, for waking up and closing it.
     """
@@ -41,6 +42,7 @@ class Cycles:
     rows: np.ndarray
     parts: np.ndarray
     is_judged: np.ndarray
+    stalled: int
     overhead_ns: int
 
     @property
@@ -81,7 +83,8 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
     """
     recording.need_all_columns()
     tasks = [task for task in recording.layout.tasks if len(recording.cycles.get(task.name, ()))]
-    places = {task.name: _obtained(recording, task) for task in tasks}
+    places = {task.name: recording.place(task) for task in tasks}
+    _, away = stalls_of(recording)
     spans = {task.name: Occupation.of(recording.cycles[task.name]) for task in tasks}
     planned = {task.name for task in recording.layout.tasks if task.role == "planner"}
     found = {}
@@ -96,24 +99,21 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
                 # Without a planner the look for a plan is part of reading.
                 parts[:, _READ] += parts[:, _EXCHANGE]
                 parts[:, _EXCHANGE] = 0
-            judged = _judged(recording, task.name, rows["tick"])
-            found[task.name] = Cycles(task, core, priority, rows, parts, judged, overhead_ns(rows))
+            settled = _settled(recording, task.name, rows["tick"])
+            whole = settled & (away[core].within(rows["start_ns"], rows["end_ns"]) == 0)
+            judged = whole if whole.any() else settled
+            stalled = int(settled.sum() - judged.sum())
+            found[task.name] = Cycles(task, core, priority, rows, parts, judged, stalled, overhead_ns(rows))
     return found
 
 
-def _obtained(recording: Recording, task: TaskSpec) -> tuple[int, int]:
-    """Return core and priority that a task obtained; those of the config where the end of the run is not recorded."""
-    counted: Mapping[str, Any] = recording.ended.get("tasks", {}).get(task.name, {})
-    return counted.get("core", task.core), counted.get("priority", task.priority)
-
-
-def _judged(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
+def _settled(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
     """Return which cycles do not belong to the start-up of a process; all where none would be left."""
     span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
-    judged = np.ones(len(ticks), bool)
+    settled = np.ones(len(ticks), bool)
     for begun in (0, *restarts(recording).get(task, ())):
-        judged &= (ticks < begun) | (ticks >= begun + span)
-    return judged if judged.any() else np.ones(len(ticks), bool)
+        settled &= (ticks < begun) | (ticks >= begun + span)
+    return settled if settled.any() else np.ones(len(ticks), bool)
 
 
 def restarts(recording: Recording) -> dict[str, list[int]]:
@@ -129,8 +129,9 @@ def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[st
     """Return the processor time that each level of a run took, by board; levels that never ran are left out.
 
     Each part is the longest of all cycles (eq. 3.6), whether or not they fell into the same one; with a `percentile`
-    below 100, the longest of that many in a hundred: a virtual machine stalled by its host counts the stall as
-    processor time. The start-up of processes (`START_UP_S`) is excluded. Raises `Failure` as `cycles_of`.
+    below 100, the longest of that many in a hundred. The start-up of processes (`START_UP_S`) is excluded, and so are
+    cycles with a stall in them: a virtual machine stalled by its host counts that as processor time. Raises
+    `Failure` as `cycles_of`.
     """
     return budgets_of(cycles_of(recording), percentile)
 

@@ -16,7 +16,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from rack.boards.events import Event
+from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.runs.holds import is_news
@@ -237,7 +237,7 @@ def _bar(progress: TaskProgress, width: int) -> RenderableType:
 
 
 def _is_shown(event: Event) -> bool:
-    is_brief = event.code == "brakes_closed" and 0 < event.value < BRIEF_TICKS
+    is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
     return event.kind not in QUIET and not is_brief
 
 

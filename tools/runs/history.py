@@ -51,27 +51,14 @@ def counted(found: Sequence[dict[str, Any]]) -> tuple[int, int]:
 
 
 def steal(recording: Recording) -> dict[str, Any]:
-    """Return the time stolen by the hypervisor, ms by core, and how many of the traced misses it may explain.
+    """Return the time stolen by the hypervisor, by core: ms, and `percent` of the run's time.
 
-    A miss counts when its cycle, from release to end, overlaps a measurement in which the steal of its core rose.
-    `percent` is of the run's time. In lockstep, and where the kernel does not count it, steal is not `measured`.
+    In lockstep, and where the kernel does not count it, steal is not `measured`.
     """
-    stolen, lasted_ms = recording.cores.stolen, recording.cores.lasted_ns * 1e-6
-    stolen_ms = {str(core): ms for core, ms in recording.cores.stolen_ms().items()}
-    percent = {core: round(100 * ms / lasted_ms, 3) if lasted_ms else 0.0 for core, ms in stolen_ms.items()}
-    missed = during = 0
-    ended = recording.ended.get("tasks", {})
-    for task in recording.layout.tasks:
-        cycles = recording.trace(task.name)
-        late = cycles[is_missed(cycles)]
-        core = ended.get(task.name, {}).get("core", task.core)
-        inside = np.zeros(len(late), bool)
-        for span in (span for span in stolen or () if span.core == core):
-            inside |= (late["release_ns"] <= span.to_ns) & (late["end_ns"] >= span.from_ns)
-        missed += len(late)
-        during += int(inside.sum())
-    measured = {"measured": stolen is not None, "ms": stolen_ms, "percent": percent}
-    return {**measured, "missed": missed, "missed_during": during}
+    record = recording.cores
+    stolen_ms = {str(core): ms for core, ms in record.stolen_ms().items()}
+    percent = {core: round(1e8 * ms / record.lasted_ns, 3) for core, ms in stolen_ms.items()}
+    return {"measured": record.stolen is not None, "ms": stolen_ms, "percent": percent}
 
 
 def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:

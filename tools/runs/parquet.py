@@ -97,9 +97,7 @@ class SignalsFile:
         )
 
     def add(self, mailbox: str, rows: np.ndarray) -> None:
-        """Add rows of a mailbox's ring, shape (rows,)."""
-        if not len(rows):
-            return
+        """Add rows of a mailbox's ring, shape (rows,), at least one."""
         waiting = self._waiting[mailbox]
         waiting.append(rows)
         if sum(map(len, waiting)) >= MESSAGE_ROWS or sum(block.nbytes for block in waiting) >= MESSAGE_BYTES:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 from rack.backplane.mailbox.history import row_dtype
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.segment import Launch, layout_of, mailbox_of
+from rack.backplane.segment import Launch, Segment, layout_of, mailbox_of
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
@@ -25,7 +25,15 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
 from rack.tools.runs.parquet import CONFIG, HEAD, columns_of, config_check
-from rack.tools.runs.spool import mend
+from rack.tools.runs.spool import mend, rings
+
+
+class Missing(NamedTuple):
+    """Rows of a ring that a recording lacks, of how many that were written."""
+
+    rows: int
+    written: int
+
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """Errors of reading a damaged file, or a file of another kind."""
@@ -127,10 +135,32 @@ class Recording:
 
     @cached_property
     def lost(self) -> dict[str, int]:
-        """Rows overwritten before the recorder took them, by task and by mailbox."""
+        """Rows that were written and are not in the files, by task and by mailbox."""
+        if "rows_lost" in self.ended:
+            return dict(self.ended["rows_lost"])
         with _naming(self.folder):
             texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
             return {name: count for text in texts for name, count in json.loads(text).items()}
+
+    def missing(self, segment: Segment) -> dict[str, Missing]:
+        """Return what the files lack of the rings of a rack that has ended, by task and by mailbox."""
+        found = {}
+        for name, ring in rings(segment).items():
+            lost = self.lost[name]
+            if name in self.cycles:
+                rows = len(self.cycles[name])
+                at = lost + rows
+            else:
+                serials = self.signal(name, "serial")
+                rows = len(serials)
+                at = int(serials[-1]) if rows else 0
+            ring.resume(at)
+            written = at + ring.waiting
+            left, overwritten = ring.drain()
+            # Messages that every reader rejects are absent and not lost; those lost last are overwritten.
+            if count := min(lost, at - rows) + overwritten + len(left):
+                found[name] = Missing(count, written)
+        return found
 
     @cached_property
     def cores(self) -> CoreRecord:
@@ -156,6 +186,11 @@ class Recording:
             for name in table.column_names[1:]:
                 rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
+
+    def place(self, task: TaskSpec) -> tuple[int, int]:
+        """Return core and priority that a task obtained; those of the config where the run's end is not recorded."""
+        counted = self.ended.get("tasks", {}).get(task.name, {})
+        return counted.get("core", task.core), counted.get("priority", task.priority)
 
     def trace(self, task: str) -> np.ndarray:
         """Return the trace of a task, as in `cycles`; empty for a task that left none."""

@@ -23,9 +23,10 @@ import numpy as np
 import pyarrow as pa
 
 from rack.backplane.layout import Layout
-from rack.backplane.mailbox.history import row_dtype
-from rack.backplane.segment import Launch, layout_of
-from rack.backplane.trace import RECORD
+from rack.backplane.mailbox.history import MailboxRing, row_dtype
+from rack.backplane.ring import Ring
+from rack.backplane.segment import Launch, Segment, layout_of
+from rack.backplane.trace import RECORD, trace_ring
 from rack.tools.console.answer import Failure
 from rack.tools.runs.cores import UNMEASURED, CoreRecord
 from rack.tools.runs.parquet import CyclesFile, SignalsFile
@@ -51,7 +52,7 @@ class Frame(NamedTuple):
 class RunFiles:
     """cycles.parquet and signals.parquet of a folder, being written.
 
-    By ring, `lost` counts the rows lost, and `taken` those plus the rows written: all its records so far.
+    By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far.
     """
 
     def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
@@ -64,12 +65,14 @@ class RunFiles:
     def add(self, frame: Frame) -> None:
         """Add rows of a ring."""
         name, rows, lost = frame
-        if name in self.tasks:
-            self._cycles.add(name, rows)
-        else:
-            self._signals.add(name, rows)
         self.lost[name] += lost
         self.taken[name] += lost + len(rows)
+        if name in self.tasks:
+            self._cycles.add(name, rows)
+        elif len(rows):
+            self._signals.add(name, rows)
+            # Messages that every reader rejects were left out.
+            self.taken[name] = int(rows["serial"][-1])
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
         """Finish both files; the trace keeps what the machine did to its cores."""
@@ -191,6 +194,12 @@ def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Frame]:
         name, dtype = rings[place]
         data = pa.decompress(packed, count * dtype.itemsize, "zstd", asbytes=True)
         yield Frame(name, np.frombuffer(data, dtype), lost)
+
+
+def rings(segment: Segment) -> dict[str, Ring]:
+    """Return every ring of a rack: traces by task, then messages by mailbox."""
+    traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+    return traces | {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in segment.layout.timed}
 
 
 def _dtypes(layout: Layout) -> dict[str, np.dtype]:

@@ -1,4 +1,4 @@
-"""The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; the planned path; goals."""
+"""The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; pushes; path and goals."""
 
 from __future__ import annotations
 
@@ -14,15 +14,13 @@ from rack.levels.robot.cell import STATE, Cell
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import verb_name
 from rack.tools.viewer.shapes import shape_of, xyzw
-from rack.tools.viewer.stream import Changes, RowBlock, Stream
-from rack.tools.viewer.style import CURRENT, GOAL, PLANNED
+from rack.tools.viewer.stream import Changes, RowBlock, Sampled, Stream
+from rack.tools.viewer.style import CURRENT, FORCE, GOAL, PLANNED
 
 CELL, COLLISION, FRAMES = "cell", "collision", "frames"
 WORLD = "world"
 SHOWN_GROUPS = 3
 """MuJoCo's own viewer shows groups 0, 1, 2; by convention those above hold collision shapes."""
-POSES_S = 0.02
-"""Time between poses: the rate of a screen."""
 TOOL = (CELL, "tool")
 TOOL_COLOUR = (230, 60, 200)
 PATH, WAYPOINTS = (CELL, "planned_path"), (CELL, "way_points")
@@ -30,6 +28,9 @@ GOALS, CURRENT_GOAL = (CELL, "goals"), (CELL, "current_goal")
 STEP_RAD = 0.03
 """A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this length."""
 POINT_M, LINE_M = 0.008, 0.003
+PUSHES = (CELL, "pushes")
+PUSH_M, PUSH_RADIUS_M = 0.02, 0.0015
+"""Length of the arrow of a push for each N, and its radius."""
 
 
 def frame_of(model: mujoco.MjModel, body: int) -> str:
@@ -49,7 +50,7 @@ def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
 def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Log all geoms, and the frames that never move with their poses in `data`."""
     stream.static((CELL,), stream.within(WORLD))
-    shown = {geom: _is_shown(model, geom) for geom in range(model.ngeom)}
+    shown = {geom: bool(model.geom_group[geom] < SHOWN_GROUPS) for geom in range(model.ngeom)}
     for geom in shown:
         shape = shape_of(model, geom)
         if shape is not None:
@@ -63,10 +64,6 @@ def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -
             child_frame=stream.frame(frame_of(model, body)),
         )
         stream.static((FRAMES, frame_of(model, body)), pose)
-
-
-def _is_shown(model: mujoco.MjModel, geom: int) -> bool:
-    return bool(model.geom_group[geom] < SHOWN_GROUPS)
 
 
 def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
@@ -84,17 +81,14 @@ class Poses:
         self._world = stream.frame(WORLD)
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
-        self._every = max(1, round(POSES_S * 1e9 / clock_ns))
-        self._last = -1
+        self._sampled = Sampled(clock_ns)
         stream.static(TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
         if not len(self._bodies):
             return
-        slots, first = np.unique(block.ticks // self._every, return_index=True)
-        chosen = first[slots > self._last]
-        self._last = int(slots[-1])
+        chosen = self._sampled.rows(block.ticks)
         if len(chosen):
             self._write(block, chosen)
 
@@ -109,16 +103,39 @@ class Poses:
             for at, contact in enumerate(self._contacts, len(bodies)):
                 positions[row, at], quaternions[row, at] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
-        times = self._stream.times
-        ticks, stamps = block.ticks[chosen], block.stamps_ns[chosen]
-        self._stream.columns(TOOL, times.columns(ticks, stamps), rr.Points3D.columns(positions=tool))
+        self._stream.columns(TOOL, block.times_of(chosen), rr.Points3D.columns(positions=tool))
         poses = rr.Transform3D.columns(
             translation=positions.reshape(-1, 3),
             quaternion=xyzw(quaternions).reshape(-1, 4),
             parent_frame=[self._world] * (len(chosen) * count),
             child_frame=self._frames * len(chosen),
         )
-        self._stream.columns((FRAMES,), times.columns(np.repeat(ticks, count), np.repeat(stamps, count)), poses)
+        self._stream.columns((FRAMES,), block.times_of(np.repeat(chosen, count)), poses)
+
+
+class Pushes:
+    """Writes the forces that the scene exerts on its objects, as `ARM_STATE`s have them."""
+
+    def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
+        self._stream, self._cell, self._data = stream, cell, cell.start()
+        self._sampled, self._is_empty = Sampled(clock_ns), True
+        stream.static(PUSHES, stream.within(WORLD))
+
+    def write(self, block: RowBlock) -> None:
+        """Write the newest pushes, one set every 20 ms of simulated time."""
+        model, data, bodies = self._cell.model, self._data, self._cell.bodies
+        for row in self._sampled.rows(block.ticks):
+            mujoco.mj_setState(model, data, np.ascontiguousarray(block.messages["state"][row]), STATE)
+            forces = data.xfrc_applied[bodies, :3]
+            pushed = forces.any(axis=1)
+            if self._is_empty and not pushed.any():
+                continue
+            self._is_empty = not pushed.any()
+            mujoco.mj_kinematics(model, data)
+            arrows = rr.Arrows3D(
+                origins=data.xipos[bodies][pushed], vectors=PUSH_M * forces[pushed], radii=PUSH_RADIUS_M, colors=[FORCE]
+            )
+            self._stream.at(*block.when(row), PUSHES, arrows)
 
 
 class PlannedPath:
@@ -190,7 +207,7 @@ class Goals:
             move = self._moves.get(int(block.messages["current"][row]))
             positions, labels = ([move[0]], [move[1]]) if move else ([], [])
             point = rr.Points3D(positions, radii=1.5 * POINT_M, colors=[CURRENT], labels=labels)
-            self._stream.at(int(block.ticks[row]), int(block.stamps_ns[row]), CURRENT_GOAL, point)
+            self._stream.at(*block.when(row), CURRENT_GOAL, point)
 
     def _name(self, move: np.void) -> str:
         return f"{verb_name(int(move['verb']))} {self._object(move)}".strip()

@@ -5,12 +5,11 @@ from __future__ import annotations
 from math import prod
 
 import numpy as np
-import rerun as rr
 
 from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.levels.robot.cell import Cell
 from rack.tools.viewer.stream import RowBlock, Stream
-from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
+from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
 
 SIGNALS = "signals"
 MAX_CURVES = 16
@@ -34,14 +33,14 @@ class Joints:
         }
         for at, name in enumerate(names):
             for quantity, unit in QUANTITIES.items():
-                stream.static((JOINTS, name, quantity), _style(name, at, quantity, unit))
-                lines = rr.SeriesLines(names=["lower limit", "upper limit"], colors=[LIMIT, LIMIT], widths=[1.0, 1.0])
-                stream.static((JOINTS, name, quantity, "limits"), lines)
+                _style(stream, (JOINTS, name, quantity), at, unit)
+                limits = (JOINTS, name, quantity, "limits")
+                style_curves(stream, limits, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
         labels = [f"{name}, mrad" for name in names]
-        stream.static((ERROR,), rr.SeriesLines(names=labels, colors=[of_joint(at) for at in range(len(names))]))
+        style_curves(stream, (ERROR,), labels, [of_joint(at) for at in range(len(names))])
         if has_gripper:
-            stream.static((GRIPPER, "opening"), rr.SeriesLines(names=["opening, mm"]))
-            stream.static((GRIPPER, "force"), rr.SeriesLines(names=["force, N"]))
+            style_curves(stream, (GRIPPER, "opening"), ["opening, mm"])
+            style_curves(stream, (GRIPPER, "force"), ["force, N"])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of that level."""
@@ -60,19 +59,20 @@ class Joints:
 
     def _write_limits(self, block: RowBlock) -> None:
         # A straight line needs only its ends.
-        ends = [0, -1]
-        times = self._stream.times.columns(block.ticks[ends], block.stamps_ns[ends])
+        times = block.times_of([0, -1])
         for quantity, limits in self._limits.items():
             for at, name in enumerate(self._names):
                 self._stream.scalars((JOINTS, name, quantity, "limits"), times, np.tile(limits[at], (2, 1)))
 
 
-def _style(name: str, at: int, quantity: str, unit: str) -> rr.SeriesLines:
+def _style(stream: Stream, entity: tuple[str, str, str], at: int, unit: str) -> None:
+    _, name, quantity = entity
     if quantity not in _COMMANDED:
-        return rr.SeriesLines(names=[f"{name} applied, {unit}"], colors=[of_joint(at)])
+        style_curves(stream, entity, [f"{name} applied, {unit}"], [of_joint(at)])
+        return
     names = [f"{name} commanded, {unit}", f"{name} measured, {unit}"]
     # The lower one is wider: it shows on both sides where the two agree.
-    return rr.SeriesLines(names=names, colors=[COMMANDED, of_joint(at)], widths=[2.5, 1.0])
+    style_curves(stream, entity, names, [COMMANDED, of_joint(at)], [2.5, 1.0])
 
 
 class Fields:
@@ -86,7 +86,7 @@ class Fields:
             unit = "" if field.unit in ("", "1") else f", {field.unit}"
             places = [f"[{at}]" for at in range(prod(field.shape))] if field.shape else [""]
             curves = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
-            stream.static(self._lanes[field.name], rr.SeriesLines(names=curves))
+            style_curves(stream, self._lanes[field.name], curves)
 
     def write(self, block: RowBlock) -> None:
         """Write all rows."""

@@ -16,7 +16,7 @@ import rerun as rr
 
 from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Stream
-from rack.tools.viewer.style import EVENT_COLOURS, style_lane, write_span
+from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
 
 EVENTS, RECORDER = "events", "recorder"
 UNSHOWN = ("printed", "miss")
@@ -88,7 +88,7 @@ class Losses:
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
         self._logged: dict[str, int] = {}
-        stream.static((RECORDER, "rows_lost"), rr.SeriesLines(names=["rows lost"], colors=[(230, 50, 50)]))
+        style_curves(stream, (RECORDER, "rows_lost"), ["rows lost"], [LOST])
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write the losses since the last call."""
@@ -106,7 +106,7 @@ class RecorderLoad:
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
-        stream.static((RECORDER, "load"), rr.SeriesLines(names=["recorder, % of a core"]))
+        style_curves(stream, (RECORDER, "load"), ["recorder, % of a core"])
         self._cpu_s, self._wall_s = time.process_time(), time.monotonic()
 
     def advance(self, tick: int) -> None:

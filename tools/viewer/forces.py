@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from rack.levels.force.contact import AXIS_NAMES, UNITS
 from rack.levels.robot.cell import Cell
-from rack.tools.viewer.stream import RowBlock, Stream
-from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint
+from rack.tools.viewer.stream import RowBlock, Sampled, Stream
+from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
 
 ARROWS, FORCES = ("cell", "forces"), "forces"
 TASK, CONTACT = "task_frame", "contact"
 """Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
 ARROW_COLOUR = (0, 230, 255)
-ARROW_S = 0.02
-"""Time between arrows: the rate of a screen."""
 LONGEST_M, TOOL_SHAFT_M = 1.0, 0.014
 """Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show beyond the tool."""
 TIP_M, TIP_SHAFT_M = 0.02, 0.003
@@ -65,18 +63,17 @@ class ContactArrows:
         self._scale, shaft = TIP_M, TIP_SHAFT_M
         if cell.wrist is not None:
             self._scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
-        self._every, self._last = max(1, round(ARROW_S * 1e9 / clock_ns)), -1
+        self._sampled = Sampled(clock_ns)
         for place in self._places:
             arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
             stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
 
     def write(self, block: RowBlock) -> None:
         """Write an arrow every 20 ms of simulated time."""
-        slots, first = np.unique(block.ticks // self._every, return_index=True)
-        chosen, self._last = first[slots > self._last], int(slots[-1])
+        chosen = self._sampled.rows(block.ticks)
         if not len(chosen):
             return
-        times = self._stream.times.columns(block.ticks[chosen], block.stamps_ns[chosen])
+        times = block.times_of(chosen)
         forces = block.messages[self._field][chosen].reshape(len(chosen), -1)
         for at, place in enumerate(self._places):
             vectors = self._scale * forces[:, 3 * at : 3 * at + 3]
@@ -90,8 +87,7 @@ class TaskForces:
         self._stream = stream
         for at, (axis, unit) in enumerate(AXES.items()):
             names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
-            lines = rr.SeriesLines(names=names, colors=[COMMANDED, of_joint(at)], widths=[2.5, 1.0])
-            stream.static((FORCES, TASK, axis), lines)
+            style_curves(stream, (FORCES, TASK, axis), names, [COMMANDED, of_joint(at)], [2.5, 1.0])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of that level; nothing is wanted on an axis of motion."""
@@ -109,7 +105,7 @@ class ContactForces:
         self._stream, self._most = stream, dict(zip(("force", "torque"), most, strict=True))
         for what, unit in (("force", "N"), ("torque", "N m")):
             names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
-            stream.static((FORCES, CONTACT, what), rr.SeriesLines(names=names, colors=[LIMIT, of_joint(0)]))
+            style_curves(stream, (FORCES, CONTACT, what), names, [LIMIT, of_joint(0)])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of the arm."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import rerun as rr
 
 from rack.levels.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.robot.hand import Hand
 from rack.tools.viewer.stream import RowBlock, Stream
-from rack.tools.viewer.style import COMMANDED, dimmed, of_joint
+from rack.tools.viewer.style import COMMANDED, dimmed, of_joint, style_curves
 
 HAND = "hand"
 JOINTS, TENSIONS, FORCES = "joints", "tensions", "forces"
@@ -29,16 +28,15 @@ class HandCurves:
             colours = [of_joint(at) for at in range(len(own))]
             rows = ("flexor", "extensor")
             pairs = [f"{name} {row}{what}, N" for what in (" commanded", "") for row in rows for name in own]
-            angles = rr.SeriesLines(names=[f"{name}, rad" for name in own], colors=colours)
-            stream.static((HAND, finger, JOINTS), angles)
+            style_curves(stream, (HAND, finger, JOINTS), [f"{name}, rad" for name in own], colours)
             # The lower ones are wider: they show on both sides where the two agree.
             shades = [*[COMMANDED] * (2 * len(own)), *colours, *(dimmed(colour) for colour in colours)]
             widths = [2.5] * (2 * len(own)) + [1.0] * (2 * len(own))
-            stream.static((HAND, finger, TENSIONS), rr.SeriesLines(names=pairs, colors=shades, widths=widths))
+            style_curves(stream, (HAND, finger, TENSIONS), pairs, shades, widths)
             axes = [f"{axis}, N" for axis in "xyz"]
-            stream.static((HAND, finger, FORCES), rr.SeriesLines(names=axes, colors=[of_joint(at) for at in range(3)]))
+            style_curves(stream, (HAND, finger, FORCES), axes, [of_joint(at) for at in range(3)])
         labels = [f"{finger}, N" for finger in self._fingers]
-        stream.static(TIPS, rr.SeriesLines(names=labels, colors=[of_joint(at) for at in range(len(labels))]))
+        style_curves(stream, TIPS, labels, [of_joint(at) for at in range(len(labels))])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of the hand."""

@@ -23,20 +23,52 @@ ROW, COLUMN = 45.0, 110.0
 """Distance between nodes, in the graph's units; a letter is about 7 wide."""
 WIDEST = 3
 """Boards of one level in a row: more would make the graph too small to read."""
+FIRED = ["table", "row", "fired", "in_state"]
+"""Fields of a status that say which row of a state table fires."""
 
 
 class ValueLane:
-    """A lane of a level: the name of a value, from where it changes."""
+    """Writes a value of a level's messages as a lane: its name, from where it changes."""
 
-    def __init__(self, stream: Stream, *lane: str) -> None:
+    def __init__(
+        self, stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
+    ) -> None:
+        """Take the value of one field, or the tuple of several; `lane` is the board and what its lane shows."""
         self._stream, self._lane, self._changes = stream, (LEVELS, *lane), Changes()
+        self._fields, self._name = fields, name
 
-    def write(self, block: RowBlock, values: np.ndarray, name: Callable[[Any], str]) -> None:
-        """Write the changes in a block; `values` has shape (rows,)."""
+    def write(self, block: RowBlock) -> None:
+        """Write what changed."""
+        values = block.messages[self._fields]
         rows = self._changes.rows(values)
         if len(rows):
-            times = self._stream.times.columns(block.ticks[rows], block.stamps_ns[rows])
-            write_spans(self._stream, self._lane, times, [name(value) for value in values[rows].tolist()])
+            names = [self._name(value) for value in values[rows].tolist()]
+            write_spans(self._stream, self._lane, block.times_of(rows), names)
+
+
+def command_name(serial: int) -> str:
+    """Return a command in words; empty without one."""
+    return f"command {serial}" if serial else ""
+
+
+def request_name(serial: int) -> str:
+    """Return a motion request in words; empty without one."""
+    return f"request {serial}" if serial else ""
+
+
+def move_name(move: tuple[int, int]) -> str:
+    """Return the verb of a move, which is its serial and its verb; empty without one."""
+    return verb_name(move[1]) if move[0] else ""
+
+
+def mode_name(mode: int) -> str:
+    """Return the mode of a server in words."""
+    return Mode(mode).name.lower()
+
+
+def verb_name(verb: int) -> str:
+    """Return the verb of an elemental move in words."""
+    return Verb(verb).name.lower().replace("_", " ")
 
 
 class Activity:
@@ -46,30 +78,20 @@ class Activity:
         self._stream, (self._board, _, port) = stream, mailbox.name.partition(".")
         # An adapter also writes the statuses of other racks' levels.
         lane = "state" if port == "status" else port
-        self._states, self._errors = ValueLane(stream, self._board, lane), Changes()
-        style_lane(stream, (LEVELS, self._board, lane), STATES)
+        own = (self._board, lane)
+        self._states = ValueLane(stream, own, "state", lambda state: State(state).name.lower())
+        self._errors = Changes()
+        style_lane(stream, (LEVELS, *own), STATES)
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
         messages = block.messages
-        self._states.write(block, messages["state"], lambda state: State(state).name.lower())
+        self._states.write(block)
         for row in self._errors.rows(messages["error"]):
             if messages["error"][row]:
                 reason = messages["reason"][row].decode("ascii", "replace")
                 text = f"{self._board}: {reason or 'error ' + str(messages['error'][row])}"
-                self._stream.say(int(block.ticks[row]), int(block.stamps_ns[row]), "levels", text, "ERROR")
-
-
-class Commanded:
-    """Writes the serial of the command in a mailbox."""
-
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        board, _, port = mailbox.name.partition(".")
-        self._serials = ValueLane(stream, board, port)
-
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
-        self._serials.write(block, block.messages["id"], lambda serial: f"command {serial}" if serial else "")
+                self._stream.say(*block.when(row), "levels", text, "ERROR")
 
 
 class FiredRows:
@@ -77,56 +99,20 @@ class FiredRows:
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream, self._board = stream, mailbox.name.partition(".")[0]
-        self._lane, self._changes = ValueLane(stream, self._board, "row"), Changes()
+        self._lane = ValueLane(
+            stream, (self._board, "row"), FIRED, lambda row: f"{row[1]} {row[2].decode('ascii', 'replace')}"
+        )
+        self._changes = Changes()
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
-        rows = block.messages[["table", "row", "fired", "in_state"]]
-        self._lane.write(block, rows, lambda row: f"{row[1]} {row[2].decode('ascii', 'replace')}")
+        self._lane.write(block)
+        rows = block.messages[FIRED]
         for at in self._changes.rows(rows):
             table, row, fired, state = (part.decode() if isinstance(part, bytes) else part for part in rows[at].item())
             text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"
             level = "INFO" if row else "ERROR"
-            self._stream.say(int(block.ticks[at]), int(block.stamps_ns[at]), "rows", text, level)
-
-
-class Moves:
-    """Writes the current elemental move of `MOVE_STATUS`es, by its verb."""
-
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._moves = ValueLane(stream, mailbox.name.partition(".")[0], "move")
-
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
-        moves = block.messages[["current", "verb"]]
-        self._moves.write(block, moves, lambda move: verb_name(move[1]) if move[0] else "")
-
-
-class Requests:
-    """Writes the motion request under way of `MOTION_STATUS`es."""
-
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._requests = ValueLane(stream, mailbox.name.partition(".")[0], "request")
-
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
-        self._requests.write(block, block.messages["current"], lambda serial: f"request {serial}" if serial else "")
-
-
-class Modes:
-    """Writes the mode of `SERVER_STATUS`es."""
-
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._modes = ValueLane(stream, mailbox.name.partition(".")[0], "mode")
-
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
-        self._modes.write(block, block.messages["mode"], lambda mode: Mode(mode).name.lower())
-
-
-def verb_name(verb: int) -> str:
-    """Return the verb of an elemental move in words."""
-    return Verb(verb).name.lower().replace("_", " ")
+            self._stream.say(*block.when(at), "rows", text, level)
 
 
 class Hierarchy:
@@ -151,7 +137,7 @@ class Hierarchy:
         names = _names(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero(names != before):
-            self._changes.append((int(block.ticks[row]), int(block.stamps_ns[row]), task, str(names[row])))
+            self._changes.append((*block.when(row), task, str(names[row])))
         self._states[task] = str(names[-1])
 
     def lose(self, tick: int, stamp_ns: int, board: str) -> None:

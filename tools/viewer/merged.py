@@ -30,7 +30,9 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
     view = blueprint(together(views) if len(views) > 1 else views[name].everything())
     launches = "-".join(str(place.own.launch.created_ns) for place in placed)
     recording = new_recording(name, f"{name}-{launches}", file, view)
-    _note(Stream(recording, Timelines(placed[0].own.clock_ns, placed[0].own.launch)), placed)
+    log = Stream(recording, Timelines(placed[0].own.clock_ns, placed[0].own.launch))
+    for place in placed[1:]:
+        log.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
     for at, place in enumerate(placed):
         times = Timelines(place.own.clock_ns, place.own.launch, place)
         stream = Stream(recording, times, roots[place.own.rack])
@@ -41,11 +43,6 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
             stream.flush()
             show((at + min(1.0, tick / last)) / len(placed))
     recording.disconnect()
-
-
-def _note(stream: Stream, placed: Sequence[RackPlace]) -> None:
-    for place in placed[1:]:
-        stream.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
 
 
 def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:

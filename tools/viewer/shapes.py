@@ -39,25 +39,27 @@ def _solid(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
     return {"quaternions": [xyzw(model.geom_quat[geom])], "colors": [colour(model, geom)], "fill_mode": "solid"}
 
 
+def _centred(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
+    """Return the same, and the centre of the solid."""
+    return {"centers": [model.geom_pos[geom]], **_solid(model, geom)}
+
+
 def _box(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    centers = [model.geom_pos[geom]]
-    return rr.Boxes3D(half_sizes=[model.geom_size[geom]], centers=centers, **_solid(model, geom))
+    return rr.Boxes3D(half_sizes=[model.geom_size[geom]], **_centred(model, geom))
 
 
 def _sphere(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     radius = model.geom_size[geom][0]
-    return rr.Ellipsoids3D(half_sizes=[[radius] * 3], centers=[model.geom_pos[geom]], **_solid(model, geom))
+    return rr.Ellipsoids3D(half_sizes=[[radius] * 3], **_centred(model, geom))
 
 
 def _ellipsoid(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    centers = [model.geom_pos[geom]]
-    return rr.Ellipsoids3D(half_sizes=[model.geom_size[geom]], centers=centers, **_solid(model, geom))
+    return rr.Ellipsoids3D(half_sizes=[model.geom_size[geom]], **_centred(model, geom))
 
 
 def _cylinder(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     radius, half, _ = model.geom_size[geom]
-    centers = [model.geom_pos[geom]]
-    return rr.Cylinders3D(lengths=[2 * half], radii=[radius], centers=centers, **_solid(model, geom))
+    return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **_centred(model, geom))
 
 
 def _capsule(model: mujoco.MjModel, geom: int) -> rr.AsComponents:

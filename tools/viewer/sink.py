@@ -30,13 +30,22 @@ from rack.levels.messages import (
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.trajectory.messages import MOTION_STATUS
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
-from rack.tools.viewer.cell import Goals, PlannedPath, Poses, write_geometry
+from rack.tools.viewer.cell import Goals, PlannedPath, Poses, Pushes, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses, RecorderLoad
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces
 from rack.tools.viewer.hand import HandCurves
-from rack.tools.viewer.levels import Activity, Commanded, FiredRows, Hierarchy, Modes, Moves, Requests
-from rack.tools.viewer.pushes import Pushes
+from rack.tools.viewer.levels import (
+    FIRED,
+    Activity,
+    FiredRows,
+    Hierarchy,
+    ValueLane,
+    command_name,
+    mode_name,
+    move_name,
+    request_name,
+)
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
@@ -183,19 +192,20 @@ def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | N
 
 def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     names = {field.name for field in mailbox.fields}
+    board, _, port = mailbox.name.partition(".")
     parts: list[ViewPart] = []
     if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
         parts.append(Activity(stream, mailbox).write)
     elif mailbox.name.endswith(".command") and "id" in names and mailbox.message not in (*STREAMED, *STREAMED_DOWN):
-        parts.append(Commanded(stream, mailbox).write)
-    if {"table", "row", "fired", "in_state"} <= names:
+        parts.append(ValueLane(stream, (board, port), "id", command_name).write)
+    if names.issuperset(FIRED):
         parts.append(FiredRows(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
-        parts.append(Moves(stream, mailbox).write)
+        parts.append(ValueLane(stream, (board, "move"), ["current", "verb"], move_name).write)
     if mailbox.message in (MOTION_STATUS.name, SERVER_STATUS.name):
-        parts.append(Requests(stream, mailbox).write)
+        parts.append(ValueLane(stream, (board, "request"), "current", request_name).write)
     if mailbox.message == SERVER_STATUS.name:
-        parts.append(Modes(stream, mailbox).write)
+        parts.append(ValueLane(stream, (board, "mode"), "mode", mode_name).write)
     if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name, HAND_STATUS.name):
         parts.append(Fields(stream, mailbox).write)
     return parts

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, SupportsIndex
 
 import numpy as np
 import rerun as rr
@@ -102,6 +102,14 @@ class RowBlock:
         """The time columns of all rows, made once for all parts that write them."""
         return self._timelines.columns(self.ticks, self.stamps_ns)
 
+    def times_of(self, rows: Ints | list[int]) -> list[rr.TimeColumn]:
+        """Return the time columns of some rows, by their indices."""
+        return self._timelines.columns(self.ticks[rows], self.stamps_ns[rows])
+
+    def when(self, row: SupportsIndex) -> tuple[int, int]:
+        """Return tick and time stamp of one row."""
+        return int(self.ticks[row]), int(self.stamps_ns[row])
+
     @property
     def messages(self) -> np.ndarray:
         """The messages of a mailbox's rows."""
@@ -125,6 +133,23 @@ class Changes:
         changed[0] |= self._last is None
         self._last = values[-1:].copy()
         return np.flatnonzero(changed)
+
+
+SHOWN_S = 0.02
+"""Time between things drawn: the rate of a screen."""
+
+
+class Sampled:
+    """Finds the rows of consecutive blocks that are drawn: the first of every 20 ms of simulated time."""
+
+    def __init__(self, clock_ns: int) -> None:
+        self._every, self._last = max(1, round(SHOWN_S * 1e9 / clock_ns)), -1
+
+    def rows(self, ticks: Ints) -> Ints:
+        """Return the indices of these rows."""
+        slots, first = np.unique(ticks // self._every, return_index=True)
+        chosen, self._last = first[slots > self._last], int(slots[-1])
+        return np.asarray(chosen)
 
 
 def new_recording(

@@ -31,35 +31,42 @@ PLANNED: Colour = (255, 200, 40, 255)
 GOAL: Colour = (70, 210, 90, 255)
 CURRENT: Colour = (255, 110, 40, 255)
 FORCE: Colour = (240, 60, 60, 255)
+LOST: Colour = (230, 50, 50, 255)
 
+_GREY: Colour = (110, 110, 120, 255)
+_BLUE: Colour = (70, 140, 230, 255)
+_GREEN: Colour = (70, 180, 90, 255)
+_YELLOW: Colour = (230, 180, 60, 255)
+_ORANGE: Colour = (240, 140, 30, 255)
+_RED: Colour = (220, 50, 50, 255)
 STATES: dict[str, Colour] = {
-    "idle": (110, 110, 120, 255),
-    "executing": (70, 140, 230, 255),
-    "done": (70, 180, 90, 255),
-    "holding": (230, 180, 60, 255),
-    "error": (220, 50, 50, 255),
-    "missed": (240, 140, 30, 255),
+    "idle": _GREY,
+    "executing": _BLUE,
+    "done": _GREEN,
+    "holding": _YELLOW,
+    "error": _RED,
+    "missed": _ORANGE,
     "lost": (120, 20, 20, 255),
 }
 EVENT_COLOURS: dict[str, Colour] = {
-    "launch": (110, 110, 120, 255),
-    "ready": (110, 110, 120, 255),
-    "start": (70, 140, 230, 255),
-    "stop": (240, 140, 30, 255),
-    "end": (70, 180, 90, 255),
-    "died": (220, 50, 50, 255),
+    "launch": _GREY,
+    "ready": _GREY,
+    "start": _BLUE,
+    "stop": _ORANGE,
+    "end": _GREEN,
+    "died": _RED,
     "fault": (190, 90, 210, 255),
-    "detection": (240, 140, 30, 255),
+    "detection": _ORANGE,
     "reaction": (220, 90, 60, 255),
-    "recovery": (70, 180, 90, 255),
+    "recovery": _GREEN,
 }
 """By kind; the viewer picks a colour for any other."""
 PHASES: dict[str, Colour] = {
     "wait": (60, 62, 70, 255),
     "read": (90, 170, 220, 255),
-    "process": (70, 180, 90, 255),
+    "process": _GREEN,
     "plan": (150, 110, 220, 255),
-    "write": (230, 180, 60, 255),
+    "write": _YELLOW,
     "missed": (230, 50, 50, 255),
 }
 
@@ -82,6 +89,17 @@ def style_lane(stream: Stream, entity: Sequence[str], colours: Mapping[str, Colo
     names = list(colours)
     labels = [" " if name in quiet else name for name in names]
     stream.static(entity, rr.StateConfiguration(values=names, labels=labels, colors=list(colours.values())))
+
+
+def style_curves(
+    stream: Stream,
+    entity: Sequence[str],
+    names: Sequence[str],
+    colours: Sequence[Colour] | None = None,
+    widths: Sequence[float] | None = None,
+) -> None:
+    """Set names, colours and widths of an entity's curves; without colours the viewer picks them."""
+    stream.static(entity, rr.SeriesLines(names=names, colors=colours, widths=widths))
 
 
 def write_spans(stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]) -> None:

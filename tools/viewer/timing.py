@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
 from rack.levels.timing.trace_times import execution_ns, is_missed, lateness_ns, newest_visible, response_ns
 from rack.tools.viewer.levels import LEVELS
 from rack.tools.viewer.stream import Ints, RowBlock, Stream
-from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_lane, write_spans
+from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_curves, style_lane, write_spans
 
 BOARDS, LOAD, TIMES, AGES = "boards", "load", "times", "ages"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
@@ -57,8 +56,8 @@ class Load:
         self._stream, self._task, self._is_lockstep = stream, task.name, is_lockstep
         self._slice_ns = task.every * task.within_cycles * period_ns
         curves = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
-        stream.static((TIMES, task.name), rr.SeriesLines(names=curves, colors=[of_joint(1), of_joint(0), LIMIT]))
-        stream.static((LOAD, task.name), rr.SeriesLines(names=[f"{task.name}, %"]))
+        style_curves(stream, (TIMES, task.name), curves, [of_joint(1), of_joint(0), LIMIT])
+        style_curves(stream, (LOAD, task.name), [f"{task.name}, %"])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle; 100 % is the deadline."""
@@ -119,7 +118,7 @@ class Age:
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)
         self._upto = -1
-        stream.static(self._lane, rr.SeriesLines(names=[f"{mailbox.name}, ms"]))
+        style_curves(stream, self._lane, [f"{mailbox.name}, ms"])
 
     def write(self, block: RowBlock) -> None:
         """Take messages; they count from the tick at which they become visible."""

@@ -9,11 +9,13 @@ from itertools import pairwise
 
 import pytest
 
+from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import by_priority
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.watch.alarms import Alarm, alarm_ring
 from rack.backplane.words import Block, Head, Run, System
 from tests.backplane.bus import layout, task
 from tests.backplane.conftest import MakeBus
@@ -113,6 +115,11 @@ def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> Non
     assert following - held_up[0] >= 6
     left_out = sum(second - first - 1 for first, second in pairwise([-1, *numbers]))
     assert segment.words[System.CLOCK_SKIPPED] == left_out
+    # Its own gap is on record: since which tick it was due, and how much later it woke.
+    rows, _ = alarm_ring(segment, CLOCK).drain()
+    (late,) = [row for row in rows if row["since"] == held_up[0] + 1]
+    assert (late["code"], late["tick"]) == (Alarm.CLOCK_LATE, following)
+    assert (following - held_up[0] - 1) * PERIOD_NS <= late["value"] < (following - held_up[0]) * PERIOD_NS
 
 
 class Lagging:
@@ -147,6 +154,8 @@ def test_a_clock_that_starts_late_does_not_shift_its_grid(make_bus: MakeBus) -> 
     first = given_out(segment, 30)[0][0]
     assert first >= 10
     assert segment.words[System.CLOCK_SKIPPED] >= first
+    # Before its first tick nothing took its core.
+    assert not any(row["since"] == 0 for row in alarm_ring(segment, CLOCK).drain()[0])
 
 
 def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:

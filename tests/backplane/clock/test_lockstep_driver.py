@@ -6,10 +6,12 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 from typing import get_args
 
 import pytest
 
+from rack.backplane import process
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
@@ -126,16 +128,39 @@ def test_lockstep_waits_for_its_recorder(make_bus: MakeBus) -> None:
     assert max(ahead) <= HISTORY + 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, None], ids=["dead", "stopped", "idle"])
-def test_a_recorder_that_takes_nothing_over_is_not_waited_for_long(
-    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals | None
+def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
+    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.backplane.clock.lockstep.IDLE_S", 0.05 if number else 60.0)
-    monkeypatch.setattr("rack.backplane.clock.lockstep.SLOW_S", 60.0 if number else 0.05)
+    # Each look at it takes a second: it is waited for longer than for any that is dead.
+    quick = SimpleNamespace(monotonic=lambda: 1000 * time.monotonic(), monotonic_ns=time.monotonic_ns, sleep=time.sleep)
+    monkeypatch.setattr("rack.backplane.clock.lockstep.time", quick)
+    segment = make_bus(task("fast"))
+    looks = 0
+
+    def state_of(pid: int) -> str:
+        nonlocal looks
+        looks += 1
+        if looks == 100:
+            segment.words[System.FOLLOWER_TICK] = 3 * HISTORY
+        return process.state_of(pid)
+
+    monkeypatch.setattr("rack.backplane.clock.lockstep.state_of", state_of)
+    with forked(signal.pause) as follower:
+        segment.words[System.FOLLOWER_PID] = follower
+        _, ticks = lockstep(segment, 3 * HISTORY, False)
+    assert looks == 100
+    assert len(ticks) == 3 * HISTORY + 1
+    assert segment.words[System.FOLLOWER_PID] == follower
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["dead", "stopped"])
+def test_a_recorder_that_nobody_replaces_is_not_waited_for_long(
+    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    monkeypatch.setattr("rack.backplane.clock.lockstep.IDLE_S", 0.05)
     segment = make_bus(task("fast"))
     with forked(signal.pause) as follower:
-        if number is not None:
-            os.kill(follower, number)
+        os.kill(follower, number)
         segment.words[System.FOLLOWER_PID] = follower
         _, ticks = lockstep(segment, 3 * HISTORY, False)
     assert len(ticks) == 3 * HISTORY + 1

@@ -12,6 +12,7 @@ from typing import get_args
 
 import pytest
 
+from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
 from rack.backplane.process import state_of
@@ -26,6 +27,7 @@ from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 WAKES = pytest.mark.parametrize("wake", get_args(Wake), indirect=True)
 EVERY = 4
 PERIOD_NS = 2_500_000
+LONG_NS = 20_000_000
 
 
 @pytest.fixture
@@ -247,6 +249,27 @@ def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one
 
     with in_thread(skip):
         assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 1)
+
+
+@TIMER
+def test_a_release_that_the_clock_makes_up_for_after_a_skip_wakes_a_sleeping_task(
+    bus: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Ahead of its grid points on a busy machine too.
+    monkeypatch.setattr("rack.backplane.clock.driver.LEAD_NS", LONG_NS)
+    cycle, taken = NextCycle(bus, "level"), []
+    start_grid(bus, -LONG_NS, LONG_NS)
+
+    def ended(tick: int) -> int | None:
+        # Skips the tick of the task's release, and is on time in the next one.
+        driver.skip = int(tick == EVERY)
+        return tick if tick > 2 * EVERY else None
+
+    driver = RealtimeDriver(bus, ended)
+    with in_thread(driver.run):
+        while (tick := cycle.wait()) is not None:
+            taken.append((tick, cycle.skipped))
+    assert taken == [(0, 0), (EVERY, 0), (2 * EVERY, 0)]
 
 
 @TIMER

@@ -11,13 +11,14 @@ import pytest
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.segment import Segment, unlink
-from rack.backplane.watch.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import BY_DEMAND, MISSES, NO_TORQUE, Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
 from rack.boards.config.faults import injections
 from rack.boards.crate.alarm_events import AlarmEvents
 from rack.boards.events import Event
+from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
@@ -34,6 +35,7 @@ KINDS = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",
     Alarm.REJOINED: "recovery",
+    Alarm.FLOWS: "recovery",
     Alarm.DEMAND: "reaction",
     Alarm.BRAKES_CLOSED: "reaction",
     Alarm.BRAKES_OPENED: "recovery",
@@ -107,8 +109,9 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
         ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor all joints disagrees with the model: off by 0.05"),
         ("driven", Alarm.ACTUATOR, 7, 0.5, "actuator joint 7 does not produce its commanded torque: off by 0.5"),
         ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder cut to its limit: 512 N m was commanded"),
-        ("driven", Alarm.BRAKES_CLOSED, -1, 0, "brakes engaged"),
-        ("driven", Alarm.BRAKES_CLOSED, -1, 4, "brakes engaged: no torque for 4 ticks (10 ms)"),
+        ("driven", Alarm.BRAKES_CLOSED, BY_DEMAND, 0, "brakes engaged: a stop is demanded"),
+        ("driven", Alarm.BRAKES_CLOSED, Error.SENSORS, 0, "brakes engaged: sensors"),
+        ("driven", Alarm.BRAKES_CLOSED, NO_TORQUE, 4, "brakes engaged: no torque for 4 ticks (10 ms)"),
         ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes released after 40 ticks (100 ms)"),
     ],
 )
@@ -163,7 +166,7 @@ def test_a_fault_names_its_target(segment: Segment, fault: int, board: str, subj
 
 
 def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
-    FaultTable(segment).entries[2].acted(400, 1)
+    FaultTable(segment).entries[2].acted(400)
     event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
     assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")
 

@@ -97,7 +97,7 @@ def test_its_brakes_engage_when_the_servo_level_misses_cycles(rig: ServoRig) -> 
     rig.run(200, Course(START, GOAL, 2.0).at)
     rig.miss(10)
     rig.run(12)
-    assert rig.alarms() == [Alarm.BRAKES_CLOSED]
+    assert rig.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
 
 
 def test_a_restarted_board_restores_it(rig: ServoRig) -> None:

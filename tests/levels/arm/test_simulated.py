@@ -13,7 +13,6 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm, substeps
-from rack.levels.arm.arm import PATIENCE_CYCLES
 from rack.levels.arm.simulation import ObstacleMotion
 from rack.levels.messages import ARM_STATE, SCENE
 from rack.levels.robot.cell import Cell, sizes
@@ -168,7 +167,7 @@ def test_drives_keep_the_last_torque_for_a_while_then_brake_to_standstill() -> N
         arm.drive(torque(tick), 0.0)
         arm.step(1)
     given = arm.torque.copy()
-    for _ in range(PATIENCE_CYCLES - 1):
+    for _ in range(arm.patience - 1):
         arm.step(1)
         assert np.array_equal(arm.torque, given)
     assert np.abs(arm.sense().velocity).max() > 0.2

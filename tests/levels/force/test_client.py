@@ -50,6 +50,10 @@ class Bus:
         self.requests: list[dict[str, Any]] = []
         self.status = Message(SERVER_STATUS.dtype({"joints": 6}))
 
+    @property
+    def time_s(self) -> float:
+        return self.tick * CONTEXT.tick_s
+
     def wait(self, timeout_s: float) -> bool:
         self.tick += 20
         return True

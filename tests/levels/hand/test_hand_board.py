@@ -90,7 +90,7 @@ def test_board_that_sees_nothing_new_closes_the_valves() -> None:
     rig.cycles(8)
     status = rig.status
     assert (status.state, status.stopped) == (State.HOLDING, 1)
-    assert status.reason == "tensions of board 'index' are stale: they rest on a status more than 20 ticks old"
+    assert status.reason == "stale tensions from board 'index': based on a status more than 20 ticks old"
     rig.swing("index").is_blind = False
     rig.cycles(10)
     assert_follows(rig)

@@ -25,7 +25,7 @@ CYCLES = 17
 
 
 class Crate:
-    """A bus with one board, whose messages the test sets: ports of `Workstation`."""
+    """A bus with one board, whose messages the test sets: ports of `Workstation`. A second passes between two looks."""
 
     tasks = ("coordinator",)
     tick = 12
@@ -42,6 +42,10 @@ class Crate:
     def is_over(self) -> bool:
         self.looks -= 1
         return self.looks < 0
+
+    @property
+    def time_s(self) -> float:
+        return 20.0 - self.looks
 
     def wait(self, timeout_s: float) -> bool:
         return True

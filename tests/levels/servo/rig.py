@@ -97,7 +97,7 @@ class ServoRig:
         servo = self.servo
         self.rack.step()
         self.found += [Found(self.rack.tick - 1, finding) for finding in servo.findings]
-        self.acted += [self.rack.tick - 1] * bool(servo.acted)
+        self.acted += [self.rack.tick - 1] * any(servo.acted.values())
         servo.findings.clear()
         servo.acted.clear()
 

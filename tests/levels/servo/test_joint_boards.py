@@ -12,6 +12,7 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_TORQUE
 from rack.levels.level import LevelContext, Pace
+from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.servo.joint_control import AT, DUE, JointLoads
 from rack.levels.servo.joint_torques import JointTorques
@@ -39,7 +40,9 @@ def joint_torques() -> JointTorques:
     """Return those of two boards, one as fast as the arm, one of half its rate."""
     robot, scene = config("puma560")
     pace = {"fast": Pace(1, 1), "slow": Pace(2, 1)}
-    return JointTorques(LevelContext("arm", 1, 1, CLOCK_NS, 0, robot, scene, {}, SIZES, pace), len(JOINTS))
+    return JointTorques(
+        LevelContext("arm", 1, 1, CLOCK_NS, 0, robot, scene, {}, SIZES, pace), build_cell(robot, scene, CLOCK_NS)
+    )
 
 
 def readings(fast: Message, slow: Message) -> dict[str, Reading]:
@@ -116,7 +119,7 @@ MISSING: dict[str, tuple[Callable[[dict[str, Reading]], object], int, str]] = {
     "stale, by its own cycle": (
         lambda read: setattr(read["slow"].value, "sampled", TICK - 8),
         0,
-        "torque of board 'slow' is stale: it rests on a status more than 7 ticks old",
+        "stale torque from board 'slow': based on a status more than 7 ticks old",
     ),
     "from before the brakes engaged": (lambda read: None, TICK - 2, "braked until the boards above have seen it"),
 }

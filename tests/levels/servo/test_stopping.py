@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.backplane.watch.alarms import Alarm
+from rack.backplane.watch.alarms import NO_TORQUE, Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Demand
 from rack.levels.messages import Error
@@ -163,6 +163,28 @@ def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(
     values = [(f.finding.alarm, f.finding.value) for f in rig.found]
     assert values[:1] == ([] if seen is None else [(Alarm.BRAKES_CLOSED, seen)])
     assert rig.status.stopped == 0
+
+
+@pytest.mark.parametrize("missed", [2, 3, 40])
+def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_their_time(missed: int) -> None:
+    rig, move = rig_under_way()
+    begun = rig.rack.tick
+    rig.miss(missed)
+    rig.run(missed + 5, move.at)
+    # The last torque was given a tick before, and the motors kept it for two.
+    closed, opened = (Alarm.BRAKES_CLOSED, NO_TORQUE, missed), (Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1)
+    assert rig.found == [(begun + missed, closed), (begun + missed, opened)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"), [("sensor-nan", Error.SENSORS), ("actuator-off", Error.MOTORS), ("command-nan", Error.LIMIT)]
+)
+def test_brakes_say_which_fault_engaged_them(kind: str, why: Error) -> None:
+    rig, move = rig_under_way()
+    rig.inject(kind, joint=1)
+    rig.run(100, move.at)
+    engaged = [finding for _, finding in rig.found if finding.alarm is Alarm.BRAKES_CLOSED]
+    assert [finding.subject for finding in engaged[:1]] == [why]
 
 
 def test_a_restarted_servo_reports_how_long_the_arm_was_without_torque() -> None:

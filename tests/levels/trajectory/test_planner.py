@@ -17,7 +17,7 @@ from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind
 from rack.levels.trajectory.planner import RequestExecutor, RequestPlanner
-from rack.levels.trajectory.program import read_motions
+from rack.levels.trajectory.program import MotionProgram
 from tests.levels.arms import config
 
 ROBOT, SCENE = config("puma560_crossing")
@@ -168,7 +168,7 @@ def test_live_goals_name_their_body() -> None:
 )
 def test_a_program_that_does_not_fit_is_refused(step: dict[str, Any], why: str) -> None:
     with pytest.raises(ProgramError) as refused:
-        read_motions({"step": [step]}, ROBOT, SCENE)
+        MotionProgram.read({"step": [step]}, ROBOT, SCENE)
     assert why in str(refused.value)
 
 

@@ -46,7 +46,7 @@ def test_a_run_that_fits_breaks_nothing(config: RackConfig, tmp_path: Path) -> N
 def test_a_cycle_that_computes_beyond_its_cycle_breaks_what_it_breaks(config: RackConfig, tmp_path: Path) -> None:
     trace = [*lower(), Cycle(SETTLED + 8, (0.0, 0.1, 3.0, 0.1), flags=MISSED)]
     (breach,) = found_in(tmp_path / "run", config, {"lower": trace})
-    assert (breach.task, breach.tick, breach.is_start_up) == ("lower", SETTLED + 8, False)
+    assert (breach.task, breach.tick, breach.is_judged) == ("lower", SETTLED + 8, True)
     assert equations(breach) == ["3.1", "3.6", "3.9", "response time"]
     sides = {broken.equation: (broken.left, broken.sign, broken.right) for broken in breach.broken}
     assert sides["3.1"] == (3.2 * MS, "<=", 2.5 * MS)
@@ -59,7 +59,7 @@ def test_a_cycle_that_computes_beyond_its_cycle_breaks_what_it_breaks(config: Ra
 def test_the_worst_come_first_and_the_start_up_is_told_apart(config: RackConfig, tmp_path: Path) -> None:
     bad = [Cycle(tick, (0.0, 0.1, ms, 0.1)) for tick, ms in ((3, 9.0), (50, 4.0), (60, 7.0))]
     found = found_in(tmp_path / "run", config, {"lower": [bad[0], *lower(), *bad[1:]]})
-    assert [(breach.tick, breach.is_start_up) for breach in found] == [(3, True), (60, False), (50, False)]
+    assert [(breach.tick, breach.is_judged) for breach in found] == [(3, False), (60, True), (50, True)]
 
 
 def test_a_level_that_others_kept_from_its_core_keeps_its_own_equations(config: RackConfig, tmp_path: Path) -> None:

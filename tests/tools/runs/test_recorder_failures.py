@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
+import resource
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
+from rack.backplane.segment import racks
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
@@ -23,6 +27,7 @@ from rack.tools.recorder.recorder import Recorder, SafeSink
 from rack.tools.runs import recorder_process
 from rack.tools.runs.display import Display
 from rack.tools.runs.launch import NO_RECORDER, run_rack
+from rack.tools.runs.parquet import CONFIG
 from rack.tools.runs.recording import Recording
 from rack.tools.runs.snapshot import Snapshot
 from rack.tools.runs.spool import SPOOL, mend
@@ -36,6 +41,8 @@ FIRST_BLOCK = 400
 """Ticks after which there is something on disk."""
 LONG_S = 12.0
 """Simulated time that the recorder does not outrun."""
+FULL_S = 5.0
+"""Bound of the end of a run whose disk is full."""
 
 
 @pytest.fixture
@@ -184,12 +191,14 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
 
 
 class AtTick(Display):
-    """Sends a signal to the recorder of the run, once, when that has got to some tick."""
+    """Strikes the recorder of the run, by default with a signal, `times` times, when the run has got to some tick."""
 
     period_s = 0.05
 
-    def __init__(self, number: signal.Signals, tick: int = FIRST_BLOCK, view: Path | None = None) -> None:
-        self._number, self._tick, self._view = number, tick, view
+    def __init__(
+        self, number: signal.Signals, tick: int = FIRST_BLOCK, view: Path | None = None, times: int = 1
+    ) -> None:
+        self._number, self._tick, self._view, self._times = number, tick, view, times
         self._view_began = 0
         self.struck: list[int] = []
 
@@ -203,9 +212,28 @@ class AtTick(Display):
 
     def show(self, snapshot: Snapshot) -> None:
         """Look at the tick, and at the viewer's file."""
-        if snapshot.tick > self._tick and not self.struck and self._has_view():
-            self.struck = [pid for pid in children_of(os.getpid()) if b"rack.tools.recorder" in command_of(pid)]
-            os.kill(self.struck[0], self._number)
+        if snapshot.tick > self._tick and len(self.struck) < self._times and self._has_view():
+            for pid in children_of(os.getpid()):
+                if pid not in self.struck and b"rack.tools.recorder" in command_of(pid):
+                    self.struck.append(pid)
+                    self.strike(pid)
+
+    def strike(self, pid: int) -> None:
+        """Send the signal."""
+        os.kill(pid, self._number)
+
+
+class FillingDisk(AtTick):
+    """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is full."""
+
+    def __init__(self) -> None:
+        super().__init__(signal.SIGKILL)
+        self.full_at = 0.0
+
+    def strike(self, pid: int) -> None:
+        """Fill the disk."""
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, 4096))
+        self.full_at = time.monotonic()
 
 
 def command_of(pid: int) -> bytes:
@@ -214,6 +242,12 @@ def command_of(pid: int) -> bytes:
 
 def notes_of(recording: Recording) -> list[str]:
     return [event["text"] for event in recording.events if event["kind"] == "recorder"]
+
+
+def counts(recording: Recording) -> dict[str, int]:
+    """Return the rows of every task and every mailbox."""
+    rows = {task: len(cycles) for task, cycles in recording.cycles.items()}
+    return rows | {name: len(recording.signal(name, "serial")) for name in recording.mailboxes}
 
 
 def realtime(config: RackConfig) -> RackConfig:
@@ -230,11 +264,130 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config:
     # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
     serials = recording.signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
-    assert len(recording.cycles["lower"]) == result.outcome.ticks
     assert not any(recording.lost.values())
-    assert result.outcome.digest == run_rack(config, LONG_S, None, Display()).outcome.digest
+    whole = run_rack(config, LONG_S, tmp_path / "whole", Display())
+    assert result.outcome.digest == whole.outcome.digest
+    assert counts(recording) == counts(Recording(tmp_path / "whole"))
     # The viewer's file is not written over.
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_recorders_killed_before_their_first_block_cost_no_row(config: RackConfig, tmp_path: Path) -> None:
+    # Each new one, too, is struck as soon as it is there.
+    display = AtTick(signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
+    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    assert len(display.struck) == recorder_process.RESTARTS
+    assert (result.worked, result.recording, result.rows_lost) == (True, "complete", {})
+    serials = Recording(tmp_path / "run").signal("lower.status", "serial")
+    assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
+
+
+def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(config: RackConfig, tmp_path: Path) -> None:
+    display = AtTick(signal.SIGSTOP)
+    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    assert display.struck
+    assert (result.worked, result.recording) == (True, "complete")
+    recording = Recording(tmp_path / "run")
+    assert notes_of(recording)[0] == "the recorder is not responding: killed"
+    assert len(recording.signal("lower.status", "serial")) == result.outcome.ticks
+
+
+def test_lockstep_waits_for_a_recorder_that_comes_late(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
+    result = run_rack(config, LONG_S, tmp_path / "run", Display())
+    assert notes_of(Recording(tmp_path / "run"))[:2] == [NO_RECORDER, "the recorder has begun"]
+    assert (result.worked, result.recording) == (True, "complete")
+
+
+def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_is_missing(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    display = AtTick(signal.SIGKILL, times=recorder_process.RESTARTS + 1)
+    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    assert len(display.struck) == recorder_process.RESTARTS + 1
+    assert (result.outcome.worked, result.worked) == (True, False)
+    recording, ticks = Recording(tmp_path / "run"), result.outcome.ticks
+    taken = counts(recording)
+    missing = {name: ticks - taken[name] for name in ("lower", "lower.status")}
+    assert missing["lower"] > ticks / 4
+    assert {name: result.rows_lost[name] for name in missing} == missing == {n: recording.lost[n] for n in missing}
+    worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
+    assert result.recording == (
+        f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing (and rows of {len(result.rows_lost) - 1} more "
+        "tasks and mailboxes); the recorder ended with status -9"
+    )
+    assert result.failure().endswith(result.recording)
+
+
+def test_rows_that_no_recorder_took_are_missing(config: RackConfig, tmp_path: Path) -> None:
+    taken, left = tmp_path / "taken", tmp_path / "left"
+    with Rack(config) as rack:
+        for folder in (taken, left):
+            folder.mkdir()
+            (folder / CONFIG).write_text(config.text())
+        with Recorder(rack.segment, left):
+            rack.run(0.5)
+        with Recorder(rack.segment, taken) as recorder:
+            recorder.drain()
+        assert Recording(taken).missing(rack.segment) == {}
+        missing = Recording(left).missing(rack.segment)
+    assert (missing["lower.status"], missing["lower"]) == ((200, 200), (200, 200))
+    assert missing["upper.status"] == (25, 25)
+
+
+@pytest.mark.parametrize("kind", ["drop", "corrupt", "delay", "reorder", "masquerade"])
+def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(small: Path, rack_name: str, kind: str) -> None:
+    """Faults of messages, and a recorder that is killed after them."""
+    lasts = "" if kind == "masquerade" else ", for = '0.4s'"
+    faults = f"fault=[{{ kind = '{kind}', board = 'lower', at = 0.4{lasts} }}]"
+    folder = small.parent / "run"
+    result = run_rack(load(small, [f"name={rack_name}", faults]), LONG_S, folder, AtTick(signal.SIGKILL))
+    assert result.recording == "complete"
+    serials = Recording(folder).signal("lower.status", "serial")
+    assert np.all(np.diff(serials) > 0)
+
+
+def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(small: Path, rack_name: str) -> None:
+    """In each cycle as many messages as the ring of a slow task holds in a second."""
+    faults = "fault=[{ kind = 'babble', board = 'upper', at = 0.4, for = '1s', writes = 25 }]"
+    result = run_rack(load(small, [f"name={rack_name}", faults]), LONG_S, small.parent / "run", Display())
+    assert result.faults[0].count > 1
+    assert result.recording == "complete"
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
+    config: RackConfig, tmp_path: Path, mode: str
+) -> None:
+    display = FillingDisk()
+    # Python's own helpers of earlier tests stay until the end.
+    before = set(children_of(os.getpid()))
+    wanted = config if mode == "lockstep" else realtime(config)
+    with pytest.raises(Failure) as caught:
+        run_rack(wanted, 5 * LONG_S, tmp_path / "run", display)
+    assert time.monotonic() - display.full_at < FULL_S
+    assert len(display.struck) == 1
+    assert caught.value.status == 1
+    assert re.fullmatch(f"{tmp_path}/run: File too large: the recording ends at tick [0-9]+", str(caught.value))
+    assert config.name not in racks()
+    assert set(children_of(os.getpid())) <= before
+
+
+def test_a_disk_that_is_full_from_the_start_ends_the_run(config: RackConfig, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / SPOOL).symlink_to("/dev/full")
+    with pytest.raises(Failure, match="run: No space left on device: the recording ends at tick 0"):
+        run_rack(config, 5 * LONG_S, tmp_path / "run", Display())
+
+
+def test_a_folder_that_cannot_be_written_is_named(config: RackConfig, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / CONFIG).symlink_to("/dev/full")
+    with pytest.raises(Failure, match="/run: No space left on device"):
+        run_rack(config, 1.0, tmp_path / "run", Display())
+    assert config.name not in racks()
 
 
 def test_what_a_killed_recorder_took_is_readable(
@@ -243,10 +396,12 @@ def test_what_a_killed_recorder_took_is_readable(
     monkeypatch.setattr(recorder_process, "RESTARTS", 0)
     display = AtTick(signal.SIGKILL, view=tmp_path / "run" / "run.rrd")
     result = run_rack(realtime(config), LONG_S, tmp_path / "run", display)
-    assert result.worked
-    assert result.recording == "the recorder ended with status -9"
+    # The run went well, but is not recorded as wanted.
+    assert (result.outcome.worked, result.worked) == (True, False)
+    assert re.fullmatch(r"[0-9,]+ of [0-9,]+ rows of lower.* are missing .*ended with status -9", result.recording)
     report, _ = write_report(tmp_path / "run")
-    assert report["worked"]
+    assert (report["worked"], report["recording"]) == (False, result.recording)
+    assert report["rows_lost"] == result.rows_lost
     assert notes_of(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the run continues, unrecorded"]
     ticks = pq.read_table(tmp_path / "run" / "signals.parquet", columns=["tick"])["tick"].to_numpy()
     assert ticks.max() > FIRST_BLOCK / 2
@@ -256,11 +411,11 @@ def test_what_a_killed_recorder_took_is_readable(
     assert RrdReader(str(repaired)).stream().filter(content="/boards/**").to_chunks()
 
 
-def test_a_recorder_that_is_stopped_delays_no_end(config: RackConfig, tmp_path: Path) -> None:
+def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(config: RackConfig, tmp_path: Path) -> None:
     result = run_rack(realtime(config), 2.0, tmp_path / "run", AtTick(signal.SIGSTOP))
-    assert result.worked
-    assert result.recording == "the recorder ended with status -9"
-    assert Recording(tmp_path / "run").signal("lower.status", "tick")[-1] > FIRST_BLOCK / 2
+    assert result.outcome.worked
+    # The rings hold two seconds: the whole run.
+    assert (result.worked, result.recording) == (True, "complete")
 
 
 def test_a_recorder_that_comes_late_delays_no_run(

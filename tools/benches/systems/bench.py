@@ -16,18 +16,17 @@ from rack.boards.config.files import CONFIGS, read
 from rack.boards.config.layout import obtained_core
 from rack.tools.analysis.analysis import core_loads
 from rack.tools.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
-from rack.tools.benches.observed import Runs, missed_share
+from rack.tools.benches.observed import Runs, missed_share, record
 from rack.tools.benches.systems.figures import RealTimeFigures, SystemFigures, Systems
 from rack.tools.benches.systems.hold import held, hold_for
 from rack.tools.benches.systems.kills import kill_each, kills_s
-from rack.tools.benches.systems.motion import LONGEST_S, PosesBench, PosesRun, poses_config
+from rack.tools.benches.systems.motion import LONGEST_S, PosesBench, poses_config
 from rack.tools.benches.systems.prediction import prediction
 from rack.tools.benches.systems.realtime import ages_ms, board_loads, bus_traffic, cycles_in, plan_latencies
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.runs.cycles import cycles_of
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import RunResult, run_rack
+from rack.tools.runs.launch import RunResult
 from rack.tools.runs.measured_response import system_response
 from rack.tools.runs.recording import Recording
 
@@ -92,15 +91,18 @@ class _System:
         parts = dict(self._parts())
         progress.begin(f"{self._name}: in real time")
         realtime, failure = self._in_real_time(folder / "own")
-        progress.end(parts["in real time"], realtime.verdict, ())
+        progress.end(parts["in real time"], realtime.verdict)
         progress.begin(f"{self._name}: killing each board")
         kills = kill_each(self._lockstep, self._layout, self._runs.share)
-        progress.end(parts["killing each board"], kills.failure or kills.verdict, ())
+        progress.end(parts["killing each board"], kills.failure or kills.verdict)
         poses, unmoved = None, ""
         if self._poses is not None:
             progress.begin(f"{self._name}: three poses")
-            poses, unmoved = self._in_poses(self._poses, folder / "poses")
-            progress.end(parts["three poses"], unmoved if poses is None else poses.verdict, ())
+            try:
+                poses = self._poses.measure(folder / "poses")
+            except Failure as why:
+                unmoved = str(why)
+            progress.end(parts["three poses"], unmoved if poses is None else poses.verdict)
         killed = kills.failure and f"killing each board: {kills.failure}"
         failures = [text for text in (failure, killed, unmoved) if text]
         return SystemFigures(
@@ -112,20 +114,13 @@ class _System:
             failure="; ".join(failures),
         )
 
-    def _in_poses(self, bench: PosesBench, folder: Path) -> tuple[PosesRun | None, str]:
-        """Return the motion, or why there was none."""
-        try:
-            return bench.measure(folder), ""
-        except Failure as failure:
-            return None, str(failure)
-
     def _in_real_time(self, folder: Path) -> tuple[RealTimeFigures, str]:
         commands = () if self._hold is None else (self._hold,)
         config = self._config.model_copy(update={"command": (*self._config.command, *commands)})
-        run = run_rack(config, self._runs.seconds, folder, Display(), share=self._runs.share)
+        run, recording = record(config, self._runs.seconds, folder, self._runs.share)
         late_us = cyclictest(self._grid()) if self._is_compared else None
         late = None if late_us is None else overdue(late_us, self._grid().period_ns)
-        return self._figures(run, Recording(folder), late), "" if run.worked else run.failure()
+        return self._figures(run, recording, late), "" if run.worked else run.failure()
 
     @property
     def _fastest(self) -> list[str]:

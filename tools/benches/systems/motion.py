@@ -8,7 +8,6 @@ sent in the first run enters these at the same ticks, so that all three are the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -21,18 +20,13 @@ from rack.backplane.segment import Segment
 from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.config.files import CONFIGS, file_at, read
 from rack.boards.config.schema import CommandConfig
-from rack.boards.wiring import Entries
 from rack.levels.algebra import Array, norm
 from rack.levels.joint_messages import DRIVING
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell
-from rack.tools.benches.observed import Deed, observe
+from rack.tools.benches.observed import Deed, observe, record
 from rack.tools.benches.systems.hold import hold_paths
 from rack.tools.console.answer import Failure
-from rack.tools.runs.display import Display
-from rack.tools.runs.entries import recorded_entries
-from rack.tools.runs.launch import run_rack
-from rack.tools.runs.recording import Recording
 
 LONGEST_S = 12.0
 """Simulated time of the run in which the motion must end."""
@@ -126,7 +120,6 @@ class StopRun(NamedTuple):
 
     tick: int
     longest: int
-    entries: Mapping[str, Entries]
     deeds: tuple[Deed, ...]
 
 
@@ -141,13 +134,12 @@ class PosesBench:
 
     def measure(self, folder: Path) -> PosesRun:
         """Run the motion, then stop it twice; record it into `folder`. Raises `Failure` if the arm does not move."""
-        run_rack(self._config, LONGEST_S, folder, Display(), share=self._share)
-        recording = Recording(folder)
+        recording = record(self._config, LONGEST_S, folder, self._share).recording
         fields = ("tick", "position", "velocity", "target", "target_velocity")
         moved = _Moved(*(recording.signal(self._arm, field) for field in fields))
         fastest = self._fastest(moved)
-        entries = recorded_entries(self._config, folder) if self._config.host else {}
-        return self._figures(moved, self._hold(fastest, entries), self._emergency(fastest, entries))
+        emergency = self._stopped(self._config, "emergency stop", StopRun(fastest, 0, (Deed(fastest, _latch),)))
+        return self._figures(moved, self._hold(fastest), emergency)
 
     def _figures(self, moved: _Moved, hold: Stop | None, emergency: Stop) -> PosesRun:
         moving = np.abs(moved.target_velocity).max(axis=1) > 0.0
@@ -185,21 +177,18 @@ class PosesBench:
         pairs = [(ik.tool_at(position[k]).position, ik.tool_at(target[k]).position) for k in some]
         return max(float(norm(is_at - wanted)) for is_at, wanted in pairs)
 
-    def _hold(self, tick: int, entries: Mapping[str, Entries]) -> Stop | None:
+    def _hold(self, tick: int) -> Stop | None:
         paths = hold_paths(self._config, rack_timing(self._config, self._layout), self._layout)
         if not paths:
             return None
         hold = CommandConfig(level=paths[0].levels[0], what="hold", tick=tick)
         config = self._config.model_copy(update={"command": (*self._config.command, hold)})
-        return self._stopped(config, hold.level, StopRun(tick, paths[0].longest, entries, ()))
-
-    def _emergency(self, tick: int, entries: Mapping[str, Entries]) -> Stop:
-        return self._stopped(self._config, "emergency stop", StopRun(tick, 0, entries, (Deed(tick, _latch),)))
+        return self._stopped(config, hold.level, StopRun(tick, paths[0].longest, ()))
 
     def _stopped(self, config: RackConfig, by: str, run: StopRun) -> Stop:
         tick_s = self._layout.clock_ns * 1e-9
         seconds = (run.tick + run.longest) * tick_s + STOPPING_S
-        rows = observe(config, seconds, self._share, (self._arm,), run.entries, run.deeds).messages[self._arm]
+        rows = observe(config, seconds, self._share, (self._arm,), run.deeds).messages[self._arm]
         after = rows[rows["tick"] >= run.tick]
         velocity = after["message"]["velocity"]
         moving = np.flatnonzero(np.abs(velocity).max(axis=1) > REST_RAD_S)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import ceil
-from typing import Any
 
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
@@ -18,10 +17,6 @@ TOO_EARLY = 0.5
 LASTS_S = 12.0
 
 
-def _inputs() -> Any:
-    return {"config": load(NAME).text(), "above": ABOVE_M, "too_early": TOO_EARLY}
-
-
 def _run(workshop: Workshop) -> Document:
     place = _place(load(NAME))
     soft = _outcome(workshop, "goto", place, None)
@@ -32,7 +27,13 @@ def _run(workshop: Workshop) -> Document:
     return {"place": place, "runs": [soft, early, met]}
 
 
-DEADLINE = Experiment("goto", "goto in soft time, and by a time", LASTS_S, _inputs, _run)
+DEADLINE = Experiment(
+    "goto",
+    "goto in soft time, and by a time",
+    LASTS_S,
+    lambda: {"config": load(NAME).text(), "above": ABOVE_M, "too_early": TOO_EARLY},
+    _run,
+)
 
 
 def _place(config: RackConfig) -> list[float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
 
 from rack.boards.config import load
 from rack.tools.reproduction.experiments.experiment import Document, Experiment, Workshop
@@ -18,10 +17,6 @@ ATTEMPTS = 3
 LASTS_S = 2 * 3.0 + 2 * (SECONDS + 3.0)
 
 
-def _inputs() -> Any:
-    return {"config": load(NAME).text(), "seconds": SECONDS, "attempts": ATTEMPTS}
-
-
 def _run(workshop: Workshop) -> Document:
     first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
     runs = [_outcome(first, None), _outcome(second, first)]
@@ -33,7 +28,13 @@ def _run(workshop: Workshop) -> Document:
     return {"seconds": SECONDS, "runs": runs}
 
 
-DETERMINISM = Experiment("determinism", "nasrem twice in lockstep, then in real time", LASTS_S, _inputs, _run)
+DETERMINISM = Experiment(
+    "determinism",
+    "nasrem twice in lockstep, then in real time",
+    LASTS_S,
+    lambda: {"config": load(NAME).text(), "seconds": SECONDS, "attempts": ATTEMPTS},
+    _run,
+)
 
 
 def _recorded(workshop: Workshop, label: str, mode: str) -> Recording:

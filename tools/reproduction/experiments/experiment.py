@@ -28,10 +28,9 @@ from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.clean import remove_dead
 from rack.tools.benches.cyclictest import permits_fifo
+from rack.tools.benches.observed import record
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
 from rack.tools.runs.recording import Recording
 
 KEPT, RUNS, PICTURES = "parts", "runs", "pictures"
@@ -78,8 +77,7 @@ class Workshop:
         """Run a rack and return its recording, which stays in the folder; one of an unfinished run is replaced."""
         folder = self.folder / RUNS / label
         shutil.rmtree(folder, ignore_errors=True)
-        run_rack(config, seconds, folder, Display(), share=self.share)
-        return Recording(folder)
+        return record(config, seconds, folder, self.share).recording
 
     def picture(self, name: str) -> Path:
         """Return the path of a picture without its suffix."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 from rack.boards.config import load
 from rack.tools.faults.judge import faults
@@ -16,11 +15,13 @@ LASTS_S = 13.0
 
 def losses_of(script: str, about: str) -> Experiment:
     """Return a run of the rack's whole task in lockstep with a script of faults."""
-    return Experiment(script, about, LASTS_S, partial(_inputs, script), partial(_run, script))
-
-
-def _inputs(script: str) -> Any:
-    return {"config": load(NAME, ["clock.mode=lockstep"], script).text()}
+    return Experiment(
+        script,
+        about,
+        LASTS_S,
+        lambda: {"config": load(NAME, ["clock.mode=lockstep"], script).text()},
+        partial(_run, script),
+    )
 
 
 def _run(script: str, workshop: Workshop) -> Document:

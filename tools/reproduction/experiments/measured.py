@@ -14,8 +14,7 @@ from rack.tools.benches.partition import PARTITIONS, compare
 from rack.tools.benches.response import ResponseRuns
 from rack.tools.benches.switch import PERIOD_S, WAKES, measure
 from rack.tools.console.progress import Progress
-from rack.tools.reproduction.experiments.experiment import Document, Experiment, Workshop, need_real_time
-from rack.tools.timing.operator_response import plot
+from rack.tools.reproduction.experiments.experiment import PICTURES, Document, Experiment, Workshop, need_real_time
 
 LEVELS = 5
 """Levels of the pipeline: "it would take 5 control cycles"."""
@@ -57,7 +56,7 @@ PIPELINE = Experiment(
 
 def _response(workshop: Workshop) -> Document:
     found = ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
-    paths = plot(found.response, workshop.folder / "pictures")
+    paths = found.plot(workshop.folder / PICTURES)
     return {**found.document(), "pictures": {"response": workshop.shown(paths)}}
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -22,10 +21,6 @@ LASTS_S = 34.0
 US, MS = 1e-3, 1e-6
 PHASES = ("exchange", "read", "process", "write")
 """The stamped parts of an executor's cycle: C, R, X, W."""
-
-
-def _inputs() -> Any:
-    return {"config": load(NAME).text()}
 
 
 def _run(workshop: Workshop) -> Document:
@@ -59,7 +54,7 @@ def _run(workshop: Workshop) -> Document:
     }
 
 
-NASREM = Experiment(NAME, "nasrem in real time, its whole task", LASTS_S, _inputs, _run)
+NASREM = Experiment(NAME, "nasrem in real time, its whole task", LASTS_S, lambda: {"config": load(NAME).text()}, _run)
 
 
 def _pairs(analysis: Analysis) -> list[Document]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -23,12 +22,12 @@ PREFIX = "system-"
 def system_experiment(name: str) -> Experiment:
     """Return the figures of one rack, in lockstep and in real time."""
     return Experiment(
-        f"{PREFIX}{name}", f"{name} next to the other systems", LASTS_S, partial(_inputs, name), partial(_run, name)
+        f"{PREFIX}{name}",
+        f"{name} next to the other systems",
+        LASTS_S,
+        lambda: {"config": load(name).text(), "seconds": SECONDS},
+        partial(_run, name),
     )
-
-
-def _inputs(name: str) -> Any:
-    return {"config": load(name).text(), "seconds": SECONDS}
 
 
 def _run(name: str, workshop: Workshop) -> Document:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from rack.boards.config import load
 from rack.tools.reproduction.experiments.experiment import Document, Experiment, Workshop
@@ -15,15 +14,17 @@ UNDISTURBED = ("scene.motion=[]",)
 LASTS_S = 20.0
 
 
-def _inputs() -> Any:
-    return {"config": load(NAME).text(), "without": UNDISTURBED}
-
-
 def _run(workshop: Workshop) -> Document:
     return {"disturbed": _task(workshop, NAME, ()), "undisturbed": _task(workshop, f"{NAME}-undisturbed", UNDISTURBED)}
 
 
-TABLES = Experiment(NAME, "state tables, with a disturbance and without", LASTS_S, _inputs, _run)
+TABLES = Experiment(
+    NAME,
+    "state tables, with a disturbance and without",
+    LASTS_S,
+    lambda: {"config": load(NAME).text(), "without": UNDISTURBED},
+    _run,
+)
 
 
 def _task(workshop: Workshop, label: str, settings: Sequence[str]) -> Document:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rack.boards.config import RackConfig, load, rack_timing, wire
-from rack.levels.timing.forecast import Forecast
+from rack.boards.config import RackConfig, load
 from rack.tools.benches.switch import PAPER_US
 from rack.tools.charts import figure5
 from rack.tools.reproduction.experiments import tables
@@ -13,6 +12,7 @@ from rack.tools.reproduction.experiments.experiment import Document, Workshop
 from rack.tools.reproduction.experiments.measured import PARTITION, SWITCH
 from rack.tools.reproduction.experiments.nasrem import NAME, NASREM
 from rack.tools.reproduction.experiments.tables import TABLES
+from rack.tools.reproduction.sections.equations import forecast_of
 from rack.tools.reproduction.sections.page import Assessment, Columns, Plate, Ruling, Side, code, text
 from rack.tools.reproduction.sections.statement import Chapter, Findings, Statement
 
@@ -39,10 +39,8 @@ def _earlier(workshop: Workshop) -> Side:
     return Side.of(
         Columns(("level", "cycle", "its state tables", "planner"), rows),
         f"The levels with state tables have {same} cycle. Levels with a planner: {', '.join(planners) or 'none'}; "
-        "plans "
-        "are poses and places in the tables. We run the task twice in lockstep: with what moves in the cell, a "
-        "pusher that shoves a block "
-        "along while the arm reaches for it, and without.",
+        "plans are poses and places in the tables. We run the task twice in lockstep: with what moves in the cell, a "
+        "pusher that shoves a block along while the arm reaches for it, and without.",
     )
 
 
@@ -101,7 +99,8 @@ def _levels_tested(findings: Findings) -> Assessment:
         if task["role"] != "executor":
             continue
         nominal = 1e9 / (config.every(name) * config.clock_ns)
-        done, due = task["cycles"] + task["start_up"], -(-found["outcome"]["ticks"] // config.every(name))
+        done = task["cycles"] + task["start_up"] + task["stalled"]
+        due = -(-found["outcome"]["ticks"] // config.every(name))
         measured = nominal * done / due
         off += [name] if done < (1 - NOMINAL) * due else []
         lateness = task["lateness_ms"]
@@ -136,9 +135,8 @@ def _switch(workshop: Workshop) -> Side:
     rows = []
     for settings in ((), (setting,)):
         config = load(NAME, settings)
-        forecast = Forecast.of(rack_timing(config, wire(config)))
         failing = ", ".join(
-            f"{verdict.equation} ({verdict.subject})" for verdict in forecast.verdicts if not verdict.holds
+            f"{verdict.equation} ({verdict.subject})" for verdict in forecast_of(config).verdicts if not verdict.holds
         )
         rows.append((f"{1e3 * config.timing.context_switch_ms:g}", text(failing) or "none"))
     head = ("t<sub>cs</sub>, us", f"what fails in {code(NAME)}")
@@ -165,11 +163,8 @@ def _switch_tested(findings: Findings) -> Assessment:
     median, assumed = found["switch_us"]["p50"], 1e3 * load(NAME).timing.context_switch_ms
     why = (
         f"NIST's 68020 boards cannot be measured any more. On this machine a switch takes {median:.0f} us, "
-        f"{PAPER_US / median:.1f} "
-    )
-    why += (
-        f"times less than theirs; the 99th percentile, {found['switch_us']['p99']:.0f} us, compares with the "
-        f"{assumed:g} us of the config."
+        f"{PAPER_US / median:.1f} times less than theirs; the 99th percentile, {found['switch_us']['p99']:.0f} us, "
+        f"compares with the {assumed:g} us of the config."
     )
     return Assessment(side, Ruling.BOUNDED, why)
 

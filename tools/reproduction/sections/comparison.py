@@ -17,6 +17,7 @@ from rack.tools.reproduction.sections.page import Assessment, Columns, Listing, 
 from rack.tools.reproduction.sections.statement import Chapter, Findings, Statement
 
 RCCL = "rccl"
+RCCL_RUN = next(one for one in SYSTEMS if one.name.endswith(f"-{RCCL}"))
 
 
 @cache
@@ -138,8 +139,9 @@ def _layered_tested(findings: Findings) -> Assessment:
     if flat or even:
         why = (
             f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a faster level above a "
+            f"slower one: {', '.join(even) or 'none'}."
         )
-        return Assessment(Side(), Ruling.BOUNDED, f"{why}slower one: {', '.join(even) or 'none'}.")
+        return Assessment(Side(), Ruling.BOUNDED, why)
     why = (
         f"From the configs alone: all {len(promised)} have at least two levels, and no level is faster than the one "
         "below."
@@ -162,7 +164,7 @@ def _rccl(workshop: Workshop) -> Side:
 
 
 def _rccl_tested(findings: Findings) -> Assessment:
-    found = systems_of([findings[_experiment(RCCL)]]).figures[0]
+    found = systems_of([findings[RCCL_RUN.name]]).figures[0]
     rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
     layout = wire(load(RCCL))
     fastest = [task for task in layout.tasks if task.every == min(other.every for other in layout.tasks)]
@@ -172,14 +174,10 @@ def _rccl_tested(findings: Findings) -> Assessment:
         return Assessment(side, Ruling.FAILS, text(found.failure))
     why = (
         f"Joint control has a board a joint, but {len(fastest)} boards of that rate share {len(cores)} processors: "
-        "each joint its own "
+        f"each joint its own processor cannot be had here. At 1 kHz {100 * found.realtime.missed:.2f} % of their "
+        "cycles were missed."
     )
-    why += f"processor cannot be had here. At 1 kHz {100 * found.realtime.missed:.2f} % of their cycles were missed."
     return Assessment(side, Ruling.BOUNDED, why)
-
-
-def _experiment(name: str) -> str:
-    return next(one.name for one in SYSTEMS if one.name.endswith(f"-{name}"))
 
 
 CHAPTER = Chapter(
@@ -213,7 +211,7 @@ CHAPTER = Chapter(
             quote="The joint control level operates at 1 kHz and assigns 1 processor per joint. The fine motion "
             "trajectory level runs a 50 Hz and runs as high-priority cyclic task. Concurrently, a rough motion "
             "planner asynchronously produces a queue of motion requests for the trajectory level as a background task.",
-            experiments=tuple(one for one in SYSTEMS if one.name.endswith(f"-{RCCL}")),
+            experiments=(RCCL_RUN,),
             predicted=_rccl,
             tested=_rccl_tested,
         ),

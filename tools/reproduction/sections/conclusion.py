@@ -4,28 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rack.boards.config import load, rack_timing, wire
-from rack.levels.timing.forecast import Forecast
+from rack.boards.config import load
 from rack.tools.reproduction.experiments.experiment import Workshop
 from rack.tools.reproduction.experiments.measured import NAME, RESPONSE
+from rack.tools.reproduction.sections.equations import forecast_of
 from rack.tools.reproduction.sections.page import Assessment, Columns, Plate, Ruling, Side, code
 from rack.tools.reproduction.sections.statement import Chapter, Findings, Statement
 
 
 def _predictable(workshop: Workshop) -> Side:
-    config = load(NAME)
-    forecast = Forecast.of(rack_timing(config, wire(config)))
+    forecast = forecast_of(load(NAME))
     failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
-    words = (
+    return Side.of(
         f"By the budgets of {code(NAME)}, {len(forecast.verdicts) - len(failing)} of {len(forecast.verdicts)} "
-        "judgements of the "
+        "judgements of the timing model hold. It then predicts more than bounds: the tick at which the torque rests "
+        "on a command that an operator gives at any tick, to any level."
     )
-    words += (
-        "timing model hold. It then predicts more than bounds: the tick at which the torque rests on a command "
-        "that an operator "
-    )
-    words += "gives at any tick, to any level."
-    return Side.of(words)
 
 
 def _predictable_tested(findings: Findings) -> Assessment:
@@ -50,11 +44,9 @@ def _predictable_tested(findings: Findings) -> Assessment:
     if found["held"] and not twins:
         why = (
             f"All {found['measured']} commands took effect at the predicted tick and within the bounds of equations "
-            "3.2 and 3.3. In a "
+            "3.2 and 3.3. In a run without one of them, the torque is the same until that tick, bit for bit."
         )
-        return Assessment(
-            side, Ruling.HOLDS, f"{why}run without one of them, the torque is the same until that tick, bit for bit."
-        )
+        return Assessment(side, Ruling.HOLDS, why)
     why = f"{found['beyond']} responses beyond a bound, {found['off_prediction']} not at the predicted tick."
     return Assessment(side, Ruling.FAILS, why)
 

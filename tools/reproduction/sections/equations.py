@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
-from rack.boards.config import load, rack_timing, wire
+from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.errors import ConfigError
 from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.tables import ms
 from rack.tools.reproduction.experiments.experiment import Document, Workshop
 from rack.tools.reproduction.experiments.nasrem import NAME, NASREM
@@ -39,10 +39,14 @@ class Biting:
         return words, Columns(HEAD, rows_of(equation, [verdict.document() for verdict in found]))
 
 
-def verdicts_of(config: Any, equation: str) -> list[Any]:
+def forecast_of(config: RackConfig) -> Forecast:
+    """Return what the timing model predicts of a rack."""
+    return Forecast.of(rack_timing(config, wire(config)))
+
+
+def verdicts_of(config: RackConfig, equation: str) -> list[EquationVerdict]:
     """Return the predicted verdicts on one equation in a rack."""
-    forecast = Forecast.of(rack_timing(config, wire(config)))
-    return [verdict for verdict in forecast.verdicts if verdict.equation == equation]
+    return [verdict for verdict in forecast_of(config).verdicts if verdict.equation == equation]
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,6 @@ LEAST_P = 3.0
 """"The planner runs at least 3 ms each cycle"."""
 WORST_CYCLES = 3
 """"At worst an updated plan should be available every third cycle"."""
-WORST_CYCLES = 3
-""""At worst an updated plan should be available every third cycle"."""
 AGAIN = code("rack reproduce --only 3.4 --again")
 DISTURBED = 0.02
 """Part of an executor's cycles late from which on a run shows the machine, not the figure."""
@@ -70,8 +68,10 @@ def ran(figure: FigureRack, found: Document) -> Side:
         )
         for task, count in found["tasks"].items()
     ]
-    caption = "Late: past its deadline; skipped: of the late ones, those that never began."
-    caption += f" Taken by the hypervisor meanwhile: {steal or 'not measured'}."
+    caption = (
+        "Late: past its deadline; skipped: of the late ones, those that never began. Taken by the hypervisor "
+        f"meanwhile: {steal or 'not measured'}."
+    )
     return Side.of(
         Plate(
             Path(found["pictures"]["measured"]), f"A run of {code(figure.label)} by real processes, from its middle."
@@ -187,9 +187,9 @@ def _sweep_side(workshop: Workshop) -> Side:
     most_each = cycle_ms - fixed_ms - budget.update_ms - LEAST_P
     most_once = cycle_ms - fixed_ms - work_ms / worst.permitted
     literal = (
-        f'Read literally, "RXWPU" has U in every cycle, and P has {cycle_ms - fixed_ms - budget.update_ms:g} &minus; '
-        "X ms "
-        f"in each: at least {LEAST_P:g} ms up to X = {most_each:g}. With X = {_values(less) or 'none'} it is less; "
+        'Read literally, "RXWPU" has U in every cycle, and P has '
+        f"{cycle_ms - fixed_ms - budget.update_ms:g} &minus; X ms in each: at least {LEAST_P:g} ms up to X = "
+        f"{most_each:g}. With X = {_values(less) or 'none'} it is less; "
         f"with X = {worst.process_ms:g} it is {worst.each_ms:g} ms, and a plan takes {_in_cycles(worst.cycles_each)}, "
         f"{(worst.cycles_each or 0) * cycle_ms:g} ms instead of {worst.permitted * cycle_ms:g}."
     )
@@ -225,18 +225,22 @@ def _sweep_tested(findings: Findings) -> Assessment:
     if not odd:
         return Assessment(measured, Ruling.HOLDS, f"Every X from {LEAST_X:g} to {MOST_X:g} ms works. Runs: {said}.")
     agrees = fails(long) == _is_slow(rows[-1]) and fails(short) == _is_slow(rows[0])
-    why = '"X will range from 1 to 3 ms" and "the planner runs at least 3 ms each cycle" exclude each other for X = '
-    why += f"{_values(odd)}. Runs agree with the computation: {said}."
     if not agrees:
         return Assessment(measured, Ruling.FAILS, f"The computation is not confirmed by the runs: {said}.")
+    why = (
+        '"X will range from 1 to 3 ms" and "the planner runs at least 3 ms each cycle" exclude each other for X = '
+        f"{_values(odd)}. Runs agree with the computation: {said}."
+    )
     return Assessment(measured, Ruling.CONTRADICTS, why)
 
 
 def _fig3_side(workshop: Workshop) -> Side:
     rows = sweep(FIG3.config, PAPER_X)
     works = [one for one in rows if not _is_slow(one)]
-    text = f"The failure depends on X. With X = {_values(works) or 'none'} three cycles are enough for P and U; with "
-    text += f"X = {_values([one for one in rows if one not in works])} they are not."
+    text = (
+        f"The failure depends on X. With X = {_values(works) or 'none'} three cycles are enough for P and U; with "
+        f"X = {_values([one for one in rows if one not in works])} they are not."
+    )
     return Side.of(*_predicted(FIG3, workshop).items, _planning_table(rows), text)
 
 
@@ -261,8 +265,8 @@ def _fig4_side(workshop: Workshop) -> Side:
     if full:
         text += (
             f" With X = {_values(full)} the executor fills its cycle: every cycle is still in time, but equation 3.6, "
+            "0 &lt; t<sub>residual</sub>, fails."
         )
-        text += "0 &lt; t<sub>residual</sub>, fails."
     return Side.of(*_predicted(FIG4, workshop).items, text, _planning_table(rows))
 
 

@@ -74,8 +74,10 @@ def _flow_tested(findings: Findings) -> Assessment:
     if not short:
         return Assessment(side, Ruling.HOLDS, "Commands went down and statuses up in every cycle of every level.")
     lacking = sum(box["due"] - box["messages"] for box in short)
-    why = f"Commands went down and statuses up; {lacking} of {sum(box['due'] for box in boxes.values())} messages were "
-    why += f"not written, because their cycles were skipped. {stolen(found)}"
+    why = (
+        f"Commands went down and statuses up; {lacking} of {sum(box['due'] for box in boxes.values())} messages were "
+        f"not written, because their cycles were skipped. {stolen(found)}"
+    )
     return Assessment(side, Ruling.BOUNDED, why)
 
 
@@ -186,9 +188,9 @@ def _bounds_tested(findings: Findings) -> Assessment:
         return Assessment(side, Ruling.FAILS, f"{why} Tasks not done: {', '.join(undone) or 'none'}.")
     why = (
         f"All {count} losses were detected within their bounds, no level stopped cycling, and both tasks were done. "
-        "Unexplained"
+        f"Unexplained detections: {unexplained}."
     )
-    return Assessment(side, Ruling.HOLDS, f"{why} detections: {unexplained}.")
+    return Assessment(side, Ruling.HOLDS, why)
 
 
 def _losses(found: Document, experiment: Experiment) -> Columns:
@@ -245,9 +247,9 @@ def _pipeline_tested(findings: Findings) -> Assessment:
     if not others["lockstep"] and all(int(took) >= found["predicted"] for c in found["cycles"].values() for took in c):
         why = (
             f"In lockstep every message took {found['predicted']} cycles; in real time {others['realtime']} took "
-            "longer, after "
+            "longer, after missed cycles."
         )
-        return Assessment(side, Ruling.BOUNDED, f"{why}missed cycles.")
+        return Assessment(side, Ruling.BOUNDED, why)
     return Assessment(
         side, Ruling.FAILS, "Messages took another number of cycles, in lockstep too, or less than predicted."
     )

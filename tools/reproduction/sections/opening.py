@@ -50,9 +50,9 @@ def _determined_tested(findings: Findings) -> Assessment:
         return Assessment(side, Ruling.HOLDS, f"{why}.{missed}")
     why = (
         "Lockstep twice wrote the same messages. This machine kept no run in real time free of misses; none "
-        "diverged before "
+        "diverged before its first miss, and every miss is on record."
     )
-    return Assessment(side, Ruling.BOUNDED, f"{why}its first miss, and every miss is on record.")
+    return Assessment(side, Ruling.BOUNDED, why)
 
 
 def _is_explained(run: Document) -> bool:
@@ -119,10 +119,12 @@ def _costs_tested(findings: Findings) -> Assessment:
     )
     loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found["loads"].items())
     side = Side.of(Columns(head, rows, f"Medians of a run. Processor time of all tasks, ms a second: {loads}."))
-    words = f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second processor takes "
-    words += f"{1e3 * saved:.0f} ms a second off the first."
     if not saved:
         return Assessment(side, Ruling.UNTESTABLE, "All boards ran on one processor: there is nothing to save.")
+    words = (
+        f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second processor takes "
+        f"{1e3 * saved:.0f} ms a second off the first."
+    )
     return Assessment(side, Ruling.HOLDS if communicates < saved else Ruling.BOUNDED, words)
 
 

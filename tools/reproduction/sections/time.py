@@ -36,8 +36,11 @@ def _goto_tested(findings: Findings) -> Assessment:
     is_refused = early["done_s"] is None and not early["moved"]
     is_met = met["done_s"] is not None and met["done_s"] <= met["by_s"]
     if is_refused and is_met:
-        why = f"By {early['by_s']:g} s is refused before anything moves; by {met['by_s']:g} s is promised, and done at "
-        return Assessment(side, Ruling.HOLDS, f"{why}{met['done_s']:g} s. Without a time nothing is promised.")
+        why = (
+            f"By {early['by_s']:g} s is refused before anything moves; by {met['by_s']:g} s is promised, and done at "
+            f"{met['done_s']:g} s. Without a time nothing is promised."
+        )
+        return Assessment(side, Ruling.HOLDS, why)
     return Assessment(side, Ruling.FAILS, f"Refused when it must be: {is_refused}; met when promised: {is_met}.")
 
 

@@ -1,0 +1,87 @@
+"""The guard of the clock: what it reports in which cycle, and what a restart leaves of it."""
+
+from __future__ import annotations
+
+import time
+
+from rack.backplane.clock.driver import RealtimeDriver
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.words import Block, System
+from rack.boards import Rack
+from rack.boards.faults.config import FaultConfig
+from rack.boards.run.task import ClockGuard
+from tests.backplane.bus import task
+from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.boards.conftest import MakeConfig
+
+PERIOD_NS = 20_000_000
+
+
+def guard_of(segment: Segment) -> ClockGuard:
+    """Return the guard of the task "level", as its process makes it."""
+    return ClockGuard(segment, AlarmWriter(segment, "level"), segment.block("level"))
+
+
+def rung(segment: Segment) -> list[tuple[int, int, float]]:
+    """Return tick, first tick skipped and count of each skip reported since the last call."""
+    rows, _ = alarm_ring(segment, "level").drain()
+    assert {int(row["code"]) for row in rows} <= {Alarm.CLOCK_SKIPPED}
+    return [(int(row["tick"]), int(row["since"]), float(row["value"])) for row in rows]
+
+
+def test_a_skip_is_reported_in_the_first_cycle_released_after_it(make_bus: MakeBus) -> None:  # noqa: F811
+    segment = make_bus(task("level", every=4))
+    guard, driver = guard_of(segment), RealtimeDriver(segment, lambda _: None)
+    driver.count_skipped(5, 2)
+    # Released at tick 4, begun when the clock had skipped ticks already.
+    guard.report_skipped(4)
+    assert guard.reported == 0
+    guard.report_skipped(8)
+    assert rung(segment) == [(8, 5, 2.0)]
+    assert guard.reported == segment.words[System.CLOCK_SKIPPED] == 2
+
+
+def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(make_bus: MakeBus) -> None:  # noqa: F811
+    segment = make_bus(task("level", every=4))
+    guard, driver = guard_of(segment), RealtimeDriver(segment, lambda _: None)
+    driver.count_skipped(1, 1)
+    guard.report_skipped(4)
+    driver.count_skipped(9, 3)
+    guard_of(segment).report_skipped(16)
+    assert guard_of(segment).reported == 4
+    assert rung(segment)[1:] == [(16, 9, 3.0)]
+
+
+def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(make_bus: MakeBus) -> None:  # noqa: F811
+    segment = make_bus(task("level"))
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    segment.words[System.EPOCH_NS] = time.monotonic_ns() + PERIOD_NS
+    guard, held_up = guard_of(segment), []
+
+    def ended(tick: int) -> int | None:
+        if segment.words[System.CLOCK_SKIPPED] != guard.reported:
+            guard.report_skipped(tick)
+        if tick >= 3 and not held_up:
+            held_up.append(tick)
+            time.sleep(3.5 * PERIOD_NS * 1e-9)
+        return 12 if tick >= 12 else None
+
+    RealtimeDriver(segment, ended).run()
+    skips = rung(segment)
+    assert held_up[0] + 1 in [first for _, first, _ in skips]
+    # From the first one skipped up to the tick that follows.
+    assert all(count == tick - first for tick, first, count in skips)
+    assert sum(count for _, _, count in skips) == segment.words[System.CLOCK_SKIPPED] >= 2
+
+
+def test_a_skip_while_the_guard_is_lost_is_seen_when_it_is_back(config: MakeConfig) -> None:
+    kill = FaultConfig(kind="kill", board="wave", tick=100)
+    skip = FaultConfig(kind="clock-skip", board="clock", tick=150, ticks=3)
+    with Rack(config().model_copy(update={"fault": (kill, skip)})) as rack:
+        rack.run(1.0)
+        reported = rack.segment.block("wave")[Block.CLOCK_SKIPPED]
+    (found,) = [event for event in rack.events if event.code == "clock_skipped"]
+    (back,) = [event for event in rack.events if event.code == "rejoined"]
+    assert (found.board, found.value, found.since, found.tick) == ("wave", 3.0, 150, back.tick)
+    assert reported == 3

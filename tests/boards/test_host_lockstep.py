@@ -1,0 +1,125 @@
+"""Programs of host boards in lockstep: the rack waits until they wait, so that runs repeat, and never for ever."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from rack.backplane.words import Block
+from rack.boards import Rack
+from rack.boards.adapters.bus_adapter import LONGEST_S
+from rack.tools.faults.ending import strikes
+from tests.boards.conftest import MakeConfig
+from tests.boards.test_host_side import ENDS, HOSTED, codes, status, watch
+from tests.processes import wait_until
+
+SECOND = (
+    HOSTED
+    + """
+[board.second]
+slot = 4
+rate_hz = 80
+phase = 1
+executor = "rack.boards.adapters.bus_adapter:BusAdapter"
+
+[board.second.params.pass]
+sum = { from = "adder.status", every = 2 }
+"""
+)
+"""The program reads through a second bridge, too."""
+SLOW = "host.program.program=host_programs:Slow"
+STRUCK = (*(f"{{ kind='kill', board='{board}', at={at} }}" for at, board in ((0.15, "program"), (0.35, "bridge"))),)
+
+
+def slow(config: MakeConfig, lag: float, *settings: str) -> str:
+    """Return the digest of a run with a program that takes up to `lag` seconds for each number."""
+    lines = (SLOW, f"host.program.params.lag={lag}", "supervision.lockstep_restart_s=0.1", *settings)
+    with Rack(config(*lines, text=SECOND)) as rack:
+        outcome = rack.run()
+        assert (outcome.cause, outcome.faults) == ("task done", ())
+        assert status(rack.segment, "adder").last == 40
+    return outcome.digest
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        (),
+        ("host.program.computing_ms=35",),
+        (f"fault=[{','.join(STRUCK)}]",),
+        ("fault=[{ kind='hang', board='program', at=0.15 }]",),
+    ],
+    ids=["alone", "computing", "killed", "stopped"],
+)
+def test_a_run_repeats_however_long_its_program_takes(config: MakeConfig, settings: tuple[str, ...]) -> None:
+    assert slow(config, 0.0, *settings) == slow(config, 0.03, *settings)
+
+
+@pytest.mark.parametrize("kind", ["kill", "hang"])
+def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(config: MakeConfig, kind: str) -> None:
+    settings = ("host.program.program=host_programs:Lingering", f"fault=[{{ kind='{kind}', board='program', at=0.2 }}]")
+    with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
+        assert rack.run(0.5).cause == "time over"
+        assert [strike.tick for strike in strikes(rack.segment, (), ())] == [-1]
+
+
+@pytest.mark.parametrize(("computing", "arrived"), [(0, 4), (100, 40), (102.5, 44)])
+def test_what_a_program_sends_is_taken_once_its_computing_is_over(
+    config: MakeConfig, computing: float, arrived: int
+) -> None:
+    settings = ("host.program.params.count=1", f"host.program.computing_ms={computing}")
+    with Rack(config(*settings, text=HOSTED)) as rack:
+        assert rack.run().cause == "task done"
+        assert status(rack.segment).numbers["arrived"] == arrived
+
+
+def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: MakeConfig) -> None:
+    settings = ("host.program.program=host_programs:Deaf", "board.bridge.executor=host_programs:HastyAdapter")
+    with Rack(config(*settings, text=HOSTED)) as rack:
+        outcome = rack.run()
+    assert (outcome.cause, outcome.worked) == ("board lost", False)
+    (fault,) = outcome.faults
+    assert fault.startswith(
+        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time: lockstep cannot go on"
+    )
+
+
+def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
+    with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
+        rack.start()
+        block = rack.segment.block("program")
+        wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
+        began = time.monotonic()
+        rack.stop("the test has seen enough")
+        while rack.watch(0.5):
+            continue
+        assert rack.outcome is not None
+        assert rack.outcome.cause == "stopped"
+    assert time.monotonic() - began < LONGEST_S / 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_program_that_dies_while_the_rack_waits_for_it_does_not_hold_the_rack(
+    config: MakeConfig, number: signal.Signals
+) -> None:
+    with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
+        rack.start()
+        block = rack.segment.block("program")
+        wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
+        os.kill(block[Block.PID], number)
+        watch(rack, lambda: "rejoined" in codes(rack, "program"))
+    assert [code for code in codes(rack, "program") if code in ENDS] == ["died", "restart", "rejoined"]
+
+
+def test_a_program_that_is_given_up_ends_the_run_at_the_same_tick(config: MakeConfig) -> None:
+    settings = ("host.program.program=host_programs:Failing", "host.program.restarts=2")
+    found = []
+    for _ in range(2):
+        with Rack(config(*settings, text=HOSTED)) as rack:
+            outcome = rack.run()
+            found.append((outcome.cause, outcome.ticks, outcome.digest))
+    assert found[0] == found[1]
+    assert found[0][0] == "task failed"
