@@ -39,6 +39,27 @@ RUNS = (
     "nasrem --faults bad-motors --seconds 8",
     "nasrem --faults noisy-bus --seconds 9",
     "nasrem --faults kill-each-board --seconds 9",
+    "nasrem-three-poses --seconds 3",
+    "fig2 --seconds 1",
+    "fig3 --seconds 1",
+    "fig4 --seconds 1",
+    "fig4-overload --seconds 1",
+    "nist-state-table/direct --seconds 3",
+    "nist-state-table/three-poses --seconds 3",
+    "rccl/three-poses --seconds 3",
+    "brown/three-poses --seconds 3",
+    "chimera/three-poses --seconds 3",
+    "penn/three-poses --seconds 3",
+    "ibm/three-poses --seconds 3",
+    "penn --faults client-dies --seconds 11",
+    *(f"{system} --faults kill-each-board --seconds 5" for system in ("brown", "rccl", "nist-state-table", "hic", "penn")),
+    *(f"{system} --faults kill-each-board --seconds 5" for system in ("ibm", "chimera", "condor")),
+    "configs/examples/own-level/metered.toml --seconds 2",
+    "configs/examples/own-servo/pd.toml --seconds 2",
+    "configs/examples/own-modification/gentle.toml --seconds 2",
+    "configs/examples/own-planner/trapezoid.toml --seconds 4",
+    "configs/examples/own-hardware/hardware.toml --seconds 2",
+    "configs/examples/own-arm/desk-arm.toml --seconds 2",
 )
 """As one would call `rack run`, but for --lockstep. The script `overload` needs real time."""
 LIBRARIES = ("daqp", "mujoco", "numpy", "ompl", "ruckig")
@@ -56,7 +77,8 @@ def digest(run: str, name: str) -> str:
     """Return the digest of one of `RUNS`, run as the rack `name`."""
     words = shlex.split(run)
     options = dict(zip(words[1::2], words[2::2], strict=True))
-    config = load(words[0], [f"name={name}", "clock.mode=lockstep"], options.get("--faults"))
+    place = FILE.parents[1] / words[0]
+    config = load(place if place.is_file() else words[0], [f"name={name}", "clock.mode=lockstep"], options.get("--faults"))
     with Rack(config) as rack:
         seconds = options.get("--seconds")
         return rack.run(None if seconds is None else float(seconds)).digest
