@@ -16,9 +16,9 @@ QUICK := tests/test_architecture.py $(wildcard tests/backplane/test_*.py) $(filt
 	tests/levels/arm/test_faulty.py tests/levels/arm/test_own_arm.py \
 	$(wildcard tests/boards/test_config_*.py) $(wildcard tests/boards/test_fault_*.py) \
 	$(addprefix tests/boards/run/test_lockstep.py::test_,ten_runs_in_lockstep_have_one_digest the_digest_distinguishes_runs) \
-	tests/tools/test_cli.py tests/tools/test_schema.py tests/tools/test_fault_judge.py \
-	$(wildcard tests/tools/test_campaign_*.py) tests/tools/timing/test_judged_config.py tests/tools/timing/test_repair.py \
-	tests/tools/charts/test_measured.py tests/tools/charts/test_patterns.py tests/tools/charts/test_window.py
+	tests/tools/test_cli.py tests/tools/commands/test_schema.py tests/tools/faults/test_judge.py \
+	tests/tools/faults/campaigns tests/tools/timing/test_judged_config.py tests/tools/timing/test_repair.py \
+	tests/tools/timing/charts/test_measured.py tests/tools/timing/charts/test_patterns.py tests/tools/timing/charts/test_window.py
 
 .DEFAULT_GOAL := help
 .PHONY: help run test quick mutants golden lint lock clean

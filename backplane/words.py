@@ -89,7 +89,7 @@ class Demand(IntEnum):
 class Block(IntEnum):
     """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the finder of a loss.
 
-    A host board has one too. In lockstep its bus adapter releases it: see `rack.boards.adapters.bus_adapter`.
+    A host board has one too. In lockstep its bus adapter releases it: see `rack.boards.host.bus_adapter`.
     """
 
     RELEASED = 0  # newest release, as a tick; -1: none yet

@@ -2,7 +2,7 @@
 
 A host board is a process of its own under ordinary scheduling. The clock does not release it; real time never waits for
 it.
-It reaches the levels only through a bus adapter (`rack.boards.adapters.bus_adapter`), which exchanges at its own rate.
+It reaches the levels only through a bus adapter (`rack.boards.host.bus_adapter`), which exchanges at its own rate.
 The author writes `run`:
 
     class Stroll(HostProgram):

@@ -51,7 +51,8 @@ A servo level of your own
 - advances the arm's time, saves its state, and publishes its scene, without which the world model is stale and motion
   holds: see `rack.levels.arm.arm`.
 
-A level without Python of its own for its decisions is a state table in a file: see `rack.levels.state_table.level`.
+A level without Python of its own for its decisions is a state table in a file: see
+`rack.levels.systems.state_table.level`.
 
 A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 * every`): the first
 brings them to the servo, which interpolates over the second. It reports `done`, `current`, `resting` and `blocked` of

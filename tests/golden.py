@@ -52,7 +52,10 @@ RUNS = (
     "penn/three-poses --seconds 3",
     "ibm/three-poses --seconds 3",
     "penn --faults client-dies --seconds 11",
-    *(f"{system} --faults kill-each-board --seconds 5" for system in ("brown", "rccl", "nist-state-table", "hic", "penn")),
+    *(
+        f"{system} --faults kill-each-board --seconds 5"
+        for system in ("brown", "rccl", "nist-state-table", "hic", "penn")
+    ),
     *(f"{system} --faults kill-each-board --seconds 5" for system in ("ibm", "chimera", "condor")),
     "configs/examples/own-level/metered.toml --seconds 2",
     "configs/examples/own-servo/pd.toml --seconds 2",
@@ -78,7 +81,9 @@ def digest(run: str, name: str) -> str:
     words = shlex.split(run)
     options = dict(zip(words[1::2], words[2::2], strict=True))
     place = FILE.parents[1] / words[0]
-    config = load(place if place.is_file() else words[0], [f"name={name}", "clock.mode=lockstep"], options.get("--faults"))
+    config = load(
+        place if place.is_file() else words[0], [f"name={name}", "clock.mode=lockstep"], options.get("--faults")
+    )
     with Rack(config) as rack:
         seconds = options.get("--seconds")
         return rack.run(None if seconds is None else float(seconds)).digest

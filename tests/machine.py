@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.benches.network import Lab
+from rack.tools.lab.benches.network import Lab
 
 WAIT_S = 600.0
 """Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the test's own time."""

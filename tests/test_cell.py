@@ -13,12 +13,12 @@ from rack.backplane.message import State
 from rack.boards.config import CONFIGS, load, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
-from rack.levels.cell.messages import Response
 from rack.levels.messages import Error
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import pointing, pose
-from rack.tools.runs.window import free_port
+from rack.levels.systems.cell.messages import Response
+from rack.tools.viewer.window import free_port
 from tests.boards.lan.racks import run_together
 from tests.levels.arms import cell, config
 from tests.levels.whole_rack import WholeRack
@@ -72,7 +72,7 @@ others = ["lan.shared", "lan.third"]
 
 [adapter.lan.import.third]
 from = "cell-other/servo.shared"
-type = "rack.levels.shared_bodies:SHARED_BODIES"
+type = "rack.levels.systems.cell.shared_bodies:SHARED_BODIES"
 rate_hz = 50
 max_age_ms = 200
 """
@@ -100,7 +100,7 @@ MISTAKES = {
     ),
     "no copies": (
         "board.servo.params.arm=rack.levels.arm:SimulatedArm",
-        "the arm shares no objects; permitted: rack.levels.arm.sharing:SharingArm",
+        "the arm shares no objects; permitted: rack.levels.systems.cell.sharing_arm:SharingArm",
     ),
     "from nowhere": ("board.servo.reads.others=lan.shred", '"lan.shred": no task writes it'),
     "of another type": ("board.servo.reads.others=servo.scene", "carries scene 1; the port needs shared_bodies 1"),

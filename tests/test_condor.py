@@ -13,7 +13,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.levels.hand.messages import GraspKind
+from rack.levels.systems.hand.messages import GraspKind
 from tests.processes import wait_until
 
 

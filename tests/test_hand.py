@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.analysis.report import report_of
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
-from rack.tools.runs.recording import Recording
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.report import report_of
 from rack.tools.viewer.cell import PUSH_M
 from rack.tools.viewer.reading import read
 from tests.levels.arms import ROBOTS
@@ -34,13 +34,13 @@ lockstep_restart_s = 0.05
 slot = 2
 rate_hz = 500
 above = "swing"
-executor = "rack.levels.hand.executor:HandExecutor"
+executor = "rack.levels.systems.hand.executor:HandExecutor"
 
 [board.swing]
 slot = 3
 rate_hz = 500
 below = "hand"
-executor = "tests.levels.hand.hand_rig:Swing"
+executor = "tests.levels.systems.hand.hand_rig:Swing"
 
 [[scene.push]]
 body = "can"

@@ -12,7 +12,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.boards import Rack
 from rack.boards.config import load, wire
 from rack.boards.config.timing import rack_timing
-from rack.levels.hand.messages import GraspKind
+from rack.levels.systems.hand.messages import GraspKind
 from rack.levels.timing.forecast import Forecast
 
 SECONDS = 1.2

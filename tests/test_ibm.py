@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.analysis.report import write_report
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
-from rack.tools.runs.recording import Recording
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.report import write_report
 
 GUARDED = (7, 16)
 """Numbers of the requests that lower the blocks."""

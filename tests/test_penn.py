@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from rack.boards.config import load
-from rack.levels.force.messages import Mode
-from rack.levels.trajectory.messages import RequestEnd
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
+from rack.levels.systems.force.messages import Mode
+from rack.levels.systems.trajectory.messages import RequestEnd
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
 
 PRESS, EDGE, STEP = 15.0, 0.02, 0.012  # N, m, m
 SCRIPT = """

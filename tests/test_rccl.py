@@ -12,8 +12,8 @@ import pytest
 
 from rack.backplane.message import State
 from rack.boards.config import load
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
 
 SECONDS = 6.0
 STALL = """

@@ -25,32 +25,36 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
 
 COMMANDS = (
-    ("run", "rack.tools.run:run", "Run a rack until its task ends, and report on the run."),
-    ("check", "rack.tools.check:check", "Validate a config and predict its timing."),
-    ("schema", "rack.tools.schema:schema", "Show the keys of a config with their units and defaults."),
-    ("list", "rack.tools.list:list_racks", "List the racks on this machine, or on others."),
-    ("status", "rack.tools.status:status", "Show a running rack once."),
-    ("top", "rack.tools.top:top", "Watch a running rack until its end."),
-    ("stop", "rack.tools.stop:stop", "End a run and wait until it is gone."),
-    ("clean", "rack.tools.clean:clean", "Remove the shared memory that killed racks left behind."),
-    ("command", "rack.tools.command:command", "Command one level of a running rack."),
-    ("step", "rack.tools.step:step", "Let a rack in lockstep go on by single cycles."),
+    ("run", "rack.tools.commands.run:run", "Run a rack until its task ends, and report on the run."),
+    ("check", "rack.tools.commands.check:check", "Validate a config and predict its timing."),
+    ("schema", "rack.tools.commands.schema:schema", "Show the keys of a config with their units and defaults."),
+    ("list", "rack.tools.commands.list:list_racks", "List the racks on this machine, or on others."),
+    ("status", "rack.tools.commands.status:status", "Show a running rack once."),
+    ("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
+    ("stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."),
+    ("clean", "rack.tools.commands.clean:clean", "Remove the shared memory that killed racks left behind."),
+    ("command", "rack.tools.commands.command:command", "Command one level of a running rack."),
+    ("step", "rack.tools.commands.step:step", "Let a rack in lockstep go on by single cycles."),
     (
         "prompt",
-        "rack.tools.prompt:prompt",
+        "rack.tools.commands.prompt:prompt",
         "Open a Python prompt on the host side of a rack.",
     ),
-    ("inject", "rack.tools.inject:app", "Inject a fault into a running rack."),
-    ("estop", "rack.tools.estop:estop", "Engage the brakes of the arm at once, until --reset."),
-    ("record", "rack.tools.record:record", "Record a running rack."),
-    ("replay", "rack.tools.replay:replay", "Open recordings in the viewer, of several racks on one time line."),
-    ("report", "rack.tools.report:report", "Report on a recorded run, or compare two runs."),
-    ("analyze", "rack.tools.analyze:analyze", "Compare a run with the timing model, equation by equation."),
-    ("gantt", "rack.tools.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
-    ("campaign", "rack.tools.campaign:campaign", "Inject random faults into many runs, and judge each."),
-    ("lan", "rack.tools.lan.group:app", "Prepare racks that work together over a network."),
-    ("bench", "rack.tools.bench:bench", "Measure costs on this machine."),
-    ("reproduce", "rack.tools.reproduce:reproduce", "Reproduce the paper, claim by claim, as one page."),
+    ("inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."),
+    ("estop", "rack.tools.commands.estop:estop", "Engage the brakes of the arm at once, until --reset."),
+    ("record", "rack.tools.commands.record:record", "Record a running rack."),
+    (
+        "replay",
+        "rack.tools.commands.replay:replay",
+        "Open recordings in the viewer, of several racks on one time line.",
+    ),
+    ("report", "rack.tools.commands.report:report", "Report on a recorded run, or compare two runs."),
+    ("analyze", "rack.tools.commands.analyze:analyze", "Compare a run with the timing model, equation by equation."),
+    ("gantt", "rack.tools.commands.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
+    ("campaign", "rack.tools.commands.campaign:campaign", "Inject random faults into many runs, and judge each."),
+    ("lan", "rack.tools.network.group:app", "Prepare racks that work together over a network."),
+    ("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
+    ("reproduce", "rack.tools.commands.reproduce:reproduce", "Reproduce the paper, claim by claim, as one page."),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 MAX_ARGUMENT = 4096
@@ -112,15 +116,15 @@ def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
     as_json = "--json" in rest
     match command, names:
         case "list", []:
-            from rack.tools.answers import list_racks
+            from rack.tools.commands.answers import list_racks
 
             return partial(list_racks, as_json)
         case "status", [] | [_]:
-            from rack.tools.answers import show_status
+            from rack.tools.commands.answers import show_status
 
             return partial(show_status, names[0] if names else None, as_json)
         case "report", [folder]:
-            from rack.tools.answers import show_report
+            from rack.tools.commands.answers import show_report
 
             return partial(show_report, folder, as_json)
     return None

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.errors import ClockError
-from rack.boards.adapters.adapter import STATUS
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.errors import Mistake
+from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
 from rack.levels.peer import peer_port
 

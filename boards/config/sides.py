@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
 
-from rack.boards.adapters.adapter import Adapter
-from rack.boards.adapters.bus_adapter import BusAdapter
 from rack.boards.config.ports import TaskPorts, table_of
 from rack.boards.errors import Mistake
+from rack.boards.host.adapter import Adapter
+from rack.boards.host.bus_adapter import BusAdapter
 
 PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 

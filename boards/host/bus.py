@@ -27,7 +27,7 @@ _Port = TypeVar("_Port")
 class HostBus:
     """The ports of one host board. Opening it claims the board: a second process is refused with `MailboxError`.
 
-    A paced program runs in turns, in lockstep, while its adapter waits: see `rack.boards.adapters.bus_adapter`.
+    A paced program runs in turns, in lockstep, while its adapter waits: see `rack.boards.host.bus_adapter`.
     """
 
     def __init__(self, segment: Segment, wiring: HostWiring) -> None:

@@ -19,8 +19,8 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, MessageType, State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
-from rack.boards.adapters.adapter import STATUS, Adapter
-from rack.boards.adapters.entries import Rows
+from rack.boards.host.adapter import STATUS, Adapter
+from rack.boards.host.entries import Rows
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.desk import Desk, Permit

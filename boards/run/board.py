@@ -14,9 +14,9 @@ from rack.backplane.memory import lock_memory, touch_memory
 from rack.backplane.process import cores_kept_awake, die_with_parent, name_process, pin, set_priority, take_processor
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
-from rack.boards.adapters.adapter import Adapter
 from rack.boards.classes import find_class
 from rack.boards.errors import CANNOT_GO_ON
+from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
 from rack.boards.run.task import Task

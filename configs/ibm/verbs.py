@@ -6,10 +6,10 @@
 from collections.abc import Sequence
 
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.joint_messages import ARM_STATUS
 from rack.levels.level import Input
-from rack.levels.trajectory.commands import Motions
-from rack.levels.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, RequestEnd
+from rack.levels.systems.joint_boards.messages import ARM_STATUS
+from rack.levels.systems.trajectory.commands import Motions
+from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, RequestEnd
 
 PRESSED = 6.0
 """Change of a joint's torque that counts as touch, N m."""

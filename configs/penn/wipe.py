@@ -6,7 +6,7 @@ By hand, at any time:
     rack prompt penn coordinator configs/penn/wipe.py
 """
 
-from rack.levels.trajectory.messages import RequestEnd
+from rack.levels.systems.trajectory.messages import RequestEnd
 
 X, DOWN = 0.50, (0.0, 0.0, 1.0, 0.0)
 ABOVE, SURFACE = 0.62, 0.50  # m: a free height, and where the surface should be

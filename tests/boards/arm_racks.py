@@ -39,7 +39,7 @@ slot = 2
 core = 1
 rate_hz = 1000
 above = {names}
-executor = "rack.levels.servo:ArmExecutor"
+executor = "rack.levels.systems.joint_boards:ArmExecutor"
 
 [board.swing]
 slot = 3
@@ -59,7 +59,7 @@ core = {slot % 2}
 rate_hz = 1000
 above = "swing"
 below = "arm"
-executor = "rack.levels.servo:JointServo"
+executor = "rack.levels.systems.joint_boards:JointServo"
 params = {{ {", ".join(f"{key} = {json.dumps(value)}" for key, value in params.items())} }}
 """
 

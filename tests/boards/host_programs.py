@@ -11,9 +11,9 @@ from enum import IntEnum
 
 from rack.backplane.message import Field, State, command, status
 from rack.backplane.segment import Segment
-from rack.boards.adapters import bus_adapter
-from rack.boards.adapters.bus_adapter import BusAdapter
-from rack.boards.adapters.entries import Rows
+from rack.boards.host import bus_adapter
+from rack.boards.host.bus_adapter import BusAdapter
+from rack.boards.host.entries import Rows
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Executor, Input, Ports
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rack.backplane.message import Field, MessageType, State, status
-from rack.levels.figures import FIGURE_STATUS
 from rack.levels.level import Executor, Input, Ports
+from rack.levels.systems.figures import FIGURE_STATUS
 
 BOARDS = 5
 HEARD = status(

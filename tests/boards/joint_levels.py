@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import State
-from rack.levels.joint_messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import PRIMITIVE_STATUS
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.servo import ArmExecutor
 from rack.levels.servo.control import ArmParams
+from rack.levels.systems.joint_boards import ArmExecutor
+from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.tables import read_params
 
 AWAY_RAD = 0.15

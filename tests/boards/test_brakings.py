@@ -16,7 +16,7 @@ from tests.boards.arm_racks import TOGETHER, arm_rack
 from tests.boards.conftest import MakeConfig
 from tests.tools.command_line import rack as rack_command
 
-RELEASED = "rack.levels.servo:ArmExecutor"
+RELEASED = "rack.levels.systems.joint_boards:ArmExecutor"
 
 
 def stalling(**params: int) -> str:

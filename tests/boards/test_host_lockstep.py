@@ -10,7 +10,7 @@ import pytest
 
 from rack.backplane.words import Block
 from rack.boards import Rack
-from rack.boards.adapters.bus_adapter import LONGEST_S
+from rack.boards.host.bus_adapter import LONGEST_S
 from rack.tools.faults.ending import strikes
 from tests.boards.conftest import MakeConfig
 from tests.boards.test_host_side import ENDS, HOSTED, codes, status, watch
@@ -23,7 +23,7 @@ SECOND = (
 slot = 4
 rate_hz = 80
 phase = 1
-executor = "rack.boards.adapters.bus_adapter:BusAdapter"
+executor = "rack.boards.host.bus_adapter:BusAdapter"
 
 [board.second.params.pass]
 sum = { from = "adder.status", every = 2 }

@@ -48,7 +48,7 @@ MISTAKES = {
     ),
     "a second bridge": (
         [
-            "board.second={ slot = 9, every = 1, executor = 'rack.boards.adapters.bus_adapter:BusAdapter' }",
+            "board.second={ slot = 9, every = 1, executor = 'rack.boards.host.bus_adapter:BusAdapter' }",
             "board.second.params.pass.sum={ from = 'bridge.sum' }",
         ],
         'board.second.params.pass.sum = "bridge.sum": it is on the host side already',

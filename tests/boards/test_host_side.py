@@ -26,7 +26,7 @@ HOSTED = f"""{CLOCK}
 slot = 2
 rate_hz = 100
 below = "adder"
-executor = "rack.boards.adapters.bus_adapter:BusAdapter"
+executor = "rack.boards.host.bus_adapter:BusAdapter"
 ends_run = true
 
 [board.bridge.params.pass]

@@ -32,14 +32,14 @@ slot = 2
 core = 1
 rate_hz = 1000
 above = ["shoulder", "wrist"]
-executor = "rack.levels.servo:ArmExecutor"
+executor = "rack.levels.systems.joint_boards:ArmExecutor"
 
 [board.shoulder]
 slot = 3
 rate_hz = 1000
 above = "swing"
 below = "arm"
-executor = "rack.levels.servo:JointServo"
+executor = "rack.levels.systems.joint_boards:JointServo"
 params.joints = ["j1", "j2", "j3"]
 params.modifications.pd.class = "rack.levels.servo.common_modifications:JointPd"
 params.modifications.lean.class = "law_modifications:Lean"
@@ -50,7 +50,7 @@ slot = 4
 rate_hz = 1000
 above = "swing"
 below = "arm"
-executor = "rack.levels.servo:JointServo"
+executor = "rack.levels.systems.joint_boards:JointServo"
 params = {{ joints = ["j4", "j5", "j6"], gripper = true }}
 
 [board.swing]

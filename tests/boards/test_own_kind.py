@@ -16,7 +16,7 @@ from rack.boards.config.faults import injections
 from rack.boards.errors import ConfigError
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import cycles
-from rack.tools.inject import kinds_text
+from rack.tools.commands.inject import kinds_text
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import RACK
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.charts.measured import TracedRun
-from rack.tools.charts.panel import Panel
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
-from rack.tools.runs.recording import Recording
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.charts.measured import TracedRun
+from rack.tools.timing.charts.panel import Panel
 
 SLOWER = 4
 """Times of these runs as multiples of the figures': long compared with the boards' own work, on a slow machine too."""

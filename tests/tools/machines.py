@@ -14,8 +14,8 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
 from rack.boards.config import RackConfig, load, wire
 from rack.levels.peer import DRIFT_PPM, Presence, peer_port
-from rack.tools.runs.parquet import CyclesFile, SignalsFile
-from rack.tools.runs.recording import Recording
+from rack.tools.recording.parquet import CyclesFile, SignalsFile
+from rack.tools.recording.recording import Recording
 from tests.boards.lan.racks import rack_text
 
 S, MS, US = 1_000_000_000, 1_000_000, 1_000

@@ -12,8 +12,8 @@ import numpy as np
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.tools.runs.parquet import CyclesFile, SignalsFile
-from rack.tools.runs.recording import Recording
+from rack.tools.recording.parquet import CyclesFile, SignalsFile
+from rack.tools.recording.recording import Recording
 
 MS, US = 1_000_000, 1_000
 EPOCH_NS = 5_000_000_123

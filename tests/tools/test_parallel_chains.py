@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.tools.analysis.analysis import Analysis
-from rack.tools.analysis.report import write_report
-from rack.tools.benches.apart import apart
-from rack.tools.benches.bare import run_bare
-from rack.tools.benches.lockstep import differences
-from rack.tools.benches.response import run_commands
-from rack.tools.charts.figure5 import lines
-from rack.tools.runs.display import Display
-from rack.tools.runs.launch import run_rack
-from rack.tools.runs.recording import Recording
+from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.bare import run_bare
+from rack.tools.lab.benches.lockstep import differences
+from rack.tools.lab.benches.response import run_commands
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.analysis import Analysis
+from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.charts.figure5 import lines
 from rack.tools.timing.operator_response import response_of
 from rack.tools.viewer.reading import read
 from tests.boards.commanded_racks import commands

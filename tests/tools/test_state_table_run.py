@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.runs.recording import Recording
+from rack.tools.recording.recording import Recording
 from rack.tools.viewer.reading import read
 from tests.boards.commanded_racks import commands
 from tests.boards.table_racks import counting

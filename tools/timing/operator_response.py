@@ -20,7 +20,7 @@ from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
-from rack.tools.runs.recording import Recording
+from rack.tools.recording.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

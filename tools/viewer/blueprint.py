@@ -12,9 +12,9 @@ import rerun.blueprint as rrb
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
-from rack.levels.joint_messages import DRIVING
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
+from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
 from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS

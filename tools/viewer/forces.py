@@ -9,8 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from rack.levels.force.contact import AXIS_NAMES, UNITS
 from rack.levels.robot.cell import Cell
+from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
 from rack.tools.viewer.stream import RowBlock, Sampled, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.levels.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.robot.hand import Hand
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, dimmed, of_joint, style_curves
 

@@ -10,8 +10,8 @@ import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State
-from rack.levels.force.messages import Mode
 from rack.levels.messages import Verb
+from rack.levels.systems.force.messages import Mode
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, RowBlock, Stream

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rack.tools.runs.recording import Recording
-from rack.tools.runs.time_line import RackPlace
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.time_line import RackPlace
 from rack.tools.viewer.blueprint import RackViews, blueprint, together
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Stream, Timelines, new_recording

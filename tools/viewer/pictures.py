@@ -17,8 +17,8 @@ import numpy as np
 from rerun.experimental import ViewerClient
 
 from rack.tools.console.answer import Failure
-from rack.tools.runs.window import HOST, ViewerWindow, free_port, url
 from rack.tools.viewer.stream import SIM_TIME
+from rack.tools.viewer.window import HOST, ViewerWindow, free_port, url
 
 PATIENCE_S = 30.0
 LOOK_S = 0.05

@@ -16,9 +16,6 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
 from rack.boards.config.timing import tick_ns
-from rack.levels.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH
-from rack.levels.hand.messages import HAND_STATUS, STREAMED_DOWN
-from rack.levels.joint_messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.messages import (
     ARM_STATE,
     MOVE_PLAN,
@@ -28,7 +25,10 @@ from rack.levels.messages import (
     WORLD_MODEL,
 )
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.trajectory.messages import MOTION_STATUS
+from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH
+from rack.levels.systems.hand.messages import HAND_STATUS, STREAMED_DOWN
+from rack.levels.systems.joint_boards.messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
+from rack.levels.systems.trajectory.messages import MOTION_STATUS
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, PlannedPath, Poses, Pushes, write_geometry
 from rack.tools.viewer.curves import Fields, Joints

@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from rack.backplane.segment import Launch
-from rack.tools.runs.time_line import RackPlace
+from rack.tools.recording.time_line import RackPlace
 
 Ints = NDArray[np.int64]
 

@@ -24,7 +24,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event, Outcome
-from rack.tools.runs.window import free_port
+from rack.tools.viewer.window import free_port
 from tests.processes import BOUND_S
 
 ROOT = Path(__file__).resolve().parents[3]

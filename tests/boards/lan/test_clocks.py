@@ -37,7 +37,7 @@ from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import Arrived
 from rack.boards.lan.peers import PeerRack
 from rack.levels.peer import DRIFT_PPM
-from rack.tools.runs.window import free_port
+from rack.tools.viewer.window import free_port
 from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS
 
 ROOT = Path(__file__).resolve().parents[3]

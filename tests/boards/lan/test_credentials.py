@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from rack.boards.lan.credentials import Credentials
-from rack.tools.lan.certificates import make_credentials
+from rack.tools.network.certificates import make_credentials
 
 NAMES = {"cell": ["10.0.0.1", "cell.local"], "puma": []}
 

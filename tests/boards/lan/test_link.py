@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rack.boards.lan.keys import out_key
-from rack.tools.runs.window import free_port
+from rack.tools.viewer.window import free_port
 from tests.boards.lan.test_strangers import OWN, Program, Site, at_home, friend, running
 from tests.processes import wait_until
 

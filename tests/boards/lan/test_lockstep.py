@@ -12,7 +12,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.crate import patience
 from rack.levels.peer import Presence, peer_port
-from rack.tools.runs.holds import Holds
+from rack.tools.live.holds import Holds
 from tests.boards.lan.racks import Ended, configs, ended, ring_texts, run_together, running, started, watch
 from tests.processes import forked, runs, wait_until
 

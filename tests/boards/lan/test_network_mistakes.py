@@ -11,7 +11,7 @@ from rack.boards.config import load, loads, resolve, wire
 from rack.boards.config.files import CONFIGS
 from rack.boards.config.network import network_notes
 from rack.boards.errors import ConfigError
-from rack.tools.lan.certificates import make_credentials
+from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import rack_text
 
 TLS = "tls/127.0.0.1:7447"

@@ -11,7 +11,7 @@ import pytest
 from rack.backplane.errors import BackplaneError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
-from rack.tools.lan.certificates import make_credentials
+from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import configs, endpoints, rack_text, started
 from tests.processes import wait_until
 

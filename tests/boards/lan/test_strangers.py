@@ -15,8 +15,8 @@ import pytest
 
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.keys import out_key
-from rack.tools.lan.certificates import make_credentials
-from rack.tools.runs.window import free_port
+from rack.tools.network.certificates import make_credentials
+from rack.tools.viewer.window import free_port
 from tests.processes import BOUND_S, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -13,7 +13,7 @@ from rack.boards.config import resolve
 from rack.boards.errors import ConfigError
 from rack.boards.exchange import PortAge
 from rack.boards.faults.config import FaultConfig
-from rack.tools.runs.snapshot import RackMonitor
+from rack.tools.live.snapshot import RackMonitor
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
 

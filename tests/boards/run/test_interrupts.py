@@ -36,7 +36,7 @@ executor = "interrupt_levels:Hub"
 slot = {10 - at}
 core = 1
 every = 1
-executor = "rack.levels.figures:FigureLoop"
+executor = "rack.levels.systems.figures:FigureLoop"
 params.process_ms = 0.0
 budget.process_ms = 0.5
 """

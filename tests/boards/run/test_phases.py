@@ -14,8 +14,8 @@ from rack.boards.config import wire
 from rack.boards.config.timing import rack_timing
 from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.schedule import simulate
-from rack.tools.charts.gantt import Subject, gantt_of
-from rack.tools.charts.window import WindowOptions
+from rack.tools.timing.charts.gantt import Subject, gantt_of
+from rack.tools.timing.charts.window import WindowOptions
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
 

@@ -14,7 +14,7 @@ from rack.levels.arm import SimulatedArm
 from rack.levels.arm.wrist import ContactWrench
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
-from tests.levels.force.pad import pad
+from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000
 STILL = np.zeros(6)

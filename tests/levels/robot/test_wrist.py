@@ -10,7 +10,7 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.cell import build_cell
-from tests.levels.force.pad import pad
+from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000
 

@@ -11,7 +11,7 @@ from rack.backplane.message import Message
 from rack.boards.faults import KINDS
 from rack.levels.algebra import Array
 from rack.levels.level import Fault
-from rack.levels.servo import ArmExecutor, JointServo
+from rack.levels.systems.joint_boards import ArmExecutor, JointServo
 from tests.boards.joint_levels import Swing
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep

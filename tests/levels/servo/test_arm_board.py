@@ -11,7 +11,7 @@ import pytest
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Demand, Ports
 from rack.levels.operator import Answer, Operation
-from rack.levels.servo import JointServo
+from rack.levels.systems.joint_boards import JointServo
 from tests.levels.box import mute
 from tests.levels.lockstep import Operator
 from tests.levels.servo.joint_rig import APART, JOINTS, TOGETHER, JointRig

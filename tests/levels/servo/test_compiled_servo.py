@@ -9,19 +9,8 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.servo import (
-    ArmExecutor,
-    JointServo,
-    ServoExecutor,
-    actuator_monitor,
-    control,
-    curves,
-    driver,
-    joint_control,
-    joint_torques,
-    reference,
-    sensor_monitor,
-)
+from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, driver, reference, sensor_monitor
+from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control, joint_torques
 from tests.levels.arms import config
 from tests.levels.servo.joint_rig import APART, JointRig
 from tests.levels.servo.rig import Course, ServoRig

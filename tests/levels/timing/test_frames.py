@@ -63,6 +63,6 @@ def test_the_clock_takes_its_part_of_every_place_on_its_core() -> None:
 
 
 def test_planners_have_no_place_in_frames() -> None:
-    planner = ("board.even.planner=rack.levels.figures:FigurePlanner", "board.even.coupling=tight")
+    planner = ("board.even.planner=rack.levels.systems.figures:FigurePlanner", "board.even.coupling=tight")
     even, _ = core_frames(timing(*planner, "board.even.budget.plan_ms=5.0"))
     assert [name for name, *_ in places(even)] == ["fast", "even"]

@@ -11,8 +11,8 @@ import pytest
 
 from rack.boards.config import load
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.tools.benches.response import run_commands
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.response import run_commands
 from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
 from tests.boards.commanded_racks import COMMANDED
 

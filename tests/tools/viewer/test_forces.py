@@ -11,14 +11,14 @@ import rerun.blueprint as rrb
 
 from rack.backplane.message import MessageType
 from rack.backplane.segment import Launch
-from rack.levels.force.messages import FORCE_STATUS, WRENCH
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
 from rack.tools.viewer.cell import Poses
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
-from tests.levels.force.pad import pad
+from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000
 ROWS = 60

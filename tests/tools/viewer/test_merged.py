@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from rack.tools.runs.recording import Recording
-from rack.tools.runs.time_line import on_one_time_line
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.viewer.merged import write_merged
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.runs.window import ViewerWindow, free_port
 from rack.tools.viewer.pictures import PACKAGES, NoViewerError, _connected
+from rack.tools.viewer.window import ViewerWindow, free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60

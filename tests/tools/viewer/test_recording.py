@@ -11,10 +11,10 @@ from rerun.chunk import RrdReader
 
 from rack.boards.config import load, loads
 from rack.levels.robot.cell import STATE, Cell, build_cell
-from rack.tools.runs.recording import Recording
-from rack.tools.runs.window import executable
+from rack.tools.recording.recording import Recording
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
+from rack.tools.viewer.window import executable
 from tests.shared_runs import NASREM_S, nasrem_run
 
 

@@ -1,0 +1,25 @@
+"""What bus adapters have in common: they see the segment itself, and may open something outside the rack."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from rack.backplane.segment import Segment
+from rack.boards.host.entries import Rows
+from rack.levels.level import Executor
+
+STATUS = "status"
+
+
+class Adapter(Executor):
+    """A board that passes messages between the backplane and what is not on it."""
+
+    wired_by: ClassVar[str]
+    """Key of its board under which its ports are listed."""
+
+    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
+        """Take the segment, before the self-test; in a replay with what was recorded in place of what is out."""
+
+    def open(self) -> None:
+        """Open the way outside. The board has its core and priority by now: threads that this starts inherit both."""

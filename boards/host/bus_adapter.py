@@ -1,0 +1,189 @@
+"""The bridge: a bus adapter between the real-time side and the boards of the host side.
+
+A bridge is an ordinary board with a rate and a priority. Each entry of its table passes one mailbox across; the side of
+the source is the direction.
+
+Into real time, the bridge takes messages from the ring of a host board, checks them, and writes them to its own mailbox
+`<bridge>.<port>`, which levels read by ticks as any other. From there on a run is repeatable. Out of real time it reads
+a level's mailbox by ticks and writes a copy, which host boards read whenever they like.
+
+A hung, dead or flooding host board costs the real-time side nothing: the ring is bounded, a cycle looks at no more than
+`most` messages of an entry, and nothing here waits. The bridge's status shows it, entry by entry.
+
+In lockstep a program runs only within cycles of its bridges, after the exchange, and the cycle waits until it waits. It
+is due when a message has come, when the time has come until which it waits, and at its start. What it sends is taken
+in a later cycle, once its computing is over: that takes the simulated time `[host.x] computing_ms`, however long it
+really took. So it enters at ticks that the config determines. If a program has several bridges, lockstep releases all
+tasks one at a time.
+
+Alternative considered: a clock that releases programs as it does tasks. They would need a rate, and a message would
+wait for their next cycle.
+
+A replay does without host boards: what entered in a recorded run is given out again, each message at its tick.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rack.backplane.clock.released_task import ReleasedTask
+from rack.backplane.clock.wake import CHECK_S
+from rack.backplane.layout import TaskSpec
+from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.host.adapter import STATUS, Adapter
+from rack.boards.host.entries import (
+    ENTRY,
+    NEVER,
+    AdapterParams,
+    Crossing,
+    EntryConfig,
+    EntryCount,
+    Inward,
+    Outward,
+    Replayed,
+    Rows,
+)
+from rack.levels.errors import CannotGoOn
+from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
+from rack.levels.tables import read_params
+
+LONGEST_S = 30.0
+"""Real time within which a program in lockstep must wait, or end; its start and imports have as long."""
+
+
+class BusAdapter(Adapter):
+    """Passes mailboxes between the two sides. Its status is done when the programs of all its host boards are."""
+
+    params = AdapterParams
+    wired_by = "params.pass"
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._tables = read_params(AdapterParams, context.params).entries
+        self._counts = {port: EntryCount() for port in self._tables}
+        self._entries: list[tuple[EntryConfig, Crossing]] = []
+        self._turns: list[HostTurn] = []
+        self._hosts: dict[str, memoryview] = {}
+        self._before: dict[str, bytes] = {}
+        self._statuses: Replayed | None = None
+
+    @classmethod
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+        """Return a port to read and one to write for each entry, and the status."""
+        entries = AdapterParams.entries_of(params)
+        known = {port: entry for port, entry in entries.items() if entry.source in types}
+        inputs = {port: Input(types.get(entry.source, ENTRY), entry.source) for port, entry in entries.items()}
+        # A message that is passed once must not be sampled; to host boards a bridge writes by itself.
+        outputs = {port: Output(types[entry.source], queued=entry.asynchronous) for port, entry in known.items()}
+        is_whole = bool(entries) and known == entries
+        return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))}, is_whole)
+
+    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
+        """Open the host side; in a replay, take over what the recorded run wrote, by port, instead."""
+        layout = segment.layout
+        hosts = {host.name for host in layout.hosts}
+        self._resume_counts(open_observer(segment, f"{self.context.board}.{STATUS}"))
+        for port, table in self._tables.items():
+            # What the process before this one has written, if the bridge is restarted.
+            own = open_observer(segment, f"{self.context.board}.{port}")
+            before, writer = own.peek(), layout.mailbox(table.source).writer
+            entry: Crossing
+            if writer not in hosts:
+                entry = Outward(segment, own.spec.name, port, table, self._counts[port])
+            else:
+                if before.is_there:
+                    self._before[port] = bytes(before.value.raw)
+                if entries is None:
+                    self._hosts[writer] = segment.block(writer)
+                    entry = Inward(segment, port, table, self._counts[port])
+                else:
+                    since = own.newest if before.is_there else NEVER
+                    entry = Replayed(entries[port], port, table.asynchronous, since)
+            self._entries.append((table, entry))
+        if segment.words[System.LOCKSTEP] and entries is None:
+            board = self.context.board
+            self._turns = [HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)]
+        if entries is not None:
+            self._statuses = Replayed(entries[STATUS], STATUS, is_queued=False)
+
+    def _resume_counts(self, status: Reader) -> None:
+        before = status.peek()
+        for port, count in self._counts.items() if before.is_there else ():
+            count.resume(getattr(before.value, port), status.newest)
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Exchange the entries that are due; then, in lockstep, let programs run."""
+        if self._before:
+            for port, message in self._before.items():
+                getattr(write, port).raw[:] = message
+            self._before.clear()
+        cycle = (tick - self.context.phase) // self.context.every
+        for table, entry in self._entries:
+            if table.is_due(cycle):
+                entry.exchange(read, write, tick)
+        for turn in self._turns:
+            turn.take(tick)
+        if self._statuses is not None:
+            self._statuses.exchange(read, write, tick)
+        else:
+            self._report(write.status, tick)
+
+    def _report(self, status: Message, tick: int) -> None:
+        for port, count in self._counts.items():
+            count.fill(getattr(status, port), tick)
+        states = {name: block[Block.STATE] for name, block in self._hosts.items()}
+        lost = [name for name, block in self._hosts.items() if block[Block.LOST]]
+        gone = [name for name, state in states.items() if state == TaskState.GIVEN_UP]
+        status.state, status.error, status.reason = State.EXECUTING, 0, ""
+        if lost:
+            # First: in lockstep the Rack may give it up at any tick, and the clock confirms that at one.
+            status.state, status.reason = State.HOLDING, f"host board '{lost[0]}' is lost: it is being restarted"
+        elif gone:
+            status.state, status.reason = State.ERROR, f"host board '{gone[0]}' was given up"
+        elif states and all(state == TaskState.ENDED for state in states.values()):
+            status.state = State.DONE
+
+
+class HostTurn(ReleasedTask):
+    """A host board's program in lockstep, as its adapter sees it; its own end is `rack.boards.host.bus.HostBus`."""
+
+    def __init__(self, segment: Segment, host: TaskSpec) -> None:
+        super().__init__(segment, host)
+        self._segment = segment
+
+    def take(self, tick: int) -> None:
+        """Let the program run in the cycle released at `tick` if it is due, and wait until it waits.
+
+        Raises `CannotGoOn` if that takes too long.
+        """
+        block = self.block
+        # It may be done, or given up.
+        if block[Block.STATE] > TaskState.RUNNING or block[Block.WAITS_UNTIL] > tick or not self.is_free(tick):
+            return
+        block[Block.RELEASED] = tick
+        self.wake()
+        bound_s = time.monotonic() + LONGEST_S
+        while not self.is_settled():
+            if self.done.acquire(CHECK_S):
+                continue
+            if self._segment.words[System.STOP_REQUEST] or not self._segment.launcher_is_alive:
+                break
+            if time.monotonic() > bound_s:
+                raise CannotGoOn(
+                    f"the program of host board '{self.spec.name}' has not waited for {LONGEST_S:g} s of real time: "
+                    "lockstep cannot go on without it"
+                )
+        if block[Block.LOST]:
+            # The crate has noted the tick of the clock, which may be ahead of this cycle.
+            block[Block.LOST] = tick + 1
+
+
+def status_of(entries: Mapping[str, EntryConfig]) -> MessageType:
+    """Return the type of a bridge's status: one group of counts for each entry."""
+    return status("adapter_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries))

@@ -1,8 +1,0 @@
-"""State tables: levels whose executors are tables in TOML files, with static plans and no planners."""
-
-from rack.levels.state_table.elemental_move import MoveTable
-from rack.levels.state_table.level import StateTableExecutor
-from rack.levels.state_table.primitive import PrimitiveTable
-from rack.levels.state_table.task import TaskTable
-
-__all__ = ["MoveTable", "PrimitiveTable", "StateTableExecutor", "TaskTable"]

@@ -1,0 +1,11 @@
+"""Task levels of several racks that work together: one that takes its actions as orders, and one that gives them."""
+
+from rack.levels.systems.cell.coordinator import Coordinator
+from rack.levels.systems.cell.executor import OrderedTaskExecutor
+from rack.levels.systems.cell.messages import CELL_ORDER, CELL_REPORT
+from rack.levels.systems.cell.planner import OrderedTaskPlanner
+from rack.levels.systems.cell.program import CellProgram
+from rack.levels.systems.cell.sharing_executor import SharingServoExecutor
+
+__all__ = ["CELL_ORDER", "CELL_REPORT", "CellProgram", "Coordinator", "OrderedTaskExecutor", "OrderedTaskPlanner"]
+__all__ += ["SharingServoExecutor"]

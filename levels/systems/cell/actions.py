@@ -1,0 +1,71 @@
+"""Actions of a task program as fields of a message, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.message import Message
+from rack.levels.errors import ProgramError
+from rack.levels.operator import Goal
+from rack.levels.systems.cell.messages import ACTION_FIELDS, OrderAction
+from rack.levels.tables import RobotConfig, SceneConfig
+from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, read_program
+
+
+def write_action(action: AnyAction, message: Message) -> None:
+    """Fill the `ACTION_FIELDS` of a message; what the action lacks is zero."""
+    for field in ACTION_FIELDS:
+        message.record[field.name] = np.zeros((), message.record.dtype[field.name])
+    message.by = action.by or 0.0
+    if isinstance(action, Transfer):
+        message.action, message.object, message.position = OrderAction.TRANSFER, action.object, action.to
+        message.turned, message.yaw, message.lift = action.yaw is not None, action.yaw or 0.0, action.lift
+    elif isinstance(action, Goto):
+        message.action = OrderAction.GOTO
+        _write_goal(action, message)
+    elif isinstance(action, Home):
+        message.action = OrderAction.HOME
+
+
+def _write_goal(action: Goto, message: Message) -> None:
+    if action.joints is not None:
+        message.goal, message.count = Goal.JOINTS, len(action.joints)
+        message.joints[: message.count] = action.joints
+    elif action.position is not None:
+        message.position = action.position
+        message.goal = Goal.POSE if action.quaternion is not None else Goal.DIRECTION
+        if action.quaternion is not None:
+            message.quaternion = action.quaternion
+        else:
+            message.direction = action.direction or DOWN
+
+
+def copy_action(source: Message, target: Message) -> None:
+    """Copy the `ACTION_FIELDS` from one message to another."""
+    for field in ACTION_FIELDS:
+        target.record[field.name] = source.record[field.name]
+
+
+def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> AnyAction:
+    """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not suit arm or scene."""
+    table = _table(message) | ({"by": message.by} if message.by else {})
+    (action,) = read_program({"action": [table]}, robot, scene).action
+    return action
+
+
+def _table(message: Message) -> dict[str, Any]:
+    what, goal = message.action, message.goal
+    if what == OrderAction.HOME:
+        return {"do": "home"}
+    if what == OrderAction.TRANSFER:
+        turn = {"yaw": message.yaw} if message.turned else {}
+        place = message.position.tolist()
+        return {"do": "transfer", "object": message.object, "to": place, "lift": message.lift, **turn}
+    if what != OrderAction.GOTO or goal not in (Goal.JOINTS, Goal.POSE, Goal.DIRECTION):
+        raise ProgramError(f"action {what} with goal {goal} is not known; permitted: transfer, goto, home")
+    if goal == Goal.JOINTS:
+        return {"do": "goto", "joints": message.joints[: message.count].tolist()}
+    turned = "quaternion" if goal == Goal.POSE else "direction"
+    return {"do": "goto", "position": message.position.tolist(), turned: getattr(message, turned).tolist()}

@@ -1,0 +1,286 @@
+"""The executor of an ordered task level: takes its actions from a coordinator, one order at a time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from rack.backplane.message import Message, MessageType, State
+from rack.levels.errors import ProgramError
+from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
+from rack.levels.messages import WORLD_MODEL, Error
+from rack.levels.operator import Operation
+from rack.levels.peer import PEER, peer_port
+from rack.levels.systems.cell.actions import copy_action, read_action
+from rack.levels.systems.cell.messages import CELL_ORDER, CELL_REPORT, CELL_REQUEST, Response
+from rack.levels.systems.cell.params import OrderedTaskParams
+from rack.levels.systems.cell.taken import TakenOrder
+from rack.levels.tables import read_params
+from rack.levels.task.executor import TaskExecutor
+from rack.levels.task.program import AnyAction
+
+MAX_STRAY_RAD = 0.005
+"""A plan holds if no joint has moved farther since it was requested."""
+NUMBERED = re.compile(r"^(task\.)?action( 0|\[0\]|\.0)[:,.]? ?")
+"""The action's number in a reason: an order has only one."""
+
+
+class OrderedTaskExecutor(TaskExecutor):
+    """Answers what it is asked, and does what it has answered to be possible.
+
+    While its orders are lost it holds the arm on its path. It ends its run when the coordinator says so, or when that
+    stays away for `stalled_s`.
+    """
+
+    inputs = {
+        **TaskExecutor.inputs,
+        "world": Input(WORLD_MODEL, "world.model"),
+        "last_request": Input(CELL_REQUEST, "own.request"),
+        "last_report": Input(CELL_REPORT, "own.report"),
+    }
+    # The report last: what it says has begun is in the status.
+    outputs = {**TaskExecutor.outputs, "request": CELL_REQUEST, "report": CELL_REPORT}
+    params = OrderedTaskParams
+    program = None
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._table = read_params(OrderedTaskParams, context.params)
+        self._source = f"rack '{self._table.coordinator}'" if self._table.coordinator else "the coordinator"
+        self._taken = TakenOrder()
+        self._begun = 0  # request whose plan is followed; 0: none
+        self._orders_begun = self._orders_done = 0
+        self._moves = 0, 0  # done, of how many, of the newest order begun
+        self._halted = False  # moves were withdrawn: the arm is held until another order begins
+        self._breaking_off: int | None = None  # first move that must not begin
+        self._rests = False  # the arm is held so that the order can be broken off
+        self._absent = ""  # why there are no orders
+        self._held = ""  # why the coordinator holds the arm
+        self._waits = ""  # why an order cannot be planned yet
+        self._is_end_reported = False
+        self._nothing: Message | None = None  # the plan of no order
+
+    @classmethod
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+        """Return the mailboxes of the orders and, over the network, of the other rack's time."""
+        try:
+            table = OrderedTaskParams.model_validate(params)
+        except ValidationError:
+            return MadePorts(is_whole=False)
+        peer = {"peer": Input(PEER, f"lan.{peer_port(table.coordinator)}")} if table.coordinator else {}
+        return MadePorts({"order": Input(CELL_ORDER, table.orders), **peer})
+
+    def _first_actions(self) -> tuple[AnyAction, ...]:
+        return ()
+
+    def _recall(self, read: Ports, write: Ports) -> None:
+        super()._recall(read, write)
+        last = read.last_status.value
+        self._orders_begun, self._orders_done = last.actions, last.action
+        self._moves = last.moves_done, last.moves
+        if not read.last_report.is_there:
+            return
+        report: Message = read.last_report.value
+        write.report.copy_from(report)
+        write.request.copy_from(read.last_request.value)
+        self._taken, self._halted = TakenOrder(report), bool(report.halted)
+        self._is_end_reported = self._taken.response is Response.ENDED
+        if self._taken.is_under_way and report.moves:
+            self._begun = write.request.id
+            self._take_action(write.request)
+
+    def _plan_to_follow(self, read: Ports, write: Ports, tick: int) -> Message:
+        """Follow the orders; return the plan of the one under way."""
+        self._listen(read.order)
+        self._waits = ""
+        taken, request, plan = self._taken, write.request, read.plan.value
+        if taken.is_asked:
+            self._answer_order(read, request, tick)
+        elif taken.is_under_way and not self._begun:
+            self._begin(read, request, tick)
+        write.status.echo = plan.id if plan.id == request.id else 0
+        self._fill_times(plan, request, write.report)
+        below = read.status.value
+        write.report.operated = below.operated or self._orders.standing is not Operation.NONE
+        self._nothing = self._nothing or Message(plan.record.dtype)
+        return plan if self._begun and self._begun == plan.id else self._nothing
+
+    def _listen(self, reading: Reading) -> None:
+        """Take up what the coordinator says, or note why it says nothing."""
+        order: Message = reading.value
+        self._held = self._absent = ""
+        if not reading.is_there:
+            self._absent = f"no orders from {self._source} yet"
+        elif reading.is_lost:
+            self._absent = f"{self._source} is lost: held until it is back"
+        else:
+            self._taken.hear(order.program, order.id, order.what, order.reason)
+            self._held = order.reason if order.hold and self._taken.is_under_way else ""
+        if self._taken.response is Response.ENDED:
+            if self._is_end_reported and not self._error:
+                self._error, self._reason = self._taken.error, self._taken.reason
+            self._absent = ""
+
+    def _answer_order(self, read: Ports, request: Message, tick: int) -> None:
+        """Answer when the order is planned; have it planned as soon as the arm rests."""
+        plan, taken = read.plan.value, self._taken
+        if (request.program, request.order) == (taken.program, taken.order):
+            if plan.id == request.id and not plan.error:
+                taken.promise()
+            elif plan.id == request.id:
+                taken.fail(Error(plan.error), bare(plan.reason))
+            return
+        order, ahead_s, now_s = read.order.value, self._ahead(read), tick * self.context.tick_s
+        self._waits = self._not_ready(read)
+        if self._waits:
+            return
+        try:
+            action = read_action(order, self.context.robot, self.context.scene)
+        except ProgramError as error:
+            taken.fail(Error.UNREACHABLE, bare(str(error)))
+            return
+        if action.by is not None and action.by - ahead_s <= now_s:
+            taken.fail(Error.TOO_LATE, f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already")
+            return
+        request.program, request.order, request.ahead = taken.program, taken.order, ahead_s
+        copy_action(order, request)
+        planned_s = (self.context.within_cycles + 1) * self.context.period_s
+        self._request(read, request, now_s + planned_s + self._table.decision)
+
+    def _request(self, read: Ports, request: Message, begin_s: float) -> None:
+        """Have the action in `request` planned, to begin at `begin_s`."""
+        request.id += 1
+        request.begin, request.revision, request.start = begin_s, read.world.value.revision, read.status.value.start
+
+    def _ahead(self, read: Ports) -> float:
+        """Return the coordinator's simulated time less that here, s."""
+        return float(read.peer.value.ahead) if self._table.coordinator else 0.0
+
+    def _knows_time(self, read: Ports) -> bool:
+        peer: Reading | None = read.peer if self._table.coordinator else None
+        return peer is None or (peer.is_there and peer.value.uncertainty >= 0.0)
+
+    def _not_ready(self, read: Ports) -> str:
+        """Return why nothing can be planned now; empty: it can."""
+        if self._orders.standing is not Operation.NONE or not read.status.value.resting:
+            return "the arm does not rest yet"
+        if not read.world.value.revision:
+            return "the world model knows nothing yet"
+        if read.order.value.by and not self._knows_time(read):
+            return f"the clock of {self._source} has not been compared yet"
+        return ""
+
+    def _begin(self, read: Ports, request: Message, tick: int) -> None:
+        """Begin with the plan that was promised; have it planned anew if the world has changed since."""
+        if not self._actions:
+            self._take_action(request)
+        strays = float(np.abs(read.status.value.start - request.start).max()) > MAX_STRAY_RAD
+        if request.begin and (strays or read.world.value.revision != request.revision):
+            self._waits = self._not_ready(read)
+            if not self._waits:
+                self._request(read, request, 0.0)
+        elif read.plan.value.id == request.id:
+            self._begun, self._done, self._halted = request.id, 0, False
+            self._window.renumber(0)
+            self._orders_begun += 1
+
+    def _take_action(self, request: Message) -> None:
+        self._actions = (read_action(request, self.context.robot, self.context.scene),)
+        self._ahead_s = request.ahead
+
+    def _step_aside(self, plan: Message, below: Message) -> int:
+        """Interrupt the order for an operator, or break it off."""
+        done = super()._step_aside(plan, below)
+        self._halted = self._halted and not self._detour.move
+        self._breaking_off, rested = None, self._rests
+        self._rests = False
+        if self._taken.stops and self._detour.move:
+            self._taken.finish(Response.STOPPED)
+        elif self._taken.stops:
+            self._breaking_off, self._rests = self._window.breaking_off(plan, done, below)
+            if rested and below.resting:
+                self._taken.finish(Response.STOPPED)
+                self._halted = True
+        return done
+
+    def _shown_until(self, plan: Message) -> int:
+        until = super()._shown_until(plan)
+        return until if self._breaking_off is None else min(until, self._breaking_off)
+
+    def _reason_to_wait(self, below: Reading) -> str:
+        waits = super()._reason_to_wait(below)
+        if self._orders.standing is not Operation.NONE:
+            return waits
+        return self._absent or self._held or waits or self._waits
+
+    def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
+        # While the coordinator holds the arm, it also says for how long.
+        if self._held:
+            self._moved_at = tick
+        else:
+            super()._check_progress(plan, read, waits, tick)
+
+    def _stage(self) -> tuple[int, ...]:
+        return self._taken.order, self._taken.response, self._begun, not self._absent
+
+    def _report(self, plan: Message, waits: str, write: Ports) -> None:
+        report, status, echo = write.report, write.status, write.status.echo
+        self._settle(plan)
+        taken = self._taken
+        if self._begun:
+            self._moves = report.moves_done, report.moves = self._done, plan.count
+        elif (report.program, report.echo) != (taken.program, taken.order):
+            report.moves_done = report.moves = 0
+        super()._report(plan, waits, write)
+        status.echo, status.action, status.actions = echo, self._orders_done, self._orders_begun
+        status.moves_done, status.moves = self._moves
+        report.program, report.echo, report.response = taken.program, taken.order, taken.response
+        report.state, report.error, report.halted = status.state, taken.error, self._halted
+        report.reason = taken.reason or waits
+        if not taken.is_under_way:
+            self._begun, self._actions = 0, ()
+        self._is_end_reported = taken.response is Response.ENDED
+
+    def _settle(self, plan: Message) -> None:
+        """End the order that is done or has failed; what ends the run as well stays an error."""
+        taken = self._taken
+        if self._error and (taken.is_asked or taken.is_under_way):
+            if self._absent and self._error is Error.STALLED:
+                return
+            taken.fail(self._error, bare(self._reason))
+            self._halted = self._halted or self._begun > 0
+            self._error, self._reason = Error.NONE, ""
+        elif taken.is_under_way and plan.count and self._done == plan.count:
+            taken.finish(Response.DONE)
+            self._orders_done += 1
+
+    def _fill_times(self, plan: Message, request: Message, report: Message) -> None:
+        """Report the earliest end, and how long a promise holds, in the coordinator's time."""
+        report.earliest = report.until = 0.0
+        if plan.id == request.id and self._taken.response in (Response.POSSIBLE, Response.DOING, Response.REFUSED):
+            report.earliest = plan.earliest
+        if self._taken.response is Response.POSSIBLE and request.by:
+            report.until = request.begin + request.ahead + request.by - plan.earliest
+
+    def _answer(self, below: Message, write: Ports) -> None:
+        super()._answer(below, write)
+        is_held = self._taken.is_under_way and bool(self._absent or self._held)
+        if not self._detour.move and (self._halted or self._rests or is_held):
+            write.command.hold = 1
+
+    def _state(self, plan: Message) -> State:
+        if self._error:
+            return State.ERROR
+        if self._taken.response is Response.ENDED:
+            return State.DONE if self._is_end_reported else State.EXECUTING
+        waits = self._taken.is_asked or self._taken.is_under_way or self._absent
+        return State.EXECUTING if waits else State.IDLE
+
+
+def bare(reason: str) -> str:
+    """Return a reason without the number of the action."""
+    return NUMBERED.sub("", reason)

@@ -1,0 +1,62 @@
+"""The simulated arm in a cell whose bodies other simulations may move: see `rack.levels.systems.cell.shared_bodies`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.algebra import Array
+from rack.levels.arm.simulated import SimulatedArm
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.lookup import below, geoms_of
+from rack.levels.tables import SceneConfig
+
+POSE, MOTION = 7, 6
+"""Numbers of a free body in qpos and qvel."""
+
+
+class SharingArm(SimulatedArm):
+    """Keeps copies of objects where it is told, between MuJoCo's ticks; within one they are bodies like others.
+
+    Rows are those of the world model.
+    """
+
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+        super().__init__(cell, scene, clock_ns, every, seed)
+        self._kept: dict[int, Array] = {}  # row of a copy: where it stays, (7,)
+        self._in_hand = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
+        self._parts: dict[int, NDArray[np.bool_]] = {}  # (ngeom,), by row: geoms of the object
+
+    def is_touched(self, row: int) -> bool:
+        """Return whether the gripper touches an object."""
+        if row not in self._parts:
+            model = self._model
+            parts = geoms_of(model, below(model, self.cell.bodies[[row]]))
+            self._parts[row] = np.isin(np.arange(model.ngeom), parts)
+        pairs = self._data.contact.geom
+        return bool((self._in_hand[pairs].any(axis=1) & self._parts[row][pairs].any(axis=1)).any())
+
+    def pose(self, row: int) -> Array:
+        """Return the pose of an object, (7,), m and quaternion, as simulated."""
+        at = self.cell.object_qpos[row]
+        return np.array(self._data.qpos[at : at + POSE])
+
+    def place(self, row: int, pose: Array) -> None:
+        """Put an object to a pose, (7,), at rest."""
+        model, at = self._model, self.cell.object_qpos[row]
+        dof = model.body_dofadr[self.cell.bodies[row]]
+        self._data.qpos[at : at + POSE], self._data.qvel[dof : dof + MOTION] = pose, 0.0
+        if row in self._kept:
+            self._kept[row] = pose
+
+    def keep(self, row: int, kept: bool) -> None:
+        """Keep an object where it is from now on, or let the simulation move it."""
+        if not kept:
+            self._kept.pop(row, None)
+        elif row not in self._kept:
+            self._kept[row] = self.pose(row)
+
+    def _simulate(self) -> None:
+        super()._simulate()
+        for row, pose in self._kept.items():
+            self.place(row, pose)

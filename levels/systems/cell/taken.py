@@ -1,0 +1,84 @@
+"""The order that an arm has taken up, and its answer: the arm's part of the agreement on each step.
+
+The other part is `rack.levels.systems.cell.agreement`. Both exchange whole states, never events, so a lost message only
+delays. What makes the arms begin together, or not at all:
+
+- An answer of an order is final: POSSIBLE turns into DOING by DO alone, into CANCELLED by CANCEL or another order.
+- An arm begins nothing that it has not answered to be possible. After a new launch of its rack, which knows of no
+  promise, it fails what it is asked to do.
+"""
+
+from __future__ import annotations
+
+from rack.backplane.message import Message
+from rack.levels.messages import Error
+from rack.levels.systems.cell.messages import OrderVerb, Response
+
+TAKEN = {
+    OrderVerb.ASK: Response.NONE,
+    OrderVerb.DO: Response.FAILED,
+    OrderVerb.CANCEL: Response.CANCELLED,
+    OrderVerb.END: Response.ENDED,
+}
+"""The response to an order that is new."""
+NOT_PROMISED = "told to do what it has not promised: its rack was launched anew"
+
+
+class TakenOrder:
+    """One order at a time, by the checksum of its program and its id."""
+
+    def __init__(self, report: Message | None = None) -> None:
+        """Begin without an order, or with that of a `CELL_REPORT`, after a restart of the board."""
+        self.program = self.order = 0
+        self.response = Response.NONE
+        self.error, self.reason = Error.NONE, ""  # of a refusal, a failure, or a program that ends early
+        self.stops = False  # under way, and to be broken off
+        if report is not None and report.echo:
+            self.program, self.order, self.response = report.program, report.echo, Response(report.response)
+            if report.error:
+                self.error, self.reason = Error(report.error), report.reason
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether an answer is due."""
+        return self.order > 0 and self.response is Response.NONE
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether the arm carries it out."""
+        return self.response is Response.DOING
+
+    def hear(self, program: int, order: int, what: int, reason: str = "") -> None:
+        """Follow what the newest message says of an order: an `OrderVerb`, and why a program ends early."""
+        if not order or what not in TAKEN or self.response is Response.ENDED:
+            return
+        is_same = (program, order) == (self.program, self.order)
+        if self.is_under_way:
+            self.stops = self.stops or not is_same or what in (OrderVerb.CANCEL, OrderVerb.END)
+        elif what == OrderVerb.END or not is_same:
+            self.program, self.order = program, order
+            self._answer(TAKEN[OrderVerb(what)], reason if what == OrderVerb.END else "")
+        elif what == OrderVerb.CANCEL and self.response in (Response.NONE, Response.POSSIBLE):
+            self._answer(Response.CANCELLED)
+        elif what == OrderVerb.DO and self.response is Response.POSSIBLE:
+            self._answer(Response.DOING)
+        elif what == OrderVerb.DO and self.is_asked:
+            self._answer(Response.FAILED)
+        if self.response is Response.FAILED and not self.error:
+            self.error, self.reason = Error.GIVEN_UP, NOT_PROMISED
+
+    def promise(self) -> None:
+        """Answer that it is possible."""
+        self._answer(Response.POSSIBLE)
+
+    def fail(self, error: Error, reason: str) -> None:
+        """Refuse the order to which an answer is due, or end the one under way."""
+        self._answer(Response.REFUSED if self.is_asked else Response.FAILED, reason, error)
+
+    def finish(self, response: Response) -> None:
+        """End the order under way, as DONE or STOPPED."""
+        self._answer(response)
+
+    def _answer(self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP) -> None:
+        self.response, self.reason, self.stops = response, reason, False
+        self.error = error if reason else Error.NONE

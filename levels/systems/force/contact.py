@@ -1,0 +1,106 @@
+"""The contact that requests have asked for: which axes of a task frame are of force, and what ends a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array, norm
+from rack.levels.systems.force.messages import AXES
+
+Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
+AXIS_NAMES: tuple[Axis, ...] = get_args(Axis)
+"""Axes of a task frame: along x, y, z, then about them."""
+UNITS = ("N", "N", "N", "N m", "N m", "N m")
+HALVES = ((slice(0, 3), "force", "N"), (slice(3, 6), "torque", "N m"))
+"""The halves of a wrench."""
+MAX_UNIT_ERROR = 1e-3
+"""A quaternion whose length is farther from 1 is no orientation."""
+SAME = 1e-9
+"""Largest difference between the numbers of quaternions that are the same."""
+
+
+class Contact:
+    """What is in force: the content of a server's `COMPLIANCE`."""
+
+    def __init__(self) -> None:
+        self.id = 0  # rises with every change
+        self.frame = np.array([1.0, 0.0, 0.0, 0.0])  # orientation of the task frame
+        self.selected = np.zeros(AXES, dtype=bool)  # axes of force
+        self.wrench, self.speed, self.guard = np.zeros((3, AXES))  # N, N m; m/s, rad/s; N, N m
+
+    @property
+    def complies(self) -> bool:
+        """Whether any axis is one of force."""
+        return bool(self.selected.any())
+
+    def comply(self, frame: Array, selected: Array, wrench: Array, speed: Array) -> bool:
+        """Replace the axes of force, and the guards if the frame is another; return whether motion begins anew."""
+        turned = not self._is_frame(frame)
+        begins_anew = self.complies and (turned or bool((self.selected != selected).any()))
+        if turned:
+            self.guard[:] = 0.0
+        self.id += 1
+        self.frame[:], self.selected[:], self.speed[:] = frame / norm(frame), selected, speed
+        self.wrench[:] = np.where(selected, wrench, 0.0)
+        return begins_anew
+
+    def watch(self, frame: Array, guard: Array) -> None:
+        """Replace the guards."""
+        self.id += 1
+        self.frame[:], self.guard[:] = frame / norm(frame), guard
+
+    def unguard(self) -> None:
+        """End the guards."""
+        self.watch(self.frame, np.zeros(AXES))
+
+    def relax(self) -> None:
+        """Want no force on the axes of force."""
+        self.id += 1
+        self.wrench[:] = 0.0
+
+    def release(self) -> None:
+        """Make all axes ones of motion, unguarded."""
+        self.id += 1
+        self.selected[:], self.wrench[:], self.guard[:] = False, 0.0, 0.0
+
+    def objection(self, frame: Array, guard: Array) -> str:
+        """Return why guards in that frame are impossible now; empty: they are not."""
+        if self.complies and guard.any() and not self._is_frame(frame):
+            return "the guard's frame is not that of the axes of force; permitted while complying: the same"
+        return ""
+
+    def _is_frame(self, frame: Array) -> bool:
+        # q and -q are the same orientation.
+        return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
+
+    def fill(self, compliance: Message) -> None:
+        """Fill a `COMPLIANCE`."""
+        compliance.id, compliance.active = self.id, self.complies or bool(self.guard.any())
+        compliance.frame, compliance.selected, compliance.wrench = self.frame, self.selected, self.wrench
+        compliance.speed, compliance.guard = self.speed, self.guard
+
+    def recall(self, compliance: Message) -> None:
+        """Continue from the last message of a level that was restarted."""
+        self.id = compliance.id
+        self.selected[:] = compliance.selected
+        for name in ("frame", "wrench", "speed", "guard"):
+            getattr(self, name)[:] = getattr(compliance, name)
+
+
+def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
+    """Return why a task frame (4,), or wrenches (6,) in it, are impossible; `most`: of a contact, N and N m.
+
+    Empty: they are possible.
+    """
+    # Written so that NaN is outside.
+    if not abs(norm(frame) - 1.0) <= MAX_UNIT_ERROR:
+        return f"the task frame's quaternion has length {norm(frame):.3g}; permitted: 1"
+    for wrench in vectors:
+        for (half, what, unit), limit in zip(HALVES, most, strict=True):
+            if not norm(wrench[half]) <= limit:
+                return f"{what} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor: {limit:g}"
+    return ""

@@ -1,0 +1,134 @@
+"""The executor of a level of hybrid motion/force control, between a trajectory level and boards that servo joints."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
+from rack.levels.level import Input, LevelContext, Output, Ports
+from rack.levels.robot import dynamics
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Payload
+from rack.levels.servo import reference
+from rack.levels.servo.reference import Reference
+from rack.levels.systems.force.compliance import ComplianceWatch
+from rack.levels.systems.force.hybrid_law import HybridGains, HybridLaw
+from rack.levels.systems.force.messages import COMPLIANCE, FORCE_STATUS, WRENCH
+from rack.levels.systems.force.wrist_level import WristLevel
+from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.trajectory.boards import JointBoards
+from rack.levels.tables import read_params
+
+LEAD_CYCLES = 2
+"""Cycles from the release that makes a reference to the tick at which it is due: the boards below need it in time."""
+PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
+"""Fields of a reference that are handed on as they are."""
+
+
+class HybridExecutor(WristLevel):
+    """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves for the force.
+
+    A guard that is struck ends the motion: the arm ramps to rest and holds until the level above has another command;
+    axes of force keep their forces. Without a fresh wrench, or while the level above is lost, all axes rest.
+
+    References after that, after the brakes, and after a restart of this board, begin where `status` says that the arm
+    is held. References that go on when axes cease to be of force are followed at the distance that force has left.
+    """
+
+    inputs = {
+        "command": Input(JOINT_REFERENCE, "above.command"),
+        "compliance": Input(COMPLIANCE, "above.compliance"),
+        "wrench": Input(WRENCH, "arm.wrench"),
+        "statuses": Input(JOINT_STATUS, "below.status", many=True),
+        "last_force": Input(FORCE_STATUS, "own.force"),
+    }
+    outputs = {
+        "command": JOINT_REFERENCE,
+        "status": Output(JOINT_STATUS, rests_on="statuses"),
+        "force": Output(FORCE_STATUS, rests_on="wrench"),
+    }
+    params = HybridGains
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        assert cell.wrist is not None, "`misfits` refuses an arm without a sensor"
+        self._watch = ComplianceWatch(cell.wrist.most, context.every)
+        self._law = HybridLaw(cell, read_params(HybridGains, context.params))
+        self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
+        self._boards = JointBoards(context.robot.joints)
+        self._target: Array = cell.home.copy()  # (joints,), rad: commanded last
+        self._moving = np.zeros(len(cell.home))  # (joints,), rad/s: of the motion alone, without that for forces
+        self._still = np.zeros(len(cell.home))
+        self._tick: int | None = None  # of the last cycle
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the level."""
+        for module in (dynamics, reference):
+            module.preload()
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Follow references and forces; report."""
+        if self._tick is None:
+            self._watch.recall(read.last_force)
+            self._tick = tick - self.context.every
+        passed_s, self._tick = (tick - self._tick) * self.context.tick_s, tick
+        if self._boards.update(read.statuses):
+            self._begin(self._boards.position, tick)
+        if read.command.is_new:
+            self._reference.take(read.command.value)
+        self._watch.look(read, tick)
+        write.command.id = tick // self.context.every + 1
+        for name in PASSED:
+            setattr(write.command, name, getattr(read.command.value, name))
+        if self._boards.in_step:
+            self._move(write.command, tick, passed_s)
+        else:
+            write.command.due, self._moving[:] = 0, 0.0
+        self._report(read, write.status)
+        self._report_force(read.compliance.value, write.force)
+
+    def _begin(self, position: Array, tick: int) -> None:
+        """Begin at rest, without a difference from the motion."""
+        self._law.begin()
+        self._target = position.copy()
+        self._reference.start(position, self._still, tick)
+
+    def _move(self, command: Message, tick: int, passed_s: float) -> None:
+        """Write the reference of two cycles later."""
+        watch, reference = self._watch, self._reference
+        motion = reference.rest(tick) if watch.rests else reference.at(tick)
+        payload = Payload(command.payload_mass, command.payload_offset)
+        joints = self._law.step(motion, watch.task, passed_s, payload)
+        command.due = tick + LEAD_CYCLES * self.context.every
+        command.position, command.velocity, command.acceleration, command.inertia, command.load = joints
+        self._target, self._moving[:] = joints.position, motion.velocity
+        if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
+            self._begin(self._target, tick)
+
+    def _report(self, read: Ports, status: Message) -> None:
+        """Show the boards below as one, whose set points are those of this level."""
+        values = [reading.value for reading in read.statuses.values()]
+        status.position = values[0].position
+        status.torque, status.driven = sum(v.torque for v in values), np.any([v.driven for v in values], axis=0)
+        status.target, status.target_velocity = self._target, self._moving
+        status.echo, status.operator = read.command.value.id, max(v.operator for v in values)
+        status.holding, status.stopped = self._reference.holding, not self._boards.in_step
+        status.due = read.command.value.due
+        worst = max(values, key=lambda value: value.error)
+        kept = self._watch.reason if self._boards.in_step else self._boards.awaited
+        resting = State.IDLE if self._reference.holding else State.EXECUTING
+        status.state = State.ERROR if worst.error else State.HOLDING if kept else resting
+        status.error, status.reason = worst.error, worst.reason if worst.error else kept
+
+    def _report_force(self, compliance: Message, force: Message) -> None:
+        watch = self._watch
+        force.echo, force.operator = compliance.id, compliance.operator
+        force.sensed, force.wrench, force.offset = watch.sensed, watch.felt, self._law.offset
+        force.struck, force.axis = watch.struck, watch.axis
+        force.wanted = 0.0 if watch.task is None else watch.task.wanted
+        force.selected = 0 if watch.task is None else watch.task.selected
+        resting = State.IDLE if watch.task is None else State.EXECUTING
+        force.state, force.reason = State.HOLDING if watch.reason else resting, watch.reason

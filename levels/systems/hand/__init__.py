@@ -1,0 +1,31 @@
+"""A hand of fingers driven by pairs of tendons: its plant, and its loops from tendon tension to grasp.
+
+Names are imported on first use: tools that read the messages need not wait for the levels.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rack.backplane.exports import on_first_use
+
+if TYPE_CHECKING:
+    from rack.levels.systems.hand.executor import HandExecutor
+    from rack.levels.systems.hand.finger import FingerExecutor
+    from rack.levels.systems.hand.fingertip_loop import FingertipLoop
+    from rack.levels.systems.hand.grasp import GraspExecutor
+    from rack.levels.systems.hand.joint_loop import JointLoop
+    from rack.levels.systems.hand.tendon_loop import TendonLoop
+
+__all__ = ["FingerExecutor", "FingertipLoop", "GraspExecutor", "HandExecutor", "JointLoop", "TendonLoop"]
+_PLACES = {
+    "rack.levels.systems.hand.executor": ("HandExecutor",),
+    "rack.levels.systems.hand.finger": ("FingerExecutor",),
+    "rack.levels.systems.hand.fingertip_loop": ("FingertipLoop",),
+    "rack.levels.systems.hand.grasp": ("GraspExecutor",),
+    "rack.levels.systems.hand.joint_loop": ("JointLoop",),
+    "rack.levels.systems.hand.tendon_loop": ("TendonLoop",),
+}
+
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+    __getattr__ = on_first_use(__name__, _PLACES)

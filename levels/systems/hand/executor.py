@@ -1,0 +1,180 @@
+"""The executor of a board of a hand: gives its valves the tensions of the boards above, or closes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.message import Message, State
+from rack.backplane.watch.alarms import Alarm
+from rack.backplane.words import Demand
+from rack.levels.arm import poses, substeps
+from rack.levels.errors import LevelError
+from rack.levels.faults import TendonStep
+from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Verdict
+from rack.levels.messages import ARM_STATE, Error
+from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.robot.cell import build_cell
+from rack.levels.servo.driver import SCENES
+from rack.levels.systems.hand.messages import HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.simulated import HandSample, SimulatedHand
+from rack.levels.systems.hand.slack_monitor import SlackMonitor
+from rack.levels.systems.hand.tensions import Tensions
+from rack.levels.tables import Table
+
+HELD = "held by the operator: valves closed; `resume` opens them"
+DEMANDED = "demand '{}' on the hand: valves closed until boards and emergency stop are in order"
+
+
+class HandExecutor(Executor):
+    """Drives a hand with the tensions of the boards above: all of its tendons, or none.
+
+    A hand has no brakes, and one that lets go is not safe either. So on a demand, an emergency stop too, on an
+    operator's HOLD, while a board above is lost or late, and while a tension is NaN, the valves close: the grip is kept
+    and moving fingers come to rest, see `SimulatedHand`. They open when all boards above have seen it, with what these
+    want then.
+    """
+
+    inputs = {
+        "tensions": Input(TENSION_COMMAND, "above.command", many=True),
+        "before": Input(ARM_STATE, "own.state"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"status": HAND_STATUS, "state": ARM_STATE, "scene": SCENES}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    params = Table
+    faults = (TendonStep,)
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        if cell.hand is None:
+            raise LevelError("robot.hand is missing: this board drives a hand")
+        self.hand = SimulatedHand(cell, context.scene, context.clock_ns, context.every, context.seed)
+        self.tensions = Tensions(context, cell.hand, cell.patience)
+        self.orders = Orders(self.commands)
+        self._started = False  # the first cycle has begun
+        self._closed_at: int | None = 0  # tick of the first status that said so; None: the valves are open
+        self._opened = False  # the valves have been open on this board, or before it was restarted
+        self._waiting = ""  # why the boards above do not drive the hand; empty: they do
+        self._wrong: Alarm | None = None  # last cycle's finding about a tension
+        self._slack = SlackMonitor(cell.hand, context.robot.joints)
+        self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
+        self._shown: tuple[Any, ...] | None = None  # what seldom changes, in the last status
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the plant."""
+        for module in (substeps, poses):
+            module.preload()
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield every joint that not exactly one board above drives: the one of its finger, or the one of all."""
+        hand = context.robot.hand
+        if hand is None:
+            yield "executor", f"{cls.__module__}:{cls.__name__}", "this board drives a hand; [robot.hand] is missing"
+            return
+        owners = {joint: finger.name for finger in hand.finger for joint in finger.joints}
+        for joint in context.robot.joints:
+            boards = [other.board for other in above if other.params.get("finger", owners[joint]) == owners[joint]]
+            if len(boards) != 1:
+                by = ", ".join(f"'{board}'" for board in boards) or "none"
+                why = f"joint '{joint}' must be commanded by one board; it is commanded by {by}"
+                yield "above", [other.board for other in above], why
+
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Replace the torn tendons; one of a joint that the hand lacks has no effect."""
+        joints = np.arange(len(self.hand.hand.arms))
+        struck = [(fault.joint < 0) | (joints == fault.joint) for fault in faults]
+        torn = np.zeros((2, len(joints)), dtype=bool)
+        for fault, own in zip(faults, struck, strict=True):
+            torn[int(fault.parameters["side"])] |= own
+        self.hand.tear(torn)
+        self._torn = {place: True for place, own in enumerate(struck) if own.any()}
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
+        hand = self.hand
+        was_struck = hand.struck > 0
+        self._catch_up(read.before.value if read.before.is_there else None, tick)
+        if hand.contact is not None and not was_struck:
+            self.findings.append(Finding(Alarm.COLLISION, *hand.contact))
+        if read.operator.verdict is Verdict.NEW:
+            self.orders.take(read.operator)
+        sample = hand.sense()
+        self.findings += self._slack.look(sample.tension, hand.wanted)
+        self.acted |= self._torn
+        self._drive(read, tick)
+        self._report(write.status, sample, tick)
+        self.orders.report(write.status, self.tensions.rests_on)
+        hand.save(write.state)
+        if SCENES.is_due(tick, self.context.every, self.context.phase):
+            hand.look(write.scene)
+
+    def _catch_up(self, before: Message | None, tick: int) -> None:
+        """Advance the hand to `tick`. A restarted board first restores it."""
+        if not self._started:
+            self._started = True
+            if before is not None:
+                self.hand.restore(before)
+                self._opened = True
+            self._closed_at = tick
+        self.hand.step(tick - self.hand.tick)
+        if self.hand.braked and self._closed_at is None:  # no tensions came in time
+            self._closed_at = tick
+
+    def _drive(self, read: Ports, tick: int) -> None:
+        """Give the valves the tensions of the boards above, or close them and say why."""
+        since = 0 if self._closed_at is None or not self._opened else self._closed_at
+        missing = self.tensions.missing(read.tensions, tick, since)
+        found, refused = None, ""
+        if not missing:
+            self.tensions.join(read.tensions)
+            found, refused = self.tensions.check()
+            self._find(found)
+        held = self.orders.standing is Operation.HOLD
+        demanded = DEMANDED.format(self.demand.name.lower()) if self.demand is not Demand.NONE else ""
+        self._waiting = demanded or missing or refused or (HELD if held else "")
+        if self._waiting:
+            if self._closed_at is None:
+                self._closed_at = tick
+            self.hand.close()
+            if held:
+                self.orders.done()
+        else:
+            self._closed_at, self._opened = None, True
+            self.hand.pull(self.tensions.tension)
+
+    def _find(self, found: Finding | None) -> None:
+        """Report a tension that is not as it should be, once an episode."""
+        if found is not None:
+            self.hand.clipped += 1
+            if found.alarm is not self._wrong:
+                self.findings.append(found)
+        self._wrong = None if found is None else found.alarm
+
+    def _report(self, status: Message, sample: HandSample, tick: int) -> None:
+        """Fill the status; the fields that seldom change only when they do."""
+        hand = self.hand
+        status.tick, status.position, status.velocity = tick, sample.position, sample.velocity
+        status.torque, status.tension, status.force = sample.torque, sample.tension, sample.force
+        status.wanted = hand.wanted
+        counts = hand.clipped, hand.touches, hand.violations, hand.pushed
+        shown = self._waiting, self._opened, self.demand, counts, hand.fault, self._slack.note
+        if shown == self._shown:
+            return
+        self._shown = shown
+        closed = bool(self._waiting)
+        status.holding, status.stopped, status.demand = closed, closed and self._opened, self.demand
+        status.clipped, status.touches, status.violations, status.pushed = counts
+        if hand.fault:
+            status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, hand.fault
+            return
+        status.state = State.EXECUTING if not closed else State.HOLDING if self._opened else State.IDLE
+        status.error = Error.LIMIT if hand.violations else Error.TOUCHED if hand.touches else Error.NONE
+        status.reason = self._waiting or hand.first_violation or hand.first_touch or self._slack.note

@@ -1,0 +1,275 @@
+"""The grasp loop: does a program of steps, from the open hand around an object to the open hand again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
+from rack.levels.errors import Refused
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
+from rack.levels.messages import WORLD_MODEL, Error
+from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.planning.pose import Pose
+from rack.levels.robot.cell import build_cell
+from rack.levels.systems.hand.fingers_below import FingersBelow
+from rack.levels.systems.hand.grasp_program import (
+    CloseStep,
+    GraspProgram,
+    Posture,
+    PreshapeStep,
+    ShiftStep,
+    SqueezeStep,
+    Step,
+)
+from rack.levels.systems.hand.grasp_steps import WORKS, Grasp, GraspParams, StepWork
+from rack.levels.systems.hand.grip import HandGrip
+from rack.levels.systems.hand.kinematics import FingerKinematics
+from rack.levels.systems.hand.messages import FINGER_STATUS, GRASP_STATUS, GRASP_TARGET, GraspKind
+from rack.levels.systems.hand.plan_message import GRASP_PLAN
+from rack.levels.tables import read_params
+
+PLANNED = "planned"
+"""Name of the posture of a plan."""
+NO_WORLD = "no world model: waiting for where the object is"
+NO_PLAN = "no plan of the grasp yet: waiting for one from '{}'"
+
+
+class GraspExecutor(Executor):
+    """Does the steps of a program in their order; the fingers keep what they do while it waits.
+
+    It waits while a finger does not follow, and on an operator's hold; then the step under way goes on. A step that
+    fails, or waits for too long, ends the program with an error: the fingers stay. With a planner above, the posture
+    before a CLOSE, its points and the grip after it are those of the newest plan. After a restart it continues from its
+    own last messages.
+    """
+
+    inputs = {
+        "fingers": Input(FINGER_STATUS, "below.status", many=True),
+        "world": Input(WORLD_MODEL, "world.model"),
+        "plan": Input(GRASP_PLAN, "above.plan", many=True, optional=True),
+        "last_command": Input(GRASP_TARGET, "own.command"),
+        "last_status": Input(GRASP_STATUS, "own.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"command": Output(GRASP_TARGET, rests_on="fingers"), "status": Output(GRASP_STATUS, rests_on="fingers")}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    params = GraspParams
+    program = GraspProgram
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        assert cell.hand is not None, "checked with the config"
+        self._program = GraspProgram.model_validate(dict(context.task))
+        kinematics = FingerKinematics(cell, cell.hand)
+        self._from_world = kinematics.palm.inverse()  # from the world's frame into the palm's
+        self._orders = Orders(self.commands)
+        names, params = cell.hand.names, read_params(GraspParams, context.params)
+        self._opposing = names.index(self._program.opposing)
+        self._grasp = Grasp(
+            params=params,
+            names=names,
+            joints=context.robot.joints,
+            postures={name: self._posture(given) for name, given in self._program.posture.items()},
+            period_s=context.period_s,
+            fingers=FingersBelow(context, kinematics.joints),
+            target=Message(GRASP_TARGET.dtype(context.sizes)),
+            grip=HandGrip(params, np.full(len(names), False), self._opposing, context.period_s),
+            touching=np.full(len(names), False),
+        )
+        self._work: StepWork | None = None  # on the step under way
+        self._done = 0  # steps that are done
+        self._passed_s = 0.0  # since the step under way began, without waiting
+        self._waited_s = 0.0  # in a row, other than for an operator
+        self._failed = Refused(Error.NONE, "")
+        self._plan = Message(GRASP_PLAN.dtype(context.sizes))  # in use; id 0: none
+        self._tick: int | None = None  # of the last cycle
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield a robot without a hand, and every finger that not exactly one board below drives."""
+        hand = context.robot.hand
+        if hand is None:
+            yield "executor", cls.__name__, "it drives a hand; there is no [robot.hand]"
+            return
+        names = [finger.name for finger in hand.finger]
+        for name in names:
+            boards = [board.board for board in below if board.params.get("finger", name) == name]
+            if len(boards) != 1:
+                by = ", ".join(f"'{board}'" for board in boards) or "none"
+                yield "below", list(context.below), f"finger '{name}' needs one board that drives it; it has: {by}"
+        steps = GraspProgram.model_validate(dict(context.task)).step
+        if not above and any(isinstance(step, CloseStep) and not step.points for step in steps):
+            yield "above", [], "a step 'close' without points needs a planner of grasps there"
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Look at fingers and object, go on with the step under way, write what is wanted, report."""
+        grasp = self._grasp
+        self._orders.take(read.operator)
+        grasp.fingers.look(read.fingers)
+        if read.world.is_there and read.world.value.revision:
+            self._see(read.world.value)
+        if self._tick is None:
+            self._recall(read)
+        self._tick = tick
+        waits = self._waits(read)
+        self._count_waiting(waits)
+        if not waits and not self._failed.code and self._done < len(self._program.step):
+            self._go_on(read)
+        if waits or self._failed.code:
+            grasp.target.velocity = grasp.target.tip_velocity = 0.0
+        target = write.command
+        grasp.target.id += 1
+        grasp.target.operator = self._orders.rests_on(0)
+        target.copy_from(grasp.target)
+        self._report(write.status, waits)
+
+    def _see(self, world: Message) -> None:
+        """Find the object in the world model."""
+        close = self._closing()
+        if close is not None:
+            row = self.context.scene.objects.index(close.object)
+            self._grasp.object = self._from_world @ Pose(world.position[row], world.quaternion[row])
+
+    def _posture(self, posture: Posture) -> Array:
+        """Return a posture of all fingers as one of all joints, (joints,), rad."""
+        hand, joints = self.context.robot.hand, self.context.robot.joints
+        assert hand is not None
+        position = np.zeros(len(joints))
+        for finger in hand.finger:
+            position[[joints.index(joint) for joint in finger.joints]] = posture[finger.name]
+        return position
+
+    def _closing(self) -> CloseStep | None:
+        """Return the newest step that has closed, or closes, on an object; None: there is none yet."""
+        steps = self._program.step[: self._done + 1]
+        return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
+
+    def _waits(self, read: Ports) -> str:
+        """Return why the step under way does not go on; empty: it does."""
+        if self._grasp.fingers.awaited:
+            return self._grasp.fingers.awaited
+        if self._orders.standing is Operation.HOLD:
+            self._orders.done()
+            return self._orders.keeps(self.context.board)
+        if read.world.is_lost or (self._closing() is not None and self._grasp.object is None):
+            return NO_WORLD
+        if read.plan and not self._newest(read.plan).id and self._awaits_plan():
+            return NO_PLAN.format(", ".join(read.plan))
+        return ""
+
+    def _count_waiting(self, waits: str) -> None:
+        """Fail when something has kept the program for too long."""
+        is_over = self._done == len(self._program.step) or self._orders.standing is Operation.HOLD
+        self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
+        if self._waited_s > self._grasp.params.stalled and not self._failed.code:
+            self._failed = Refused(Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}")
+
+    @staticmethod
+    def _newest(plans: Mapping[str, Reading]) -> Message:
+        return max([reading.value for reading in plans.values()], key=lambda plan: plan.id)
+
+    def _awaits_plan(self) -> bool:
+        """Return whether the step under way is to be planned: a CLOSE, or a PRESHAPE before it."""
+        kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
+        return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
+
+    def _go_on(self, read: Ports) -> None:
+        """Begin the step under way, or go on with it."""
+        if self._work is None:
+            if read.plan and self._awaits_plan() and not self._passed_s:
+                self._plan.copy_from(self._newest(read.plan))
+            self._begin()
+        assert self._work is not None
+        try:
+            done = self._work.do(self._passed_s)
+        except Refused as failure:
+            self._failed = failure
+            return
+        self._passed_s += self.context.period_s
+        if done:
+            self._work, self._passed_s = None, 0.0
+            self._done += 1
+
+    def _begin(self) -> None:
+        """Begin a step, for the first time or after a restart."""
+        grasp, step = self._grasp, self._prepared(self._done)
+        if isinstance(step, CloseStep):
+            self._take_up(step)
+            if not self._passed_s:
+                grasp.touching[:] = False
+        grasp.target.active = True
+        self._work = WORKS[type(step)](grasp, step, self._passed_s)
+
+    def _take_up(self, close: CloseStep) -> None:
+        """Grip by a CLOSE from now on."""
+        grasp, gripping = self._grasp, np.array([name in close.points for name in self._grasp.names])
+        grasp.close, grasp.base = close, 0.0
+        grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
+
+    def _prepared(self, index: int) -> Step:
+        """Return a step of the program with what the plan says, and with ways in the frame of the palm."""
+        step, plan = self._program.step[index], self._plan
+        if isinstance(step, ShiftStep):
+            turned = np.zeros(3)
+            mujoco.mju_rotVecQuat(turned, np.array(step.by), self._from_world.quaternion)
+            return step.model_copy(update={"by": tuple(turned)})
+        if not plan.id:
+            return step
+        if isinstance(step, CloseStep):
+            inside = plan.contact + step.depth * plan.normal
+            points = {name: tuple(point) for name, point in zip(self._grasp.names, inside, strict=True)}
+            return step.model_copy(update={"points": points})
+        after = self._program.step[index - 1] if isinstance(step, SqueezeStep) else None
+        if isinstance(after, CloseStep):
+            return step.model_copy(update={"grip": float(plan.grip)})
+        if isinstance(step, PreshapeStep) and self._awaits_plan():
+            self._grasp.postures[PLANNED] = plan.posture.copy()
+            return step.model_copy(update={"posture": PLANNED})
+        return step
+
+    def _recall(self, read: Ports) -> None:
+        """Continue after a restart, from the level's own last messages."""
+        status, grasp = read.last_status.value, self._grasp
+        if not (read.last_status.is_there and read.last_command.is_there):
+            return
+        grasp.target.copy_from(read.last_command.value)
+        self._done, self._passed_s = status.step, status.passed
+        if status.plan and read.plan:
+            self._plan.copy_from(self._newest(read.plan))
+        for index in range(min(self._done + 1, len(self._program.step))):
+            step = self._prepared(index)
+            if isinstance(step, CloseStep):
+                self._take_up(step)
+            elif isinstance(step, SqueezeStep):
+                grasp.base = step.grip if index < self._done else status.grip
+        grasp.grip.force, grasp.grip.load[:] = status.grip, status.load
+        grasp.touching[:], grasp.anchor[:] = status.touching, status.anchor
+        grasp.moved, grasp.farthest = status.moved, status.farthest
+        if status.state == State.ERROR:
+            self._failed = Refused(status.error, status.reason)
+
+    def _report(self, status: Message, waits: str) -> None:
+        grasp, steps = self._grasp, self._program.step
+        status.echo, status.step, status.steps = grasp.target.id, self._done, len(steps)
+        status.kind = GraspKind.NONE if self._work is None else self._work.kind
+        status.passed, status.touching, status.grip = self._passed_s, grasp.touching, grasp.grip.force
+        status.object = -1 if grasp.close is None else self.context.scene.objects.index(grasp.close.object)
+        status.load, status.anchor, status.plan = grasp.grip.load, grasp.anchor, self._plan.id
+        status.moved, status.farthest = grasp.moved, grasp.farthest
+        status.error = self._failed.code or grasp.fingers.error
+        status.reason = str(self._failed) or waits
+        if status.error:
+            status.state = State.ERROR
+        elif self._done == len(steps):
+            status.state = State.DONE if steps else State.IDLE
+        else:
+            status.state = State.HOLDING if waits else State.EXECUTING
+        self._orders.report(status, grasp.fingers.rests_on)

@@ -1,0 +1,159 @@
+"""Plans grasps: where the tips of a hand take hold of an object, one finger opposed to all others, and from where.
+
+The fingers press along one line, from one side, the opposing finger from the other. Lines in all directions across the
+fingers' knuckles are tried. Rays give contacts on the object's surface, inverse kinematics the joints. A line is
+possible if all tips reach their contacts, and if the hand touches nothing before; of those the one counts whose joints
+are farthest from the ends of their ranges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from pydantic import Field
+
+from rack.levels.algebra import Array, norm, transposed_mat_vec
+from rack.levels.errors import LevelError
+from rack.levels.robot.cell import Cell
+from rack.levels.systems.hand.kinematics import FingerKinematics
+from rack.levels.tables import NotNegative, Positive, Table
+
+LINES = 72
+"""Directions tried."""
+STEPS = 60
+"""Most steps of inverse kinematics to a point."""
+STEP_M = 0.02
+"""Longest way of a tip in such a step."""
+REACHED_M = 0.001
+OUTSIDE_M = 0.2
+"""Distance from the object at which rays begin."""
+
+
+class GraspRules(Table):
+    """What a planned grasp is to be."""
+
+    pad: Positive = Field(0.009, description="distance of a tip's site from the surface that the tip touches, m")
+    clear: Positive = Field(0.02, description="distance from the object at which tips begin to close, m")
+    pull: NotNegative = Field(
+        2.0, description="force on the object, in addition to its weight, that friction must bear, N"
+    )
+    reserve: Positive = Field(1.5, ge=1.0, description="by how much more it could bear")
+
+
+@dataclass(frozen=True)
+class PlannedGrasp:
+    """A grasp. Points and directions are in the object's frame, a row for each finger."""
+
+    contact: Array  # (fingers, 3), m, on the surface
+    normal: Array  # (fingers, 3), directions of the tips' forces
+    posture: Array  # (joints,), rad, from which the fingers close
+    grip: float  # N, force of each finger but the opposing one
+    margin: float  # least distance of a joint from the ends of its range, in parts of the range
+
+
+class GraspPlanner:
+    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError` without one."""
+
+    def __init__(self, cell: Cell, opposing: str, rules: GraspRules) -> None:
+        assert cell.hand is not None, "a cell with a hand"
+        names = cell.hand.names
+        if opposing not in names:
+            raise LevelError(f"params.opposing = {opposing}: the hand has no such finger; fingers: {', '.join(names)}")
+        self._cell, self._rules, self._kinematics = cell, rules, FingerKinematics(cell, cell.hand)
+        self._data, self._opposing = cell.start(), names.index(opposing)
+        self._palm = self._data.site_xmat[cell.tool].reshape(3, 3).copy()
+        self._origin = self._data.site_xpos[cell.tool].copy()
+        bases = [int(np.flatnonzero(row)[0]) for row in cell.hand.fingers]
+        self._bases = [self._data.xanchor[self._joint(base)].copy() for base in bases]  # (3,), m, of each finger
+
+    def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
+        """Return a grasp of the object in a row of the scene at a pose in the world; None if no line is possible."""
+        self._place(row, position, quaternion)
+        found = (self._along(row, 2.0 * math.pi * number / LINES) for number in range(LINES))
+        return max((one for one in found if one is not None), key=lambda one: one.margin, default=None)
+
+    def _place(self, row: int, position: Array, quaternion: Array) -> None:
+        at = self._cell.object_qpos[row]
+        self._data.qpos[at : at + 7] = *position, *quaternion
+        self._data.qpos[self._cell.qpos] = self._cell.home
+        mujoco.mj_kinematics(self._cell.model, self._data)
+
+    def _along(self, row: int, angle: float) -> PlannedGrasp | None:
+        """Return the grasp along one line across the palm, if it is possible."""
+        across, out = self._palm[:, 0], self._palm[:, 2]
+        line = math.cos(angle) * across + math.sin(angle) * out
+        contact, normal = np.zeros((2, len(self._bases), 3))
+        for finger, base in enumerate(self._bases):
+            way = -line if finger != self._opposing else line
+            touched = self._touched(row, base, way)
+            if touched is None:
+                return None
+            contact[finger], normal[finger] = touched, way
+        closed = self._reach(contact - self._rules.pad * normal)
+        open_ = None if closed is None else self._reach(contact - self._rules.clear * normal, closed)
+        if closed is None or open_ is None or self._touches(open_):
+            return None
+        low, high = self._cell.limits.position.T
+        margin = float((np.minimum(closed - low, high - closed) / (high - low)).min())
+        body = self._cell.bodies[row]
+        turned, origin = self._data.xmat[body].reshape(3, 3), self._data.xpos[body]
+        return PlannedGrasp(
+            contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
+            normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
+            posture=open_,
+            grip=self._grip(row),
+            margin=margin,
+        )
+
+    def _touched(self, row: int, base: Array, way: Array) -> Array | None:
+        """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it does not."""
+        model, data, body = self._cell.model, self._data, self._cell.bodies[row]
+        along = self._palm[:, 1]  # the knuckles' line
+        centre = data.xipos[body]
+        centre = centre + float(((base - centre) * along).sum()) * along
+        start, nearest = centre - OUTSIDE_M * way, math.inf
+        for own in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+            if not model.geom_contype[own]:
+                continue
+            size, kind = model.geom_size[own], int(model.geom_type[own])
+            distance = mujoco.mju_rayGeom(data.geom_xpos[own], data.geom_xmat[own], size, start, way, kind, None)
+            nearest = min(nearest, distance if distance >= 0.0 else math.inf)
+        return None if nearest > OUTSIDE_M else start + nearest * way
+
+    def _reach(self, tips: Array, start: Array | None = None) -> Array | None:
+        """Return joint positions, (joints,), rad, at which the tips are at points of the world, (fingers, 3), m."""
+        kinematics = self._kinematics
+        position = (self._cell.home if start is None else start).copy()
+        wanted = [transposed_mat_vec(self._palm, point - self._origin) for point in tips]
+        for _ in range(STEPS):
+            kinematics.look(position)
+            ways = [point - kinematics.tip(finger) for finger, point in enumerate(wanted)]
+            lengths = [norm(way) for way in ways]
+            if max(lengths) < REACHED_M:
+                return position
+            for finger, (way, length) in enumerate(zip(ways, lengths, strict=True)):
+                homing = np.zeros(len(kinematics.joints[finger]))
+                kinematics.step(finger, position, way * min(1.0, STEP_M / max(length, STEP_M)), homing)
+        return None
+
+    def _touches(self, position: Array) -> bool:
+        """Return whether the hand touches anything at joint positions, also itself."""
+        model, data = self._cell.model, self._data
+        data.qpos[self._cell.qpos] = position
+        mujoco.mj_fwdPosition(model, data)
+        hand = np.isin(data.contact.geom, self._cell.gripper_geoms).any(axis=1)
+        return bool((hand & (data.contact.dist < 0.0)).any())
+
+    def _grip(self, row: int) -> float:
+        """Return the force of each finger, N, with which friction on both sides bears weight and pull."""
+        model, body = self._cell.model, self._cell.bodies[row]
+        first = model.body_geomadr[body]
+        friction = float(model.geom_friction[first : first + model.body_geomnum[body], 0].max())
+        weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
+        return self._rules.reserve * (weight + self._rules.pull) / (2.0 * friction * (len(self._bases) - 1))
+
+    def _joint(self, number: int) -> int:
+        return int(np.flatnonzero(self._cell.model.jnt_qposadr == self._cell.qpos[number])[0])

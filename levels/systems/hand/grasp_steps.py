@@ -1,0 +1,307 @@
+"""The steps of a grasp at work: from what is sensed of fingers and object, what is wanted of the fingers next.
+
+A step is begun once, and again after a restart of its board: from where the fingers are, with the time that it was
+under way. Its `do` returns whether it is done, and raises `Refused` when it has failed.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array, norm
+from rack.levels.errors import Refused
+from rack.levels.messages import Error
+from rack.levels.planning.pose import Pose
+from rack.levels.systems.hand.fingers_below import FingersBelow
+from rack.levels.systems.hand.grasp_program import (
+    CloseStep,
+    HoldStep,
+    PreshapeStep,
+    ReleaseStep,
+    ShiftStep,
+    SqueezeStep,
+    Step,
+)
+from rack.levels.systems.hand.grip import GripGains, HandGrip
+from rack.levels.systems.hand.messages import FingerMode, GraspKind
+from rack.levels.tables import Positive, Table
+
+SLIPPED_PART = 0.2
+"""Part of the force at which a tip touched, below which it touches no more."""
+
+
+class GraspParams(GripGains):
+    """`[board.<name>.params]` of a grasp loop."""
+
+    astray: Positive = Field(0.03, description="distance from a posture at which a joint has reached it, rad")
+    patience: Positive = Field(1.0, description="time in excess of its own after which a step has failed, s")
+    stalled: Positive = Field(
+        60.0, description="time of waiting, other than for an operator, that fails the program, s"
+    )
+    lost: Positive = Field(0.2, description="time without touch after which a finger has lost the object, s")
+    tolerance: Positive = Field(0.02, description="distance of a gripped object from its place: it is lost, m")
+
+
+@dataclass
+class Grasp:
+    """What the steps share: the fingers as sensed, the object, and what is wanted. Points are in the palm's frame."""
+
+    params: GraspParams
+    names: tuple[str, ...]  # of the fingers
+    joints: tuple[str, ...]
+    postures: dict[str, Array]  # (joints,), rad, by name
+    period_s: float
+    fingers: FingersBelow
+    target: Message  # the `GRASP_TARGET` that the steps fill
+    grip: HandGrip
+    touching: NDArray[np.bool_]  # (fingers,)
+    close: CloseStep | None = None  # by which the object was, or is, gripped
+    base: float = 0.0  # N: the grip wanted without a load
+    object: Pose | None = None  # as sensed
+    anchor: Array = field(default_factory=lambda: np.zeros(3))  # m: where the object is to be
+    moved: float = 0.0  # m: distance of the object from there
+    farthest: float = 0.0  # m: largest such distance since it was gripped
+
+    @property
+    def object_at(self) -> Array:
+        """Where the object is, (3,), m."""
+        return self.anchor if self.object is None else self.object.position
+
+
+class StepWork(ABC):
+    """A step at work, begun `passed_s` after it began first."""
+
+    kind: GraspKind
+
+    def __init__(self, grasp: Grasp, step: Any, passed_s: float) -> None:
+        self.grasp, self.step, self.begun_s = grasp, step, passed_s
+
+    @abstractmethod
+    def do(self, passed_s: float) -> bool:
+        """Fill the target, `passed_s` after the step began; return whether it is done."""
+
+    def progress(self, passed_s: float) -> tuple[float, float]:
+        """Return the part of what was left at the beginning that is done by now, 0 to 1, and its rate, 1/s."""
+        part, rate = least_jerk(passed_s / self.step.seconds)
+        before, _ = least_jerk(self.begun_s / self.step.seconds)
+        if before >= 1.0:
+            return 1.0, 0.0
+        return (part - before) / (1.0 - before), rate / self.step.seconds / (1.0 - before)
+
+
+def least_jerk(time: float) -> tuple[float, float]:
+    """Return the way, 0 to 1, at `time`, 0 to 1, of the motion of least jerk (Flash and Hogan, 1985), and its rate."""
+    x = min(max(time, 0.0), 1.0)
+    return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x), 30.0 * x * x * (1.0 - x) * (1.0 - x)
+
+
+class PreshapeWork(StepWork):
+    """Brings all joints to a posture; done when they are there."""
+
+    kind = GraspKind.PRESHAPE
+    step: PreshapeStep
+
+    def __init__(self, grasp: Grasp, step: PreshapeStep, passed_s: float) -> None:
+        super().__init__(grasp, step, passed_s)
+        self._start, self._posture = grasp.fingers.target.copy(), grasp.postures[step.posture]
+
+    def do(self, passed_s: float) -> bool:
+        """Move the joints."""
+        grasp, target = self.grasp, self.grasp.target
+        part, rate = self.progress(passed_s)
+        way = self._posture - self._start
+        target.mode, target.force = FingerMode.JOINTS, 0.0
+        target.position, target.velocity = self._start + part * way, rate * way
+        away = np.abs(grasp.fingers.position - self._posture)
+        if part < 1.0 or bool((away < grasp.params.astray).all()):
+            return part >= 1.0
+        if passed_s > self.step.seconds + grasp.params.patience:
+            joint = int(away.argmax())
+            far = f"joint '{grasp.joints[joint]}' is {away[joint]:.2g} rad from posture '{self.step.posture}'"
+            raise Refused(Error.FOLLOWING, f"{far}: it is in the way of something, or too weak")
+        return False
+
+
+class CloseWork(StepWork):
+    """Moves tips evenly towards points in the object, until each touches it; one that touches stays, and presses."""
+
+    kind = GraspKind.CLOSE
+    step: CloseStep
+
+    def __init__(self, grasp: Grasp, step: CloseStep, passed_s: float) -> None:
+        super().__init__(grasp, step, passed_s)
+        self._start = grasp.fingers.tip.copy()
+        self._ways = np.zeros_like(self._start)  # (fingers, 3), m
+        for name, point in step.points.items():
+            finger = grasp.names.index(name)
+            assert grasp.object is not None, "a step has begun without a world model"
+            inside = grasp.object @ Pose(np.array(point), np.array([1.0, 0.0, 0.0, 0.0]))
+            self._ways[finger] = inside.position - self._start[finger]
+        self._seconds = max(norm(way) for way in self._ways) / step.speed
+        self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])  # N: with which the opposing one presses
+
+    def do(self, passed_s: float) -> bool:
+        """Move the tips."""
+        grasp, target, closing = self.grasp, self.grasp.target, self.grasp.grip.fingers
+        part = min((passed_s - self.begun_s) / self._seconds, 1.0)
+        for finger in np.flatnonzero(closing & ~grasp.touching).tolist():
+            way = self._ways[finger]
+            if norm(grasp.fingers.force[finger]) >= self.step.touch:
+                grasp.touching[finger] = True
+                self._stay(finger, grasp.grip.shares[finger] * self._touch * way / norm(way))
+            else:
+                target.mode[finger] = FingerMode.POINT
+                target.tip[finger] = self._start[finger] + part * way
+                target.tip_velocity[finger] = way / self._seconds if part < 1.0 else 0.0
+        missing = [grasp.names[finger] for finger in np.flatnonzero(closing & ~grasp.touching)]
+        at_the_end = passed_s - self.begun_s > self._seconds + grasp.params.patience
+        if missing and (at_the_end or passed_s > self.step.seconds):
+            raise Refused(Error.GRASP_MISSED, f"missed '{self.step.object}': touched nothing: {', '.join(missing)}")
+        grasp.base = grasp.grip.force = self._touch
+        return not missing
+
+    def _stay(self, finger: int, force: Array) -> None:
+        """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
+        target, grasp = self.grasp.target, self.grasp
+        target.mode[finger], target.stiffness[finger] = FingerMode.FORCE, grasp.grip.stiffness[finger]
+        target.tip[finger], target.tip_velocity[finger] = grasp.fingers.tip[finger], 0.0
+        target.force[finger] = force
+
+
+class GrippingWork(StepWork):
+    """Base of the steps while the fingers have the object: they keep the grip, and notice when it is lost."""
+
+    def __init__(self, grasp: Grasp, step: Step, passed_s: float) -> None:
+        super().__init__(grasp, step, passed_s)
+        self._silent_s = np.zeros(len(grasp.names))  # (fingers,), s: time for which one has not touched
+
+    def keep(self) -> None:
+        """Press with the grip that the load asks for; raises `Refused` when the object is lost."""
+        grasp, fingers = self.grasp, self.grasp.fingers
+        away = grasp.object_at - grasp.anchor
+        grasp.moved = norm(away)
+        grasp.farthest = max(grasp.farthest, grasp.moved)
+        grasp.grip.follow(grasp.target.tip, fingers.tip)
+        grasp.grip.recover(away)
+        grasp.grip.adapt(grasp.base, fingers.force)
+        self.press()
+
+    def press(self) -> None:
+        """Press with the grip as it is; raises `Refused` when the object is lost."""
+        self.grasp.target.force = self.grasp.grip.forces(self.grasp.fingers.tip)
+        self._notice()
+
+    def _notice(self) -> None:
+        grasp, params, close = self.grasp, self.grasp.params, self.grasp.close
+        assert close is not None, "checked with the program"
+        silent = np.array([norm(force) < SLIPPED_PART * close.touch for force in grasp.fingers.force])
+        self._silent_s[:] = np.where(silent, self._silent_s + grasp.period_s, 0.0)
+        grasp.touching[:] = grasp.grip.fingers & (self._silent_s < params.lost)
+        without = [grasp.names[finger] for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching)]
+        if without:
+            raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': no longer touched by {', '.join(without)}")
+        if grasp.moved > params.tolerance:
+            far = f"{1e3 * grasp.moved:.1f} mm from its place; permitted: {1e3 * params.tolerance:g} mm"
+            raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': {far}")
+
+
+class SqueezeWork(GrippingWork):
+    """Raises the grip. The object settles between the fingers meanwhile: its place is where it is afterwards."""
+
+    kind = GraspKind.SQUEEZE
+    step: SqueezeStep
+
+    def __init__(self, grasp: Grasp, step: SqueezeStep, passed_s: float) -> None:
+        super().__init__(grasp, step, passed_s)
+        self._from = grasp.base
+
+    def do(self, passed_s: float) -> bool:
+        """Squeeze."""
+        part, _ = self.progress(passed_s)
+        self.grasp.anchor[:] = self.grasp.object_at
+        self.grasp.base = self.grasp.grip.force = self._from + part * (self.step.grip - self._from)
+        self.press()
+        return part >= 1.0
+
+
+class ShiftWork(GrippingWork):
+    """Moves the place of the object, and the points of the tips with it; `by` is a way in the palm's frame."""
+
+    kind = GraspKind.SHIFT
+    step: ShiftStep
+
+    def __init__(self, grasp: Grasp, step: ShiftStep, passed_s: float) -> None:
+        super().__init__(grasp, step, passed_s)
+        done, _ = least_jerk(passed_s / step.seconds)
+        self._way = (1.0 - done) * np.array(step.by)
+        self._part = 0.0
+
+    def do(self, passed_s: float) -> bool:
+        """Move the object."""
+        grasp, target = self.grasp, self.grasp.target
+        part, rate = self.progress(passed_s)
+        gone, self._part = (part - self._part) * self._way, part
+        grasp.anchor += gone
+        target.tip[grasp.grip.fingers] += gone
+        target.tip_velocity[grasp.grip.fingers] = rate * self._way
+        self.keep()
+        return part >= 1.0
+
+
+class HoldWork(GrippingWork):
+    """Keeps the object where it is."""
+
+    kind = GraspKind.HOLD
+    step: HoldStep
+
+    def do(self, passed_s: float) -> bool:
+        """Keep it."""
+        self.keep()
+        return passed_s >= self.step.seconds
+
+
+class ReleaseWork(StepWork):
+    """Lets the forces fall in the first half of its time; the tips withdraw in the second."""
+
+    kind = GraspKind.RELEASE
+    step: ReleaseStep
+
+    def __init__(self, grasp: Grasp, step: ReleaseStep, passed_s: float) -> None:
+        super().__init__(grasp, step, passed_s)
+        self._force, self._load = grasp.grip.force, grasp.grip.load.copy()
+        self._start, self._out = grasp.fingers.tip.copy(), grasp.grip.outwards(grasp.fingers.tip)
+
+    def do(self, passed_s: float) -> bool:
+        """Let go."""
+        grasp, target, half = self.grasp, self.grasp.target, 0.5 * self.step.seconds
+        if passed_s < half:
+            left = 1.0 - passed_s / half
+            grasp.grip.force, grasp.grip.load[:] = left * self._force, left * self._load
+            target.force = grasp.grip.forces(grasp.fingers.tip)
+            self._start[:] = target.tip
+            return False
+        part, rate = least_jerk(passed_s / half - 1.0)
+        grasp.grip.force, grasp.grip.load[:], grasp.touching[:] = 0.0, 0.0, False
+        for finger in np.flatnonzero(grasp.grip.fingers):
+            way = self.step.way * self._out[finger]
+            target.mode[finger], target.force[finger] = FingerMode.POINT, 0.0
+            target.tip[finger], target.tip_velocity[finger] = self._start[finger] + part * way, rate / half * way
+        return part >= 1.0
+
+
+WORKS: dict[type[Table], type[StepWork]] = {
+    PreshapeStep: PreshapeWork,
+    CloseStep: CloseWork,
+    SqueezeStep: SqueezeWork,
+    ShiftStep: ShiftWork,
+    HoldStep: HoldWork,
+    ReleaseStep: ReleaseWork,
+}
+"""What is at work in a step, by the step's class."""

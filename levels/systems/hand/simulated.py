@@ -1,0 +1,130 @@
+"""The hand in MuJoCo: tendons that pull, behind valves that follow a tension or are closed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.algebra import Array
+from rack.levels.arm.drives import CoarseSensors
+from rack.levels.arm.simulation import Simulation
+from rack.levels.robot.cell import Cell
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
+from rack.levels.tables import SceneConfig
+
+
+class HandSample(NamedTuple):
+    """One sample of a hand's sensors. Positions and velocities are as coarse and noisy as their encoders."""
+
+    position: Array  # (joints,), rad
+    velocity: Array  # (joints,), rad/s
+    torque: Array  # (joints,), N m: of the tendons
+    tension: Array  # (2, joints), N: flexors, extensors
+    force: Array  # (fingers, 3), N: of the surroundings on the tips, in the palm's frame
+
+
+class SimulatedHand(Simulation):
+    """A hand of tendons. It has no brakes: without commands its valves close, and the grip is kept.
+
+    The air in a closed valve is a spring: the tension of its tendon rises by `Hand.closed` with every metre by which
+    the joint pulls at it. So fingers that moved come to rest, and what they held stays held, by the tension with which
+    the valves closed. At the start they are closed with tensions that carry the weight of the open hand.
+    """
+
+    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+        """Start at home. One tick is `clock_ns`, one cycle of commands `every` ticks; `seed` is for random noise."""
+        super().__init__(cell)
+        assert cell.hand is not None, "it is a hand"
+        self.hand = hand = cell.hand
+        # Ticks without a command after which the valves close.
+        self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
+        self.waited = self.patience
+        self._palm = np.array(self._data.site_xmat[cell.tool]).reshape(3, 3)
+        self._start_with(_carrying(cell, self._data))
+        self.begin(scene, clock_ns)
+        pull = hand.closed * hand.arms
+        self._spring = np.stack((-pull, pull))  # (2, joints), N/rad: of closed valves
+        self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._before = np.zeros(len(hand.arms))
+        acts = cell.model.actuator_actadr[hand.actuators]
+        self._acts = acts if (acts >= 0).all() else None  # (2, joints), tensions behind valves that take time
+
+    def _start_with(self, tension: Array) -> None:
+        """Let the valves have had tensions, (2, joints), N, for ever."""
+        model, d = self.cell.model, self._data
+        for actuator, pull in zip(self.hand.actuators.ravel().tolist(), tension.ravel().tolist(), strict=True):
+            d.ctrl[actuator] = pull
+            if model.actuator_actnum[actuator]:
+                d.act[model.actuator_actadr[actuator]] = pull
+            samples = model.actuator_history[actuator, 0]
+            if samples:
+                mujoco.mj_initCtrlHistory(model, d, actuator, None, np.full((samples, 1), pull))
+        mujoco.mj_forward(model, d)
+
+    @property
+    def wanted(self) -> Array:
+        """Tensions commanded of the valves, (2, joints), N; of closed ones, those that the air in them tends to."""
+        return np.asarray(np.clip(self._data.ctrl[self.hand.actuators], 0.0, self.hand.most))
+
+    def sense(self) -> HandSample:
+        """Return the newest sample; torques, tensions and forces are those of a step ago, as MuJoCo's are."""
+        position, velocity = self._state
+        if self._coarse is not None:
+            position, velocity = self._coarse.sample(position, velocity, self.tick)
+        tension, force = self._data.actuator_force[self.hand.actuators], self._data.sensordata[self.hand.forces]
+        in_palm = (force[:, :, None] * self._palm).sum(axis=1)
+        return HandSample(position, velocity, self._steps.seen[-1, 2], tension, in_palm)
+
+    def pull(self, tension: Array) -> None:
+        """Open the valves, and let them follow tensions, (2, joints), N, which are within the limits."""
+        self.waited, self.braked = 0, False
+        self._data.ctrl[self.hand.actuators] = tension
+
+    def tear(self, torn: NDArray[np.bool_]) -> None:
+        """Let the tendons marked, (2, joints), give no tension, and all others theirs."""
+        self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
+
+    def close(self) -> None:
+        """Close the valves."""
+        self.braked = True
+
+    def step(self, ticks: int) -> None:
+        """Simulate `ticks` ticks. After a fault the hand stands still in its last sound state; time continues."""
+        self.contact = None
+        for _ in range(ticks):
+            self.braked = self.braked or self.waited >= self.patience
+            self.waited += 1
+            if not self.fault:
+                self._simulate()
+            self.tick += 1
+        if self.fault:
+            self._data.time = self._now_s
+
+    def _simulate(self) -> None:
+        """Simulate one tick. Tensions behind closed valves follow the joints at once, and their controls with them.
+
+        The controls may go below 0, where MuJoCo cuts them: a slack tendon is tight again where it became slack.
+        """
+        if not self.braked:
+            return super()._simulate()
+        position, before = self._state[0], self._before
+        before[:] = position
+        super()._simulate()
+        drawn = self._spring * (position - before)
+        self._data.ctrl[self.hand.actuators] += drawn
+        if self._acts is not None:
+            self._data.act[self._acts] = np.maximum(self._data.act[self._acts] + drawn, 0.0)
+        return None
+
+
+def _carrying(cell: Cell, data: mujoco.MjData) -> Array:
+    """Return the tensions, (2, joints), N, that carry the hand's weight where it starts."""
+    hand = cell.hand
+    assert hand is not None, "it is a hand"
+    turn = (data.qfrc_bias - data.qfrc_passive)[cell.dof] / (2.0 * hand.arms)
+    tension = np.zeros((2, len(turn)))
+    tension[FLEXOR], tension[EXTENSOR] = hand.rest + turn, hand.rest - turn
+    return np.clip(tension, hand.least, hand.most)

@@ -1,0 +1,7 @@
+"""Joints servoed by boards of their own: the arm's board gets their torques; a gateway joins them to a level above."""
+
+from rack.levels.systems.joint_boards.arm_executor import ArmExecutor
+from rack.levels.systems.joint_boards.gateway import JointGateway
+from rack.levels.systems.joint_boards.joint_servo import JointServo
+
+__all__ = ["ArmExecutor", "JointGateway", "JointServo"]

@@ -1,0 +1,175 @@
+"""The executor of a board of the arm: gives it the torques of the boards that servo its joints, or brakes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rack.levels.algebra import Array
+from rack.levels.arm import Sensed
+from rack.levels.level import Input, LevelContext, Ports, Reading, Verdict
+from rack.levels.messages import ARM_STATE
+from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.robot.dynamics import Terms
+from rack.levels.servo.control import ArmParams
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.driver import SCENES, ArmDriver
+from rack.levels.servo.reference import ASTRAY_RAD
+from rack.levels.servo.stopping import Reaction
+from rack.levels.systems.joint_boards import joint_torques
+from rack.levels.systems.joint_boards.joint_torques import JointTorques
+from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_TORQUE
+from rack.levels.tables import read_params
+
+HELD = "held by the operator; `resume` releases it"
+
+
+class ArmExecutor(ArmDriver):
+    """Drives an arm with the torques of the boards above: all of its joints, or none.
+
+    While it says `stopped`, these boards bring the joints to rest and hold them; an arm that is still not at rest after
+    the time that this takes is braked. A board that is lost or late brakes the arm. It is released when all boards
+    have seen that it was braked: their torques then hold it where it is. See `ArmDriver`.
+    """
+
+    inputs = {
+        "torques": Input(JOINT_TORQUE, "above.command", many=True),
+        "before": Input(ARM_STATE, "own.state"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    params = ArmParams
+
+    def __init__(self, context: LevelContext, params: ArmParams | None = None) -> None:
+        super().__init__(context, read_params(ArmParams, context.params) if params is None else params)
+        limits = self.cell.limits
+        self.joints = JointTorques(context, self.cell)
+        self.orders = Orders(self.commands)
+        rest_s = float(np.max(limits.velocity / limits.acceleration))
+        self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values(), default=0)
+        self._defied = False  # the boards above have not brought it to rest in that time
+        self._rest_by: int | None = None  # tick by which the arm must have come to rest; None: it need not
+        self._braked_at: int | None = None  # tick of the first status that said so; None: not braked, or not yet said
+        self._torques: Mapping[str, Reading] = {}
+        self._waiting = ""  # why the boards above do not drive the arm
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the level and of its arm."""
+        super().preload()
+        joint_torques.preload()
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield every joint, and the gripper, that not exactly one board above drives, and what `ArmDriver` yields."""
+        yield from super().misfits(context, above, below)
+        everything = context.robot.joints
+        wanted = {other.board: other.params.get("joints", everything) for other in above}
+        for joint in everything:
+            boards = [board for board, joints in wanted.items() if joint in joints]
+            if len(boards) != 1:
+                yield "above", list(wanted), f"joint '{joint}' must be commanded by one board; {_by(boards)}"
+        grips = [other.board for other in above if other.params.get("gripper", False)]
+        if len(grips) != (context.robot.gripper is not None):
+            is_bare = context.robot.gripper is None
+            must = "the arm has no gripper" if is_bare else "the gripper must be commanded by one board"
+            yield "above", list(wanted), f"{must}; {_by(grips)}"
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Advance the arm to `tick`, sense, drive or brake, report."""
+        write.status.tick = tick
+        super().process(read, write, tick)
+
+    def take_messages(self, read: Ports) -> None:
+        """Take over what is new."""
+        self._torques = read.torques
+        if read.operator.verdict is Verdict.NEW:
+            self.orders.take(read.operator)
+
+    def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
+        """Return where the boards above want the arm; None: not all of them drive it."""
+        if self.arm.braked and self._braked_at is None:
+            self._waiting = "braked until the boards above have seen it"
+            return None
+        stops = reaction > 0 or self.orders.standing is Operation.HOLD
+        self._defied = self._defied and stops
+        if self._defied or (reaction is Reaction.STOP and self.abandoned):
+            return None
+        since = 0 if self._braked_at is None else self._braked_at
+        self._waiting = self.joints.missing(self._torques, tick, since)
+        if self._waiting:
+            return None
+        self.joints.add_up()
+        self.rests_on = self.joints.rests_on
+        if self.abandoned and self._is_astray():
+            return None
+        self._defied = self._must_rest(stops, tick) and self.joints.moves
+        if self._defied:
+            self._waiting = "braked: the boards above did not bring it to rest"
+            return None
+        self._braked_at = None
+        if self.orders.standing is Operation.HOLD and not self.joints.moves:
+            self.orders.done()
+        return self.joints.wanted
+
+    def _is_astray(self) -> bool:
+        """Return whether the boards above want the arm elsewhere than where it is braked.
+
+        They do for two cycles when sensors are trusted again and show another position than was estimated.
+        """
+        away = self.joints.wanted.position - self.sensors.position
+        joint = int(np.abs(away).argmax())
+        astray = abs(away[joint]) > ASTRAY_RAD
+        if astray:
+            name = self.context.robot.joints[joint]
+            self._waiting = f"braked: joint '{name}' is wanted more than {ASTRAY_RAD:g} rad away from where it is"
+        return bool(astray)
+
+    def _must_rest(self, stops: bool, tick: int) -> bool:
+        """Return whether the arm `stops`, and the boards above have had enough time to bring it to rest."""
+        if not stops:
+            self._rest_by = None
+        elif self._rest_by is None:
+            self._rest_by = tick + self._rest_ticks
+        return self._rest_by is not None and tick >= self._rest_by
+
+    def brake(self) -> None:
+        """Brake, until the boards above have seen it."""
+        if self._braked_at is None:
+            self._braked_at = self.arm.tick
+        self._rest_by = None
+        super().brake()
+
+    def terms(self) -> Terms:
+        """Return the equation of motion at the sensed state, with what the gripper holds."""
+        return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.joints.payload)
+
+    def torques(self, wanted: Motion, sensed: Sensed, terms: Terms) -> tuple[Array, float]:
+        """Return the torques of the boards above, N m, and their grip force, N."""
+        return self.joints.torque, self.joints.grip_force
+
+    @property
+    def holds(self) -> bool:
+        """Whether the gripper holds a part, by the boards above."""
+        return self.joints.payload.mass > 0.0
+
+    @property
+    def has_work(self) -> bool:
+        """Return True: the arm is there to be driven."""
+        return True
+
+    def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
+        """Return what the status says of the torques from above."""
+        held = self.orders.standing is Operation.HOLD
+        kept = self.stopping.reason or self._waiting or (HELD if held else "")
+        return 0, self.abandoned or not self.joints.moves, self.abandoned or reaction > 0 or held, 0, kept
+
+
+def _by(boards: Sequence[str]) -> str:
+    named = ", ".join(f"'{board}'" for board in boards)
+    return f"it is commanded by {named or 'none'}"

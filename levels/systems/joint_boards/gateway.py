@@ -1,0 +1,125 @@
+"""The executor of a board that joins a trajectory level, across a link with a delay, to boards that servo joints."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+from pydantic import Field
+
+from rack.backplane.message import Message, State
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
+from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.tables import NotNegative, Table, read_params
+
+LEAD_CYCLES = 2
+"""Cycles of this board until a reference that is there has come to the boards below: they need it in time."""
+
+
+class GatewayParams(Table):
+    """`[board.<name>.params]`: the link to the level above, and what to do without it."""
+
+    delay: NotNegative = Field(0.0, le=1.0, description="time that the link takes, each way, s")
+    missing: int = Field(5, ge=0, le=1000, description="references in a row that may be missing and are extrapolated")
+
+
+class JointGateway(Executor):
+    """Hands references on to the boards below, later by a constant time; makes up those that are missing.
+
+    A reference that is not there in time is extrapolated from the newest, at its velocity. After `missing` of them the
+    arm is left to the boards below, which ramp to rest and hold; when references come again, they join them. Upwards
+    the boards below appear as one.
+    """
+
+    inputs = {
+        "command": Input(JOINT_REFERENCE, "above.command"),
+        "statuses": Input(JOINT_STATUS, "below.status", many=True),
+    }
+    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_STATUS, rests_on="statuses")}
+    params = GatewayParams
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        params, every = read_params(GatewayParams, context.params), context.every
+        self._delay = -(-round(params.delay / context.tick_s) // every) * every  # ticks: whole cycles
+        self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
+        self._missing, self._period = params.missing, max(pace.every for pace in context.above.values())
+        self._above = ", ".join(context.above)
+        self._down: deque[tuple[int, bytes]] = deque()  # messages on the link, with the tick at which they are here
+        self._up: deque[tuple[int, bytes]] = deque()
+        self._newest: Message | None = None  # reference that came
+        self._merged: Message | None = None  # status of the boards below, as one
+        self._due = 0  # tick at which the last reference given is due; 0: none is followed
+        self._frozen = False  # too many are missing
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Hand references down, and statuses up."""
+        self._take(read.command, tick)
+        self._give(write.command, tick)
+        self._report(read.statuses, write.status, tick)
+
+    def _take(self, command: Reading, tick: int) -> None:
+        """Put what is new on the link; take what has passed it."""
+        if self._newest is None:
+            self._newest = Message(command.value.record.dtype)
+        if command.is_new:
+            self._down.append((tick + self._delay, bytes(command.value.raw)))
+        while self._down and self._down[0][0] <= tick:
+            self._newest.raw[:] = self._down.popleft()[1]
+
+    def _give(self, command: Message, tick: int) -> None:
+        newest = self._newest
+        assert newest is not None
+        if not newest.due:
+            command.raw[:] = newest.raw
+            self._due, self._frozen = 0, False
+        elif newest.due + self.latency > max(self._due, tick):
+            command.raw[:] = newest.raw
+            self._due = command.due = newest.due + self.latency
+            self._frozen = False
+        elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
+            self._extrapolate(newest, command)
+
+    def _extrapolate(self, newest: Message, command: Message) -> None:
+        """Make up the reference after the last one given, or give up."""
+        ahead = self._due + self._period - self.latency - newest.due  # ticks
+        if ahead > self._missing * self._period:
+            self._due = command.due = 0
+            self._frozen = True
+            return
+        self._due += self._period
+        ahead_s = ahead * self.context.tick_s
+        command.due, command.id = self._due, newest.id
+        command.position[:] = newest.position + ahead_s * newest.velocity
+        command.velocity[:], command.acceleration[:] = newest.velocity, 0.0
+
+    def _report(self, statuses: Mapping[str, Reading], status: Message, tick: int) -> None:
+        """Put the status of the boards below on the link; show the one that has passed it."""
+        if self._merged is None:
+            self._merged = Message(status.record.dtype)
+            self._merged.holding = self._merged.stopped = True
+        self._merge(statuses, self._merged)
+        self._up.append((tick + self._delay, bytes(self._merged.raw)))
+        while self._up and self._up[0][0] <= tick:
+            status.raw[:] = self._up.popleft()[1]
+
+    def _merge(self, statuses: Mapping[str, Reading], merged: Message) -> None:
+        values = [reading.value for reading in statuses.values()]
+        merged.position[:] = values[0].position
+        for name in ("target", "target_velocity", "torque", "driven"):
+            field = getattr(merged, name)
+            field[:] = 0
+            for value in values:
+                field += getattr(value, name)
+        silent = [board for board, reading in statuses.items() if reading.is_lost or not reading.is_there]
+        worst = max(values, key=lambda value: (bool(value.error), bool(value.stopped), bool(value.holding)))
+        merged.holding = any(bool(value.holding) for value in values)
+        merged.stopped = bool(silent) or any(bool(value.stopped) for value in values)
+        merged.echo, merged.due = min([value.echo for value in values]), min([value.due for value in values])
+        merged.operator = max([value.operator for value in values])
+        merged.state, merged.error, merged.reason = worst.state, worst.error, worst.reason
+        if silent:
+            merged.state, merged.reason = State.HOLDING, f"no status from '{silent[0]}': waiting for its board"
+        elif self._frozen and not worst.stopped:
+            late = f"no reference from '{self._above}'"
+            merged.state, merged.reason = State.HOLDING, f"{late}: held after {self._missing} extrapolated"

@@ -1,0 +1,222 @@
+"""The executor of a board that servoes some or all joints of an arm whose plant is on a board of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
+from rack.levels.level import Executor, Input, LevelContext, Ports, Verdict
+from rack.levels.messages import Error
+from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.robot import dynamics
+from rack.levels.robot.cell import build_cell
+from rack.levels.servo import reference
+from rack.levels.servo.control import Grip, LoopGains
+from rack.levels.servo.curves import Motion
+from rack.levels.servo.driver import numbers
+from rack.levels.servo.modification import ModifiableParams, misfits_of, names_of
+from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
+from rack.levels.servo.operator_control import OperatorControl
+from rack.levels.servo.reference import Reference
+from rack.levels.systems.joint_boards import joint_control
+from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads, servo_joints
+from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS, JOINT_TORQUE
+from rack.levels.tables import read_params
+
+ARM_LOST = "no status from the board of the arm: waiting for it"
+
+
+class JointServoParams(ModifiableParams, LoopGains):
+    """`[board.<name>.params]`: the joints that a board servoes, and the gains of their loop."""
+
+    joints: tuple[str, ...] | None = Field(None, description="joints of `robot.joints` that it servoes; default: all")
+    gripper: bool = Field(False, description="true: it drives the gripper, too")
+
+
+class JointServo(Executor):
+    """Follows references with the torques of its own joints, and leaves the rest of the arm to other boards.
+
+    Set points are interpolated for all joints, so that all of them come to rest at the same time, on whichever boards.
+    While the arm is braked they begin where it is; while the arm says `stopped`, they come to rest.
+    """
+
+    inputs = {
+        "command": Input(JOINT_REFERENCE, "above.command"),
+        "status": Input(ARM_STATUS, "below.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"command": JOINT_TORQUE, "status": JOINT_STATUS}
+    commands = {
+        Operation.HOLD: (),
+        Operation.RESUME: (),
+        Operation.SETPOINT: (Goal.JOINTS,),
+        Operation.MODIFY: (Goal.ON, Goal.OFF),
+    }
+    params = JointServoParams
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        params, robot = read_params(JointServoParams, context.params), context.robot
+        cell = build_cell(robot, context.scene, context.clock_ns)
+        names = robot.joints if params.joints is None else params.joints
+        self._driven = np.array([name in names for name in robot.joints])
+        constants = np.zeros((5, len(robot.joints)))  # in the rows of `servo_joints`
+        constants[0], constants[1] = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
+        constants[2], constants[3] = cell.model.dof_frictionloss[cell.dof], cell.bounds.torque
+        constants[4] = self._driven
+        self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
+        self.loads = JointLoads(cell)
+        self._servo = partial(servo_joints.load(), constants, self.loads.table)
+        self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
+        modify = self._modified.obey
+        self.operator = OperatorControl(self.commands, robot.joints, cell.limits.position, self._driven, modify=modify)
+        self._unmodified: Array = np.zeros(7 * len(robot.joints))  # what the law sets for its modifications
+        self._grip = Grip(robot.gripper) if params.gripper and robot.gripper is not None else None
+        below = max(pace.every for pace in context.below.values())
+        # Ticks, of a status: while its board stalls for less, the arm goes on with the last torques.
+        self._oldest = below + cell.patience.ticks(below, context.tick_s)
+        self._sample: Array = np.zeros(0)  # numbers of a status of the arm, and of the messages to write
+        self._shown_numbers: tuple[Array, ...] = ()
+        self._offered: Message | None = None  # reference whose loads are not yet taken
+        self._command = self._rests_on = self._due = 0
+        self._shown: tuple[int, bool, bool, int, str, Error] | None = None  # in the last status
+        self._met = False  # a status of the arm has come
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the level."""
+        for module in (dynamics, reference, joint_control):
+            module.preload()
+
+    @classmethod
+    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+        """Return the names of its control modifications."""
+        return names_of(params)
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield joints that the arm lacks or that are named twice, an idle board, and modifications that do not fit."""
+        params, known = read_params(JointServoParams, context.params), context.robot.joints
+        named = known if params.joints is None else params.joints
+        for joint in dict.fromkeys(named):
+            if joint not in known:
+                yield "params.joints", joint, f"the arm has no such joint; joints: {', '.join(known)}"
+            elif named.count(joint) > 1:
+                yield "params.joints", joint, "named twice"
+        if not named and not params.gripper:
+            yield "params.joints", [], "it drives no joint, and not the gripper"
+        yield from misfits_of(context)
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Interpolate, and compute the torques that act from the next cycle on."""
+        arm: Message = read.status.value
+        if not self._met and not self._meet(read.status.is_there, arm, write):
+            return
+        self._take_messages(read, write)
+        sampled, every, reference, operator = arm.tick, self.context.every, self.reference, self.operator
+        away = read.status.is_lost or tick - sampled > self._oldest
+        stopped = away or bool(arm.stopped)
+        if away or (stopped and arm.braked):
+            reference.start(arm.position, arm.velocity, tick)
+            self._modified.interrupt()
+        if stopped:
+            wanted = reference.rest(tick)
+        else:
+            wanted = operator.wanted(reference, tick) if operator.stands else reference.at(tick)
+        self._take_loads(arm, tick, stopped or operator.stands)
+        tick_s = self.context.tick_s
+        age_s = min(tick + every - sampled, self._oldest + every) * tick_s
+        times = self.loads.part(tick), every * tick_s, age_s
+        self._servo(*times, self._sample, wanted.table, *self._shown_numbers)
+        if self._modified.exists:
+            self._modify(times, wanted, tick)
+        torque = write.command
+        torque.sampled, torque.id = sampled, torque.id + 1
+        if self._grip is not None:
+            torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
+        torque.operator = operator.orders.rests_on(self._rests_on)
+        self._report(write.status, arm, away, stopped)
+        operator.orders.report(write.status, self._rests_on)
+
+    def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
+        """Replace the torques just set by those of the modified law."""
+        joints, table, part = len(self._driven), self.loads.table, times[0]
+        given, shown = self._shown_numbers
+        torque, status = self._unmodified[: 3 * joints], self._unmodified[3 * joints :]
+
+        def law(motion: Motion, state: Array) -> Array:
+            self._servo(*times, state.reshape(-1), motion.table, torque, status)
+            return torque[:joints]
+
+        inertia, load = table[AT] + part * (table[DUE] - table[AT])
+        inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
+        modified = self._modified.torque(law, inputs)
+        np.copyto(given[:joints], modified, where=self._driven)
+        np.copyto(shown[3 * joints :], modified, where=self._driven)
+
+    def _meet(self, is_there: bool, arm: Message, write: Ports) -> bool:
+        """Begin with the first status of the arm; return whether there is one."""
+        status, torque = write.status, write.command
+        self._met = is_there
+        if not is_there:
+            torque.sampled = -1
+            status.driven, status.holding, status.stopped = self._driven, True, True
+            return False
+        if self._grip is not None and arm.grip_force:
+            self._grip.keep(arm.grip_force)
+        self._sample = numbers(arm, "position", "velocity")
+        self._shown_numbers = numbers(torque, "torque", "target_velocity"), numbers(status, "position", "torque")
+        return True
+
+    def _take_messages(self, read: Ports, write: Ports) -> None:
+        """Take over what is new."""
+        if read.operator.verdict is Verdict.NEW:
+            self.operator.take(read.operator, read.status.value.position)
+        if read.command.verdict is Verdict.NEW:
+            command: Message = read.command.value
+            self._command, self._rests_on = command.id, command.operator
+            if not self.loads.are_good(command):
+                return
+            self.reference.take(command)
+            self._offered = command
+            if self._grip is not None:
+                self._grip.take(command)
+                write.command.payload_mass, write.command.payload_offset = command.payload_mass, command.payload_offset
+
+    def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
+        """Take over inertia and load of the reference that is followed; compute them while none is."""
+        if stopped or self.reference.holding:
+            self.loads.hold(arm.position)
+        elif self._offered is not None:
+            self.loads.take(self._offered, tick)
+            self._due, self._offered = self._offered.due, None
+
+    def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
+        """Fill the steady fields of the status when they change."""
+        operator, holding = self.operator, self.reference.holding
+        kept, error = operator.reason if operator.stands else "", Error.NONE
+        if away:
+            kept = ARM_LOST
+        elif stopped:
+            kept = f"arm: {arm.reason}"
+            error = Error(arm.error) if arm.state == State.ERROR else Error.NONE
+        note = kept or self._modified.reason
+        shown = self._command, holding, stopped or operator.stands, self._due, note, error
+        if shown == self._shown:
+            return
+        self._shown = shown
+        status.driven = self._driven
+        status.echo, status.holding, status.stopped, status.due, status.reason, status.error = shown
+        if error:
+            status.state = State.ERROR
+        else:
+            resting = State.IDLE if holding else State.EXECUTING
+            status.state = State.HOLDING if kept and self._command else resting

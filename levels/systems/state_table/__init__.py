@@ -1,0 +1,8 @@
+"""State tables: levels whose executors are tables in TOML files, with static plans and no planners."""
+
+from rack.levels.systems.state_table.elemental_move import MoveTable
+from rack.levels.systems.state_table.level import StateTableExecutor
+from rack.levels.systems.state_table.primitive import PrimitiveTable
+from rack.levels.systems.state_table.task import TaskTable
+
+__all__ = ["MoveTable", "PrimitiveTable", "StateTableExecutor", "TaskTable"]

@@ -1,0 +1,182 @@
+"""The check of a state table: unknown words, unreachable states, overlapping rows, cases that no row takes.
+
+The cases of a state are the combinations of the values of all conditions that its rows name. A set of cases is kept as
+boxes, a set of values per condition each; what a row leaves of a box are at most as many boxes as it has conditions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, TableText
+from rack.levels.systems.state_table.vocabulary import Lexicon, Vocabulary, objection
+
+Box = dict[str, frozenset[str]]
+"""A set of cases: the values permitted by condition."""
+REASONED = ("error", "holding")
+"""Values of `status` that need a reason."""
+MAX_HOLES = 3
+"""Holes of one state that are reported one by one."""
+
+
+def flaws(text: TableText, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
+    """Return every mistake in a table, a line each, with the number and name of the row.
+
+    Without a lexicon, since the plan has mistakes, actions are not checked.
+    """
+    found = [*text.flaws]
+    for number, row in text.rows.items():
+        found += [f"{_named(number, row)}: {why}" for why in _words(row, vocabulary, lexicon)]
+    found += _states(text)
+    # Cases can be counted only once every condition and value is known, and every row is readable.
+    if not text.flaws and not any(_conditions(row, vocabulary) for row in text.rows.values()):
+        for state in _names(text):
+            found += _cases(state, _rows_of(state, text), vocabulary)
+    return found
+
+
+def _named(number: int, row: RowConfig) -> str:
+    return f"row {number} '{row.name}'"
+
+
+def _rows_of(state: str, text: TableText) -> dict[int, RowConfig]:
+    return {number: row for number, row in text.rows.items() if state in row.state}
+
+
+def _names(text: TableText) -> list[str]:
+    """Return the states that have rows, in their order."""
+    return list(dict.fromkeys(state for row in text.rows.values() for state in row.state))
+
+
+def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> Iterator[str]:
+    """Yield unknown words of a row, and outputs that it lacks."""
+    yield from _conditions(row, vocabulary)
+    for phrase in row.do or ():
+        if lexicon is not None and (why := objection(phrase, vocabulary.actions, lexicon)):
+            yield f"do: {why}"
+    for key in ("next", "do", "status"):
+        if getattr(row, key) is None:
+            yield f"{key}: missing; {RowConfig.model_fields[key].description}"
+    if row.status is not None and row.status not in STATES:
+        yield f"status: unknown '{row.status}'; known: {', '.join(STATES)}"
+    if row.status in REASONED and row.reason is None:
+        yield f"reason: missing; status {row.status} needs one, a line for the user"
+    if row.status not in REASONED and row.reason is not None:
+        yield f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}"
+
+
+def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
+    """Return the unknown conditions and values of a row."""
+    found = []
+    for condition, values in row.when.items():
+        known = vocabulary.conditions.get(condition)
+        if known is None:
+            found.append(f"when: unknown condition '{condition}'; known: {', '.join(vocabulary.conditions)}")
+            continue
+        found += [
+            f"when: {condition} is never '{value}'; its values: {', '.join(known.values)}"
+            for value in values
+            if value not in known.values
+        ]
+        if not values:
+            found.append(f"when: {condition} has an empty list; its values: {', '.join(known.values)}")
+    return found
+
+
+def _states(text: TableText) -> Iterator[str]:
+    """Yield next states that do not exist, and states that no row leads to."""
+    names = _names(text)
+    known = ", ".join(names)
+    if SAME in names:
+        yield f"state: '{SAME}' is no name of a state: `next = \"{SAME}\"` stays in a state"
+    if text.start not in names:
+        yield f"start: no row has the state '{text.start}'; states: {known}"
+    for number, row in text.rows.items():
+        if row.next is not None and row.next not in (*names, SAME):
+            yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
+    reached, ahead = set[str](), [text.start]
+    while ahead:
+        state = ahead.pop()
+        if state not in reached:
+            reached.add(state)
+            ahead += [row.next for row in _rows_of(state, text).values() if row.next not in (None, SAME)]
+    # If the start is unknown, nothing is reached.
+    for state in names if text.start in names else ():
+        if state not in reached:
+            numbers = ", ".join(map(str, _rows_of(state, text)))
+            yield f"row {numbers}: unreachable: no row leads from '{text.start}' to the state '{state}'"
+
+
+def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) -> Iterator[str]:
+    """Yield overlaps of the rows of one state, rows that never fire, and cases that no row takes."""
+    named = [name for name in vocabulary.conditions if any(name in row.when for row in rows.values())]
+    every: Box = {name: frozenset(vocabulary.conditions[name].values) for name in named}
+    boxes = {number: {**every, **_box(row)} for number, row in rows.items()}
+    left = [every]
+    for number, row in rows.items():
+        earlier = [other for other in rows if other < number]
+        if not row.otherwise:
+            yield from _overlaps(state, (number, row), {n: rows[n] for n in earlier}, boxes)
+        rest = [piece for box in left for piece in without(box, boxes[number])]
+        if row.otherwise and rest == left:
+            yield f"{_named(number, row)}: never fires in '{state}': the rows above it take every case of it"
+        left = rest
+    left = joined(left)
+    for box in left[:MAX_HOLES]:
+        yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
+    if len(left) > MAX_HOLES:
+        yield f"hole: '{state}' has {len(left) - MAX_HOLES} more"
+
+
+def _overlaps(
+    state: str, new: tuple[int, RowConfig], earlier: Mapping[int, RowConfig], boxes: Mapping[int, Box]
+) -> Iterator[str]:
+    number, row = new
+    for other, before in earlier.items():
+        both = {name: values & boxes[other][name] for name, values in boxes[number].items()}
+        if all(both.values()):
+            shared = {name: values for name, values in both.items() if name in row.when or name in before.when}
+            yield (
+                f"{_named(number, row)}: overlaps {_named(other, before)} in '{state}'"
+                f" when {_listed(shared)}; let them exclude each other, or give the later one else = true"
+            )
+
+
+def _box(row: RowConfig) -> Box:
+    return {condition: frozenset(values) for condition, values in row.when.items()}
+
+
+def without(box: Box, taken: Box) -> Sequence[Box]:
+    """Return disjoint boxes that hold the cases of `box` that are not in `taken`; both name the same conditions."""
+    pieces, rest = [], dict(box)
+    for condition, values in taken.items():
+        outside, inside = rest[condition] - values, rest[condition] & values
+        if not inside:
+            return [box]
+        if outside:
+            pieces.append({**rest, condition: outside})
+        rest[condition] = inside
+    return pieces
+
+
+def joined(boxes: Sequence[Box]) -> list[Box]:
+    """Return fewer boxes with the same cases: those that differ in one condition become one."""
+    left: list[Box] = []
+    for count, box in enumerate(boxes, 1):
+        for at, other in enumerate(left):
+            differing = [condition for condition in box if box[condition] != other[condition]]
+            if len(differing) == 1:
+                both = {**box, differing[0]: box[differing[0]] | other[differing[0]]}
+                return joined([*left[:at], both, *left[at + 1 :], *boxes[count:]])
+        left.append(box)
+    return left
+
+
+def _described(box: Box, vocabulary: Vocabulary) -> str:
+    """Return the cases of a box as text, without the conditions that may have any value."""
+    narrow = {n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n].values)}
+    return _listed(narrow)
+
+
+def _listed(box: Box) -> str:
+    return ", ".join(f"{name} = {'|'.join(sorted(values))}" for name, values in box.items()) or "any case"

@@ -1,0 +1,240 @@
+"""The primitive level as a state table: straight motions in joint space from rest to rest, and the gripper.
+
+A motion is a smooth stream of set points for the boards that servo the joints, two cycles ahead of the arm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field as Key
+
+from rack.backplane.message import Field, Message, command, status
+from rack.levels.algebra import Array
+from rack.levels.errors import RobotError
+from rack.levels.level import Input, LevelContext, Output, Ports
+from rack.levels.operator import OPERATOR_COMMAND, Operation
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics, Payload
+from rack.levels.servo import curves
+from rack.levels.servo.curves import Curve, Passage, Ramp
+from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.state_table.level import (
+    COMMAND_HEAD,
+    STATUS_HEAD,
+    YES_NO,
+    StateTableExecutor,
+    vocabulary,
+)
+from rack.levels.systems.state_table.vocabulary import Condition, Phrase
+from rack.levels.tables import Positive, Table
+
+LEAD_CYCLES = 2
+"""Cycles from the release that makes a set point to the tick at which it is due: one brings it down, the boards below
+interpolate to it over the second."""
+HANDOVER_CYCLES = 4
+"""Cycles from the first set point until the boards below must follow."""
+NOWHERE_RAD = 1e-9
+"""A motion shorter than this is none."""
+MIN_SPEED = 0.01
+GRIP_CYCLES = 6
+"""Cycles for which the gripper counts as moving after a command, until its motion shows."""
+GRIP_STILL_M_S = 0.002
+GRIP_MARGIN_M = 0.001
+"""A gripper this near to open or closed is; closed in between it holds something."""
+
+JOINT_MOVE = command(
+    "joint_move",
+    1,
+    *COMMAND_HEAD,
+    Field("joints", "f8", "rad", "where a motion ends", ("joints",)),
+    Field("speed", "f8", "1", "part of the joints' limits"),
+    Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
+    Field("aim", "f8", "m", "where the object, or the place, was for this command", (3,)),
+    Field("yaw", "f8", "rad", "how it was turned about the vertical"),
+)
+JOINT_MOVE_STATUS = status(
+    "joint_move_status",
+    1,
+    *STATUS_HEAD,
+    Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
+    Field("end", "f8", "rad", "where the newest motion ends", ("joints",)),
+    Field("moving", "u1", "1", "1: they still change"),
+    Field("closed", "u1", "1", "1: the gripper is commanded to close"),
+    Field("held", "u1", "1", "1: it holds something"),
+    Field("object", "i2", "1", "row of the object that it holds; -1: none"),
+)
+
+
+class PrimitivePlanConfig(Table):
+    """`[plan]` of the primitive level's table."""
+
+    settled: Positive = Key(0.01, description="distance from its end at which a joint has arrived, rad")
+
+
+class PrimitiveTable(StateTableExecutor):
+    """Moves the joints along straight lines and works the gripper, as its table says."""
+
+    inputs = {
+        "command": Input(JOINT_MOVE, "above.command", many=True, optional=True),
+        "statuses": Input(JOINT_STATUS, "below.status", many=True),
+        "arm": Input(ARM_STATUS, "arm.status"),
+        "last_command": Input(JOINT_REFERENCE, "own.command"),
+        "last_status": Input(JOINT_MOVE_STATUS, "own.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
+    commands = {what: goals for what, goals in StateTableExecutor.commands.items() if what is not Operation.DO}
+    vocabulary = vocabulary(
+        conditions={
+            "hold": Condition(YES_NO, "whether an operator or the level above holds this one, or its board is lost"),
+            "arm": Condition(
+                ("arrived", "resting", "moving", "away"),
+                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the joints do not follow",
+            ),
+            "gripper": Condition(("moving", "open", "empty", "holds"), "empty: closed on nothing"),
+        },
+        commands={
+            "move": Phrase((), "move the joints straight to the command's"),
+            "open": Phrase((), "open the gripper"),
+            "close": Phrase((), "close the gripper"),
+        },
+        actions={
+            "begin": Phrase((), "begin the motion to the joints of the command in force; while the arm moves, halt"),
+            "halt": Phrase((), "ramp to rest"),
+            "open": Phrase((), "open the gripper"),
+            "close": Phrase((), "close the gripper"),
+        },
+        plan=PrimitivePlanConfig,
+    )
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        if context.robot.gripper is None:
+            raise RobotError("the level works a gripper, and [robot] has none")
+        self._gripper, self._limits = context.robot.gripper, cell.limits
+        self._dynamics = Dynamics(cell)
+        self._masses = cell.model.body_subtreemass[cell.bodies].copy()  # kg
+        self._point = np.zeros((3, len(cell.home)))  # the newest set point: rad, rad/s, rad/s2
+        self._point[0] = cell.home
+        self._goal, self._speed = cell.home.copy(), 1.0  # rad, part of the limits: of the newest command
+        self._end = cell.home.copy()  # (joints,), rad: where the newest motion ends
+        self._curve: Curve | None = None  # None: at rest
+        self._from = 0  # tick at which it began
+        self._follows = 0  # cycles for which the boards below have followed; 0: they do not
+        self._closed, self._held, self._object = False, False, -1
+        self._target = -1  # row of the object that the newest command concerns
+        self._last_due = 0  # tick at which the set point before the next one is due
+        self._grips = 0  # cycles until the gripper's motion must show
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the curves."""
+        curves.preload()
+
+    def recall(self, read: Ports, write: Ports) -> None:
+        """Continue with the gripper as it is; the arm's motion begins anew from where the boards below hold it."""
+        super().recall(read, write)
+        if read.last_status.is_there:
+            last = read.last_status.value
+            self._closed, self._held, self._object = bool(last.closed), bool(last.held), last.object
+            self._point[0], self._end[:] = last.position, last.end
+            write.command.copy_from(read.last_command.value)
+
+    def look(self, read: Ports, tick: int) -> dict[str, str]:
+        """Return whether the arm follows and has arrived, and what the gripper does."""
+        for reading in read.command.values():
+            self._goal, self._speed, self._target = reading.value.joints, reading.value.speed, reading.value.object
+        position = self._follow(read)
+        due = self._due(tick)
+        if self._curve is not None and (due - self._from) * self.context.tick_s >= self._curve.ends_s:
+            self._point[0], self._point[1:], self._curve = self._curve.table[curves.REST], 0.0, None
+        away = np.abs(position - self._point[0]).max() > self.table.plan.settled
+        self.resting = self._curve is None and not away
+        there = np.abs(self._end - self._point[0]).max() <= self.table.plan.settled
+        arm = "moving" if not self.resting else "arrived" if there else "resting"
+        return {
+            "arm": arm if self._follows else "away",
+            "gripper": self._grip(read.arm.value),
+            "hold": YES_NO[self.holds],
+        }
+
+    def _follow(self, read: Ports) -> Array:
+        """Find out whether the boards below follow; return the joint positions, rad."""
+        readings = list(read.statuses.values())
+        statuses: list[Message] = [reading.value for reading in readings]
+        position: Array = statuses[0].position
+        gone = any(reading.is_lost or not reading.is_there for reading in readings)
+        stopped = gone or any(below.stopped for below in statuses)
+        self.detail = "its board is lost" if gone else next((s.reason for s in statuses if s.reason), "")
+        idle = any(below.holding for below in statuses) and self._follows > HANDOVER_CYCLES
+        if stopped or idle:
+            self._follows = 0
+        if not stopped:
+            if not self._follows:
+                # From where the arm is, at rest.
+                self._point[0], self._point[1:], self._curve = position, 0.0, None
+            self._follows += 1
+        return position
+
+    def _grip(self, arm: Message) -> str:
+        """Return the value of the condition `gripper`."""
+        self._grips = max(0, self._grips - 1)
+        if self._grips or abs(arm.opening_velocity) > GRIP_STILL_M_S:
+            return "moving"
+        gripper = self._gripper
+        if not self._closed:
+            is_open = abs(arm.opening - gripper.open) <= GRIP_MARGIN_M
+            self._held = False
+            return "open" if is_open else "moving"
+        self._held = abs(arm.opening - gripper.closed) > GRIP_MARGIN_M
+        return "holds" if self._held else "empty"
+
+    def do_begin(self) -> None:
+        """Begin the motion to the joints of the command in force, from rest."""
+        if self._curve is not None:
+            return self.do_halt()
+        start, limits = self._point[0], self._limits
+        goal = np.clip(self._goal, limits.position[:, 0], limits.position[:, 1])
+        self._end[:] = goal
+        speed = min(max(self._speed, MIN_SPEED), 1.0)
+        if np.abs(goal - start).max() > NOWHERE_RAD:
+            self._start(Passage(start, goal, speed * limits.velocity, speed * limits.acceleration))
+        return None
+
+    def do_halt(self) -> None:
+        """Ramp to rest."""
+        if self._curve is not None:
+            self._start(Ramp(self._point[0].copy(), self._point[1].copy(), self._limits.acceleration))
+
+    def _start(self, curve: Curve) -> None:
+        self._curve, self._from = curve, self._last_due
+
+    def do_open(self) -> None:
+        """Open the gripper."""
+        self._closed, self._grips, self._object = False, GRIP_CYCLES, -1
+
+    def do_close(self) -> None:
+        """Close the gripper."""
+        self._closed, self._grips, self._object = True, GRIP_CYCLES, self._target
+
+    def _due(self, tick: int) -> int:
+        """Return the tick at which the set point of the cycle released at `tick` is due."""
+        self._last_due = tick + (LEAD_CYCLES - 1) * self.context.every
+        return tick + LEAD_CYCLES * self.context.every
+
+    def give(self, write: Ports, tick: int) -> None:
+        """Write the set point, with inertia and load there, and what a restarted board needs."""
+        command, shown, due = write.command, write.status, self._due(tick)
+        if self._curve is not None:
+            self._point[:] = self._curve.at((due - self._from) * self.context.tick_s).table
+        command.id = tick // self.context.every + 1
+        command.due = due if self._follows else 0
+        command.position, command.velocity, command.acceleration = self._point
+        load = Payload(self._masses[self._object] if self._held and self._object >= 0 else 0.0, np.zeros(3))
+        inertia, bias = self._dynamics.terms(self._point[0], self._point[1], load)
+        command.inertia, command.load = np.diagonal(inertia), bias
+        command.opening = self._gripper.closed if self._closed else self._gripper.open
+        command.force, command.payload_mass = self._gripper.force, load.mass
+        shown.position, shown.end, shown.moving = self._point[0], self._end, not self.resting
+        shown.closed, shown.held, shown.object = self._closed, self._held, self._object if self._held else -1

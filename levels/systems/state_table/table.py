@@ -1,0 +1,208 @@
+"""A state table: the rows of a TOML file, and the one that fires.
+
+    start = "idle"
+
+    [[row]]
+    name = "begin a motion"
+    state = "idle"                          # or a list of states
+    when = { command = "move", new = "yes" }  # a condition left out: any value; a list: any of these
+    next = "moving"
+    do = ["take", "begin"]
+    status = "executing"
+
+    [[row]]
+    name = "nothing to do"
+    state = "idle"
+    else = true                             # takes what the rows of the state above this one leave
+    ...
+
+    [plan]                                  # the static plan, as the level declares it
+
+`next = "same"` stays in the state. In every cycle the first row that matches fires, and no other. Rows of a state
+exclude each other, unless the later one says `else`; together they take every case.
+`rack.levels.systems.state_table.checks` sees to that before the launch.
+"""
+
+from __future__ import annotations
+
+import tomllib
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, StringConstraints, ValidationError
+
+from rack.backplane.message import REASON_BYTES, State
+from rack.levels.errors import LevelError
+from rack.levels.systems.state_table.vocabulary import NAME_BYTES, Vocabulary
+from rack.levels.tables import Positive, Table, Vector
+
+MAX_FILE_BYTES = 200_000
+ROW_NAME_BYTES = 48
+STATES = {state.name.lower(): state for state in State}
+"""States of a level, by the words of a row's `status`."""
+Name = Annotated[str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{NAME_BYTES - 1}}}$")]
+RowName = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{ROW_NAME_BYTES}}}$")]
+Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$")]
+
+
+def _listed(value: Any) -> Any:
+    """Return one word as a list of one, and TOML's lists as tuples, which are frozen."""
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+
+
+Words = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+States = Annotated[tuple[Name, ...], BeforeValidator(_listed)]
+Place = Annotated[Vector, BeforeValidator(_listed)]
+
+
+SAME = "same"
+"""The `next` of a row that stays in its state."""
+LATE = "late"
+"""The condition that every table may use: whether its state has lasted longer than its `patience`."""
+
+
+class RowConfig(Table):
+    """`[[row]]`: one row of a state table."""
+
+    name: RowName = Field(description="what the row is for: shown while it fires")
+    state: States = Field(min_length=1, description="the state, or a list of states, in which it may fire")
+    when: dict[str, Words] = Field({}, description="value, or a list of values, by condition")
+    otherwise: bool = Field(False, alias="else", description="takes what the rows of the state above this one leave")
+    # Missing ones are reported with what else is wrong with the table.
+    next: Name | None = Field(None, description="next state, or same")
+    do: Words | None = Field(None, description="actions with their parameters, in order; may be an empty list")
+    status: str | None = Field(None, description="state shown upwards: " + ", ".join(STATES))
+    reason: Reason | None = Field(None, description="shown with status error or holding")
+
+
+class TableConfig(Table):
+    """A state table's file."""
+
+    start: Name = Field(description="state in which the table begins")
+    patience: Positive = Field(10.0, description="time in one state after which the condition late is yes, s")
+    row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500, description="its rows")
+    plan: dict[str, Any] = Field({}, description="the level's static plan")
+
+
+class TableError(LevelError):
+    """A state table that cannot be used. `flaws` holds every mistake, a line each."""
+
+    def __init__(self, flaws: Iterable[str]) -> None:
+        self.flaws = tuple(flaws)
+        super().__init__("; ".join(self.flaws))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row. `number` counts from 1, in the order of the file."""
+
+    number: int
+    name: str
+    when: Mapping[str, frozenset[str]]  # values permitted, by condition; one left out may have any value
+    is_else: bool
+    next: str
+    do: tuple[tuple[str, ...], ...]  # actions: verb and parameters
+    status: State
+    reason: str
+
+    def matches(self, values: Mapping[str, str]) -> bool:
+        """Return whether the row fires on these values of the conditions."""
+        return all(values[condition] in permitted for condition, permitted in self.when.items())
+
+
+@dataclass(frozen=True)
+class StateTable:
+    """The rows of a file by state, each state's in their order; `plan` is the level's record of `[plan]`."""
+
+    start: str
+    patience_s: float
+    rows: Mapping[str, tuple[Row, ...]]
+    plan: Any
+    checksum: int  # CRC-32 of the file
+
+    def decide(self, state: str, values: Mapping[str, str]) -> Row | None:
+        """Return the row that fires; None: no row takes the case, which cannot happen in a table that was checked."""
+        for row in self.rows.get(state, ()):
+            if row.matches(values):
+                return row
+        return None
+
+
+@dataclass(frozen=True)
+class TableText:
+    """A state table as read, before its check. `flaws` are the mistakes in the form of the file.
+
+    `rows` holds the readable rows by number; rows with a mistake in their form are missing.
+    """
+
+    start: str
+    patience_s: float
+    rows: Mapping[int, RowConfig]
+    plan: Any  # the level's record of `[plan]`; None: it has mistakes
+    checksum: int  # CRC-32 of the file
+    flaws: tuple[str, ...]
+
+    def table(self) -> StateTable:
+        """Return the table, whose check has found nothing."""
+        found: dict[str, list[Row]] = {}
+        for number, config in self.rows.items():
+            row = Row(
+                number=number,
+                name=config.name,
+                when={condition: frozenset(values) for condition, values in config.when.items()},
+                is_else=config.otherwise,
+                next=config.next or SAME,
+                do=tuple(tuple(phrase.split()) for phrase in config.do or ()),
+                status=STATES.get(config.status or "", State.ERROR),
+                reason=config.reason or "",
+            )
+            for state in config.state:
+                found.setdefault(state, []).append(row)
+        rows = {state: tuple(rows) for state, rows in found.items()}
+        return StateTable(self.start, self.patience_s, rows, self.plan, self.checksum)
+
+
+def read_text(path: Path, vocabulary: Vocabulary) -> TableText:
+    """Return the table in a file, unchecked. Raises `TableError` when it cannot be read at all."""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise TableError([f"{path.stat().st_size} bytes; permitted: {MAX_FILE_BYTES}"])
+        data = path.read_bytes()
+        config = TableConfig(**tomllib.loads(data.decode()))
+    except OSError as error:
+        raise TableError([f"cannot be read: {error.strerror}"]) from error
+    except ValidationError as error:
+        raise TableError(_flaws(error, "", TableConfig)) from error
+    except (ValueError, TypeError, RecursionError) as error:  # ValueError: TOML, UTF-8
+        raise TableError([f"not TOML: {error}"]) from error
+    rows, flaws, plan = {}, list[str](), None
+    for number, row in enumerate(config.row, 1):
+        try:
+            rows[number] = RowConfig(**row)
+        except (ValidationError, TypeError) as error:
+            flaws += _flaws(error, f"row {number}: ", RowConfig)
+    try:
+        plan = vocabulary.plan(**config.plan)
+    except (ValidationError, TypeError) as error:
+        flaws += _flaws(error, "plan: ", vocabulary.plan)
+    return TableText(config.start, config.patience, rows, plan, zlib.crc32(data), tuple(flaws))
+
+
+def _flaws(error: ValidationError | TypeError, place: str, kind: type[Table]) -> list[str]:
+    """Return what is wrong with one table of a file, a line each."""
+    if isinstance(error, TypeError):
+        return [f"{place}{error}"]
+    known = ", ".join(field.alias or key for key, field in kind.model_fields.items())
+    lines = []
+    for entry in error.errors(include_url=False):
+        key = ".".join(str(part) for part in entry["loc"])
+        why = {"missing": "missing", "extra_forbidden": f"unknown key; known: {known}"}.get(entry["type"])
+        lines.append(f"{place}{key}: {why or _wrong(entry['msg'], entry['input'])}")
+    return lines
+
+
+def _wrong(message: str, value: Any) -> str:
+    return f"{str(value)[:40]!r}: {message[0].lower()}{message[1:]}"

@@ -1,0 +1,146 @@
+"""The task level as a state table: a static list of steps, each an object and the place to which it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from pydantic import Field as Key
+
+from rack.backplane.message import Field, status
+from rack.levels.level import Input, LevelContext, Ports
+from rack.levels.operator import OPERATOR_COMMAND, Operation
+from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
+from rack.levels.systems.state_table.level import (
+    BELOW,
+    STATUS_HEAD,
+    WORD_COMMAND,
+    StateTableExecutor,
+    StateTableParams,
+    answer_of,
+    vocabulary,
+)
+from rack.levels.systems.state_table.table import Name
+from rack.levels.systems.state_table.vocabulary import Condition, Phrase
+from rack.levels.tables import SceneConfig, Table, read_params
+
+COMMANDS_A_STEP = 2
+"""Commands for the level below in one step: one to pick, one to place."""
+TASK_TABLE_STATUS = status(
+    "task_table_status",
+    1,
+    *STATUS_HEAD,
+    Field("action", "u2", "1", "steps done"),
+    Field("actions", "u2", "1", "steps of the plan"),
+    Field("moves_done", "u2", "1", "commands done by the level below"),
+    Field("moves", "u2", "1", "commands of the plan"),
+    Field("sent", "u4", "1", "serial of the newest command sent down; 0: none"),
+)
+
+
+class StepConfig(Table):
+    """`[[plan.step]]`: an object, and where it goes."""
+
+    object: str = Key(description="an object of the scene")
+    place: Name = Key(description="a place that the level below knows")
+
+
+class TaskPlanConfig(Table):
+    """`[plan]` of the task level's table."""
+
+    step: tuple[StepConfig, ...] = Key(min_length=1, max_length=100, description="steps, in order")
+
+
+class TaskTable(StateTableExecutor):
+    """Sends the commands of its steps to the level below, one after the other, as its table says."""
+
+    inputs = {
+        "status": Input(MOVE_TABLE_STATUS, "below.status"),
+        "last_command": Input(WORD_COMMAND, "own.command"),
+        "last_status": Input(TASK_TABLE_STATUS, "own.status"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"command": WORD_COMMAND, "status": TASK_TABLE_STATUS}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: ()}
+    vocabulary = vocabulary(
+        conditions={
+            "below": BELOW,
+            "step": Condition(("more", "none"), "whether a step of the plan is left"),
+        },
+        actions={
+            "send": Phrase(
+                (("pick", "place", "home"),), "command the level below, for the object or place of the step"
+            ),
+            "next": Phrase((), "go on to the next step"),
+        },
+        plan=TaskPlanConfig,
+    )
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._step = self._sent = self._answered = 0
+        self._command = ""
+
+    @classmethod
+    def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
+        """Return steps with unknown objects."""
+        known = ", ".join(scene.objects) or "none"
+        steps = [(at, step.object) for at, step in enumerate(plan.step) if step.object not in scene.objects]
+        return [f"plan.step[{at}].object: unknown '{name}'; objects: {known}" for at, name in steps]
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Iterator[tuple[str, Any, str]]:
+        """Yield every mistake in every table, and steps that the level below does not know."""
+        found = [*super().misfits(context, above, below)]
+        yield from found
+        others = [other for other in below if not found and not [*MoveTable.misfits(other, (), ())]]
+        for other in others:
+            known = MoveTable.wording(Operation.DO, other.params, context.scene)
+            for name, path in read_params(StateTableParams, context.params).tables.items():
+                for at, step in enumerate(cls.read(path, context.scene).plan.step):
+                    if f"place {step.place}" not in known:
+                        why = (
+                            f"plan.step[{at}].place: unknown '{step.place}'; '{other.board}' knows: {', '.join(known)}"
+                        )
+                        yield f"params.tables.{name}", path.name, why
+
+    def recall(self, read: Ports, write: Ports) -> None:
+        """Continue with the step under way."""
+        super().recall(read, write)
+        if read.last_status.is_there and read.last_command.is_there:
+            last = read.last_status.value
+            self._step, self._sent, self._answered = last.action, last.sent, last.moves_done
+            write.command.copy_from(read.last_command.value)
+            self._command = read.last_command.value.words
+
+    def look(self, read: Ports, tick: int) -> dict[str, str]:
+        """Return where the level below is, and whether a step is left."""
+        below = answer_of(read.status, self._sent)
+        self.detail = read.status.value.reason
+        self.resting = bool(read.status.value.resting)
+        return {"below": below, "step": "more" if self._step < len(self.table.plan.step) else "none"}
+
+    def do_send(self, what: str) -> None:
+        """Command the level below."""
+        self._sent += 1
+        steps = self.table.plan.step
+        if what == "home":
+            self._command = what
+        else:
+            step = steps[min(self._step, len(steps) - 1)]
+            self._command = f"{what} {step.object if what == 'pick' else step.place}"
+
+    def do_next(self) -> None:
+        """Go on to the next step."""
+        self._step += 1
+
+    def give(self, write: Ports, tick: int) -> None:
+        """Write the command, and the progress."""
+        command, shown = write.command, write.status
+        command.id, command.words, command.hold = self._sent, self._command, self.holds
+        steps = len(self.table.plan.step)
+        shown.action, shown.actions, shown.sent = min(self._step, steps), steps, self._sent
+        shown.moves = steps * COMMANDS_A_STEP
+        shown.moves_done = min(self._step, steps) * COMMANDS_A_STEP

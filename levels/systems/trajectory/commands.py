@@ -1,0 +1,190 @@
+"""A command environment on the host side: motions as plain Python calls, in a script or at a prompt.
+
+    move(joints)                  a straight line in joint space
+    line(position, ...)           a straight line of the tool, in the world's frame or that of a body
+    stay(seconds), grip(opening)  at rest
+    cancel()                      drop everything; the arm ramps to rest
+    done(), wait()                whether all is done; wait until it is
+
+A call returns as soon as its request is on its way: requests are queued, and blended. It waits only while the queue is
+full. A request that is lost, with a board that died as it held it, is sent again by the next call that waits.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from rack.levels.errors import LevelError
+from rack.levels.host_program import Bus, HostProgram
+from rack.levels.level import Input, LevelContext
+from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind, RequestEnd
+from rack.levels.tables import RobotConfig, SceneConfig, Table, read_params
+
+DOWN = (0.0, 1.0, 0.0, 0.0)
+"""Orientation of a tool that points straight down, w, x, y, z."""
+LOOK_S = 0.25
+PATIENCE_S = 2.0
+"""Time for which nothing is under way, though requests are open, before they are sent again."""
+WORLD = -1
+
+
+class Motions:
+    """Motion requests as calls. Every call returns the number of its request.
+
+    What a former process of the board has left in the queue is cancelled first.
+    """
+
+    calls: ClassVar[tuple[str, ...]] = (
+        "move",
+        "line",
+        "stay",
+        "grip",
+        "release",
+        "cancel",
+        "done",
+        "wait",
+        "end_of",
+        "where",
+    )
+    """Those that scripts and prompts have by name."""
+
+    def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
+        self._bus, self._robot, self._bodies = bus, robot, scene.bodies
+        # No request of a former process has a greater number than it has sent messages.
+        self._newest = bus.sent("requests")
+        self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
+        self._idle_since: float | None = None  # time since when nothing is under way, though requests are open
+        if self._newest:
+            self.cancel()
+
+    def move(self, joints: Sequence[float] | None = None, **times: float) -> int:
+        """Go to joint positions, rad, in a straight line in joint space; default: home."""
+        goal = self._robot.home if joints is None else joints
+        return self._request(kind=MotionKind.JOINTS, joints=goal, **times)
+
+    def line(
+        self,
+        position: Sequence[float],
+        quaternion: Sequence[float] = DOWN,
+        body: str = "",
+        live: bool = False,
+        guard: float = 0.0,
+        **times: float,
+    ) -> int:
+        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows.
+
+        With a `guard`, N m, it ends GUARDED where a joint's torque changes by more: the arm met something.
+        """
+        if body and body not in self._bodies:
+            raise LevelError(f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}")
+        row = self._bodies.index(body) if body else WORLD
+        pose = {"position": position, "quaternion": quaternion}
+        return self._request(kind=MotionKind.POSE, body=row, live=live, touch=guard, **pose, **times)
+
+    def stay(self, seconds: float) -> int:
+        """Stay at the goal before."""
+        return self._request(kind=MotionKind.STAY, segment=seconds)
+
+    def grip(self, opening: float | None = None, force: float | None = None) -> int:
+        """Bring the gripper to an opening, m, with at most `force`, N; default: close it."""
+        gripper = self._robot.gripper
+        if gripper is None:
+            raise LevelError("grip: the arm has no gripper")
+        wanted = gripper.closed if opening is None else opening
+        return self._request(kind=MotionKind.GRIP, opening=wanted, force=gripper.force if force is None else force)
+
+    def release(self) -> int:
+        """Open the gripper."""
+        gripper = self._robot.gripper
+        return self.grip(None if gripper is None else gripper.open)
+
+    def cancel(self) -> int:
+        """End the motion under way and drop all others; the arm ramps to rest."""
+        return self._request(kind=MotionKind.CANCEL)
+
+    def end_of(self, request: int) -> RequestEnd:
+        """Return how a request ended: NONE until it has, or if it is too long ago."""
+        status = self._bus.read("motion").value
+        ends = dict(zip(status.ended.tolist(), status.ends.tolist(), strict=True))
+        return RequestEnd(ends.get(request, RequestEnd.NONE))
+
+    def done(self, request: int | None = None) -> bool:
+        """Return whether a request, by default the newest, has ended."""
+        return bool(self._bus.read("motion").value.done >= (self._newest if request is None else request))
+
+    def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
+        """Wait until a request, by default the newest, has ended; False if `until` holds before, or the run ends."""
+        while not self.done(request):
+            if until() or self._bus.is_over:
+                return False
+            self._look()
+        return True
+
+    def where(self) -> list[float]:
+        """Return the tool position commanded last, m."""
+        return [round(float(x), 4) for x in self._bus.read("motion").value.tool]
+
+    def _request(self, **fields: Any) -> int:
+        request = {"body": WORLD, **fields, "id": self._newest + 1}
+        while not self._bus.send("requests", **request):
+            if self._bus.is_over:
+                raise LevelError("the run is over")
+            self._look()
+        self._newest += 1
+        self._open[self._newest] = request
+        return self._newest
+
+    def _look(self) -> None:
+        """Wait for news; send the requests again that are lost: nothing is under way, and not all are done."""
+        self._bus.wait(LOOK_S)
+        status, now = self._bus.read("motion").value, self._bus.time_s
+        self._open = {number: request for number, request in self._open.items() if number > status.done}
+        if status.current or not self._open:
+            self._idle_since = None
+        elif self._idle_since is None:
+            self._idle_since = now
+        elif now - self._idle_since > PATIENCE_S:
+            self._idle_since = None
+            # One that only waits is there twice then, and done once.
+            for request in self._open.values():
+                self._bus.send("requests", **request)
+
+
+class ScriptParams(Table):
+    """`[host.<name>.params]`: the script of a command environment."""
+
+    script: str = Field(description="Python script to run, in a folder of python_path")
+
+
+class CommandEnvironment(HostProgram):
+    """Runs a script that commands motions by name; a prompt offers the same names."""
+
+    inputs = {"motion": Input(MOTION_STATUS, "below.motion")}
+    outputs = {"requests": MOTION_REQUEST}
+    params = ScriptParams
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._script = read_params(ScriptParams, context.params).script
+
+    def run(self, bus: Bus) -> None:
+        """Run the script; raises `LevelError` if there is no such file."""
+        found = next((path for folder in sys.path if (path := Path(folder) / self._script).is_file()), None)
+        if found is None:
+            raise LevelError(f"params.script = {self._script}: not in a folder of python_path")
+        runpy.run_path(str(found), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
+
+    def names(self, bus: Bus) -> Mapping[str, Any]:
+        """Return the calls, by name."""
+        motions = self.motions(bus)
+        return {"motions": motions, **{name: getattr(motions, name) for name in motions.calls}}
+
+    def motions(self, bus: Bus) -> Motions:
+        """Return what makes requests of calls."""
+        return Motions(bus, self.context.robot, self.context.scene)

@@ -1,0 +1,186 @@
+"""The executor of a trajectory level: follows the motion requests of its queue with a set point every cycle."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from rack.backplane.message import Message, State
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports
+from rack.levels.messages import WORLD_MODEL
+from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.robot import dynamics
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
+from rack.levels.systems.trajectory.goal import WorldSight
+from rack.levels.systems.trajectory.guard import TouchGuard
+from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATE, MOTION_STATUS
+from rack.levels.systems.trajectory.motion import SampledMotion
+from rack.levels.systems.trajectory.requests import Agenda
+from rack.levels.systems.trajectory.work import MotionTools, RequestWork, TrajectoryParams
+from rack.levels.tables import read_params
+
+LEAD_CYCLES = 2
+"""Cycles from the release that makes a set point to the tick at which it is due.
+
+One brings it to the boards that servo joints, which interpolate to it over the second one."""
+
+
+class TrajectoryExecutor(Executor):
+    """Does motion requests in the order of the queue, blended; when it is empty, the arm rests at the last goal.
+
+    It needs no board above: what is queued is done. While a board below is lost or stopped, and on an operator's hold,
+    the arm rests; the request under way then goes on from there. A request that cannot be done ends REFUSED, or FAILED
+    on the way: the arm ramps to rest, all others held are CANCELLED, those that come are REFUSED until a CANCEL
+    [assumed]. After a restart the level continues with the requests in its own last messages.
+    """
+
+    inputs = {
+        "requests": Input(MOTION_REQUEST, "above.requests"),
+        "boards": Input(JOINT_STATUS, "below.status", many=True),
+        "world": Input(WORLD_MODEL, "world.model"),
+        "last_command": Input(JOINT_REFERENCE, "own.command"),
+        "last_status": Input(MOTION_STATUS, "own.status"),
+        "last_state": Input(MOTION_STATE, "own.state"),
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+    }
+    outputs = {"command": JOINT_REFERENCE, "status": Output(MOTION_STATUS, rests_on="boards"), "state": MOTION_STATE}
+    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
+    work: ClassVar[type[RequestWork]] = RequestWork
+    """Does the requests."""
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        params, robot = read_params(self.params, context.params), context.robot
+        cell = build_cell(robot, context.scene, context.clock_ns)
+        self._ik = InverseKinematics(cell, context.seed)
+        self._sight = WorldSight(context.scene.bodies, params.blind, context.tick_s)
+        tools = MotionTools(self._ik, cell.limits, self._sight, params, context.period_s)
+        self._agenda = Agenda()
+        self._motion = SampledMotion(cell.limits, robot.joints, context.period_s)
+        self._motion.rest_at(cell.home)
+        self._work = self.work(self._agenda, self._motion, tools)
+        self._boards = JointBoards(robot.joints)
+        self._guard = TouchGuard(context.period_s)
+        self._orders = Orders(self.commands)
+        self._dynamics = Dynamics(cell)
+        if robot.gripper is not None:
+            self._work.grip = robot.gripper.open, robot.gripper.force
+        self._tick: int | None = None  # of the last cycle
+        self._saved: tuple[int, ...] = ()  # what the last state depends on
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load the compiled functions of the dynamics."""
+        dynamics.preload()
+
+    def room(self, port: str) -> int:
+        """Return how many requests to take: the rest waits in the queue."""
+        # None before the level has recalled those that it has already.
+        return 0 if self._tick is None else self._agenda.room
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Take requests, go on with the motion, write the set point of two cycles later."""
+        if self._tick is None:
+            self._recall(read)
+            self._tick = tick - self.context.every
+        cycles, self._tick = (tick - self._tick) // self.context.every, tick
+        self._orders.take(read.operator)
+        self._sight.look(read.world)
+        cancelled = self._agenda.take(read.requests)
+        self._follow_boards(read)
+        if cancelled:
+            self._work.cancel()
+        self._watch(read, cycles)
+        hold = self._orders.standing is Operation.HOLD
+        # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the boards hold.
+        for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
+            if self._boards.in_step:
+                self._work.step((self._due(tick) - late * self.context.every) * self.context.tick_s, hold)
+        self._write_reference(write.command, tick)
+        self._write_status(write.status)
+        self._save(write.state)
+
+    def _recall(self, read: Ports) -> None:
+        """Continue after a restart, from the level's own last messages."""
+        if read.last_state.is_there and read.last_status.is_there:
+            self._agenda.recall(read.last_state.value, read.last_status.value)
+            self._work.recall(read.last_state.value.passed, read.last_status.value.progress)
+        if read.last_command.is_there and read.last_command.value.id:
+            self._work.grip = read.last_command.value.opening, read.last_command.value.force
+
+    def _follow_boards(self, read: Ports) -> None:
+        """Fall out of step with the boards below, or begin anew from where they hold the arm."""
+        before = self._boards.in_step
+        if self._boards.update(read.boards):
+            self._work.interrupt()
+            self._motion.rest_at(self._boards.position)
+        elif before and not self._boards.in_step:
+            self._work.interrupt()
+
+    def _watch(self, read: Ports, cycles: int) -> None:
+        """End the request under way if its guard is struck; `cycles` since the last one."""
+        current, leg = self._agenda.current, self._motion.leg
+        # At half its speed the arm has long broken away from rest, where friction changes torques.
+        steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
+        if current is None or not current.is_guarded or not steady:
+            self._guard.begin_anew()
+        elif self._guard.is_struck(read.boards, current.touch):
+            self._work.end_guarded()
+
+    def _due(self, tick: int) -> int:
+        return tick + LEAD_CYCLES * self.context.every
+
+    def _write_reference(self, command: Message, tick: int) -> None:
+        position, velocity, acceleration = self._motion.state
+        command.id = tick // self.context.every + 1
+        # Out of step the arm's position is not certain: no set point is better than a wrong one.
+        command.due = self._due(tick) if self._boards.in_step else 0
+        command.position[:], command.velocity[:], command.acceleration[:] = position, velocity, acceleration
+        terms = self._dynamics.terms(position, velocity)
+        command.inertia[:], command.load[:] = terms.inertia.diagonal(), terms.bias
+        command.opening, command.force = self._work.grip
+        command.operator = self._orders.rests_on(self._agenda.rests_on)
+
+    def _write_status(self, status: Message) -> None:
+        agenda, motion, goal = self._agenda, self._motion, self._work.goal
+        agenda.report(status)
+        status.echo = agenda.taken
+        reason = self._reason_to_wait() if agenda.held or agenda.missing else ""
+        if agenda.error:
+            status.state = State.ERROR
+        elif agenda.held or reason:
+            status.state = State.HOLDING if reason else State.EXECUTING
+        else:
+            status.state = State.DONE if agenda.done else State.IDLE
+        status.error, status.reason = agenda.error, agenda.reason or reason
+        status.progress, status.resting = self._work.progress, motion.resting
+        position, velocity, _ = motion.state
+        status.position[:], status.velocity[:] = position, velocity
+        tool = self._ik.tool_at(position)
+        status.tool[:] = tool.position
+        reached = goal is not None and goal.live and motion.leg is not None and motion.settled
+        status.astray = goal.astray(tool.position, motion.time_s) if goal is not None and reached else 0.0
+        if motion.resting:
+            self._orders.done()
+        self._orders.report(status, agenda.rests_on)
+
+    def _reason_to_wait(self) -> str:
+        if not self._boards.in_step:
+            return self._boards.awaited
+        if self._orders.standing is not Operation.NONE:
+            return self._orders.keeps(self.context.board)
+        if self._agenda.missing:
+            return f"request {self._agenda.taken + 1} is missing: send all again from there, or a cancel"
+        return "" if self._sight.knows or self._agenda.current is not None else "waiting for the world model"
+
+    def _save(self, state: Message) -> None:
+        agenda = self._agenda
+        state.passed = self._work.passed_s
+        newest = agenda.taken, agenda.done, agenda.begun, agenda.goal.id if agenda.goal is not None else 0
+        if newest != self._saved:
+            self._saved = newest
+            agenda.save(state)

@@ -1,0 +1,156 @@
+"""The commanded motion as samples: the leg under way, plus what is left of the motion before it.
+
+In every cycle the motion is evaluated once, one sample ahead. Velocity and acceleration of a sample are the differences
+of those around it, so they always fit the positions, however these come about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rack.levels.algebra import Array
+from rack.levels.robot.limits import Limits
+from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
+
+STOP_PART = 0.85
+"""Part of the acceleration limits that a stop takes: states are known by differences of samples only."""
+LEAST_STOP_CYCLES = 5
+"""A joint that hardly moves takes so long to stop, for its acceleration to end smoothly."""
+EXCESS = 1.04
+"""Multiple of a limit that a sample may show, as from rounding of inverse kinematics; the planned velocity limits are
+5 % below those of the arm."""
+MAX_REST_RAD = 1e-7
+"""Samples that differ by less are the same."""
+
+
+class JointState(NamedTuple):
+    """A sample; (joints,) each."""
+
+    position: Array  # rad
+    velocity: Array  # rad/s
+    acceleration: Array  # rad/s2
+
+
+class SampledMotion:
+    """Begins legs, blends them, stops: without a step in position or velocity, within the limits of every joint."""
+
+    def __init__(self, limits: Limits, joints: tuple[str, ...], period_s: float) -> None:
+        self._limits, self._joints, self._period_s = limits, joints, period_s
+        self._leg: Leg | None = None
+        self._begun_s = 0.0
+        self._settling: Settling | None = None
+        self._settles_s = 0.0  # when that began
+        self.rest_at(np.zeros(len(joints)))
+
+    def rest_at(self, position: Array) -> None:
+        """Rest at joint positions (joints,), rad."""
+        self._leg = self._settling = None
+        self._rest = np.array(position)
+        self.time_s = 0.0  # of the present sample
+        self._samples = self._rest, self._rest, self._rest  # those before, at and after it
+        self._held_state = self.state
+
+    def advance(self, time_s: float) -> None:
+        """Go on to the sample at `time_s`, the next one. Raises `Unfit` with the arm ramping to rest."""
+        self.time_s = time_s
+        self._held_state = self.state
+        before, here = self._samples[1:]
+        self._samples = before, here, here
+        try:
+            after = self._evaluate(time_s + self._period_s)
+            self._samples = before, here, after
+            if self._leg is not None:
+                self._check()
+        except Unfit:
+            # The sample ahead cannot be made: go on from the state before this one.
+            _, velocity, acceleration = self._held_state
+            self._settle(JointState(here, velocity + self._period_s * acceleration, acceleration), STOP_PART, 0.0)
+            self._leg = None
+            self._look_ahead()
+            raise
+
+    @property
+    def state(self) -> JointState:
+        """The present sample."""
+        before, here, after = self._samples
+        h = self._period_s
+        return JointState(here, (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h))
+
+    @property
+    def leg(self) -> Leg | None:
+        """The leg under way or reached; None: the arm stops, or has stopped elsewhere."""
+        return self._leg
+
+    @property
+    def leg_s(self) -> float:
+        """Time since the leg began."""
+        return self.time_s - self._begun_s
+
+    @property
+    def settled(self) -> bool:
+        """Whether the leg, if there is one, has reached its goal, and nothing is left of the motion before it."""
+        reached = self._leg is None or self.leg_s >= self._leg.law.ends_s
+        return reached and (self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s)
+
+    @property
+    def resting(self) -> bool:
+        """Whether the present sample is at rest."""
+        before, here, after = self._samples
+        return bool((np.abs(after - before) < MAX_REST_RAD).all() and (np.abs(after - here) < MAX_REST_RAD).all())
+
+    def stop(self) -> None:
+        """Ramp to rest from the present sample."""
+        self._settle(self.state, STOP_PART, LEAST_STOP_CYCLES * self._period_s)
+        self._leg = None
+        self._look_ahead()
+
+    def begin(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
+        """Begin the leg that `make` makes from where the motion so far ends, which slows down over two half blends.
+
+        Raises `Unfit` with the arm ramping to rest.
+        """
+        if self.settled and self._leg is not None and not self._leg.live:
+            self._rest, self._settling = self._samples[1], None
+        elif not self.settled or self._leg is not None:
+            self._settle(self.state, BLEND_PART, max(2.0 * half_blend_s, LEAST_STOP_CYCLES * self._period_s))
+        self._leg = None
+        try:
+            self._leg, self._begun_s = make(self._rest), self.time_s
+        finally:
+            self._look_ahead()
+
+    def _settle(self, state: JointState, part: float, least_s: float) -> None:
+        least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
+        self._settling, self._settles_s = Settling(state, part * self._limits.acceleration, least_s), self.time_s
+        self._rest = self._settling.end
+
+    def _look_ahead(self) -> None:
+        """Evaluate the sample ahead anew, the motion having changed."""
+        before, here, _ = self._samples
+        self._samples = before, here, self._evaluate(self.time_s + self._period_s)
+
+    def _evaluate(self, time_s: float) -> Array:
+        """Return the joint positions at `time_s`. Raises `Unfit`."""
+        position = self._rest if self._leg is None else self._leg.at(time_s - self._begun_s)
+        settling = self._settling
+        if settling is None:
+            return position
+        if time_s - self._settles_s >= settling.ends_s:
+            return position
+        return np.asarray(position + (settling.at(time_s - self._settles_s) - settling.end))
+
+    def _check(self) -> None:
+        """Raise `Unfit` if the present sample exceeds a limit, as when a live goal is too fast for the arm."""
+        _, velocity, acceleration = self.state
+        for values, limits, unit in (
+            (velocity, self._limits.velocity, "rad/s"),
+            (acceleration, self._limits.acceleration, "rad/s2"),
+        ):
+            # Written so that NaN is outside.
+            if not (np.abs(values) <= EXCESS * limits).all():
+                joint = int((np.abs(values) / limits).argmax())
+                name, most = self._joints[joint], limits[joint]
+                raise Unfit(f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted: {most:.2f}")

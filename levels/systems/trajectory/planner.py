@@ -1,0 +1,206 @@
+"""The planning level above a trajectory level: makes motion requests of a program, in the background, and queues them.
+
+RCCL's user program made its motion requests asynchronously [S3], and copied their parameters as it queued them: only
+live goals stay open [assumed]. So does the planner: its plan is the queue. The executor only says how far the program
+is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
+from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Ports
+from rack.levels.messages import TASK_STATUS, WORLD_MODEL
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.pose import Pose, pose
+from rack.levels.robot.cell import build_cell
+from rack.levels.systems.trajectory.messages import HELD, MOTION_REQUEST, MOTION_STATUS, MotionKind
+from rack.levels.systems.trajectory.program import (
+    CancelStep,
+    GripStep,
+    HomeStep,
+    LineStep,
+    MotionProgram,
+    MotionStep,
+    MoveStep,
+    StayStep,
+    Step,
+)
+from rack.levels.tables import Table, read_params
+
+BATCH = 2
+"""Requests that one plan makes at most."""
+PATIENCE_S = 0.5
+"""Time after which a request that the level below does not report as taken is sent again: it may be lost."""
+
+
+class PlanningParams(Table):
+    """How far the planner goes ahead, in `[board.<name>.params]`."""
+
+    ahead: int = Field(4, ge=1, le=HELD, description="requests that may be queued or under way at the same time")
+
+
+class RequestExecutor(Executor):
+    """Reports the program done, or the error that ended it. It obeys no operator: the trajectory level does."""
+
+    inputs = {"status": Input(MOTION_STATUS, "below.status")}
+    outputs = {"status": TASK_STATUS}
+    params = PlanningParams
+    program = MotionProgram
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._count = len(self.program.read(context.task, context.robot, context.scene).step)
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Report the requests done."""
+        below, status = read.status.value, write.status
+        status.echo, status.operator = below.echo, below.operator
+        status.action = status.moves_done = min(below.done, self._count)
+        status.actions = status.moves = self._count
+        status.error, status.reason = below.error, below.reason
+        if below.error:
+            status.state = State.ERROR
+        elif not self._count:
+            status.state = State.IDLE
+        elif below.done >= self._count:
+            status.state = State.DONE
+        else:
+            status.state = State.HOLDING if below.state == State.HOLDING else State.EXECUTING
+
+
+class RequestPlanner(Planner):
+    """Makes a request of each step of the program, a few ahead of the arm.
+
+    The request of step k has the id k + 1, so a restarted planner goes on after the newest one that the level below has
+    taken: a request sent twice is done once, and one that was lost is sent again. A tool goal that it finds no joint
+    positions for is queued as it stands: the level below refuses it, with its reason.
+    """
+
+    inputs = {"status": Input(MOTION_STATUS, "below.status"), "world": Input(WORLD_MODEL, "world.model")}
+    output = Output(MOTION_REQUEST, queued=True)
+    params = PlanningParams
+    program = MotionProgram
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._steps = self.program.read(context.task, context.robot, context.scene).step
+        self._ahead = read_params(PlanningParams, context.params).ahead
+        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self._ik, self._home = InverseKinematics(cell, context.seed), cell.home
+        self._upright = self._ik.tool_at(cell.home).quaternion
+        self._bodies = context.scene.bodies
+        self._goals: dict[int, Array] = {}  # joint positions (joints,), rad, at the end of each step planned
+        self._sent: int | None = None  # newest request queued; None: not yet known, after a start
+        self._taken = 0, 0  # newest request taken below, and the tick at which it or `_sent` changed
+        self._begun = 0, 0  # newest request begun below, and the tick at which it was seen
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Return whether a step may be planned now."""
+        below = read.status.value
+        if not read.status.is_there or below.error:
+            return False
+        begun = max(below.current, below.done)
+        if begun != self._begun[0]:
+            self._begun = begun, tick
+        if self._sent is None or below.taken > self._sent:
+            self._sent = below.taken
+        if below.taken != self._taken[0]:
+            self._taken = below.taken, tick
+        elif below.taken < self._sent and self._since_s(self._taken, tick) > PATIENCE_S and not read.status.is_lost:
+            self._sent, self._taken = below.taken, (below.taken, tick)
+        return self._may_send(self._sent, below.done, tick)
+
+    def plan(self, read: Ports, write: Any, tick: int) -> None:
+        """Plan the next steps, and queue their requests."""
+        assert self._sent is not None
+        for _ in range(BATCH):
+            if not self._may_send(self._sent, read.status.value.done, tick):
+                return
+            self._fill(write, self._sent, read.world.value)
+            if not write.send():
+                return
+            self._sent += 1
+            self._taken = self._taken[0], tick
+
+    def _since_s(self, event: tuple[int, int], tick: int) -> float:
+        return (tick - event[1]) * self.context.tick_s
+
+    def _may_send(self, sent: int, done: int, tick: int) -> bool:
+        if sent >= len(self._steps) or sent - done >= self._ahead:
+            return False
+        step = self._steps[sent]
+        if not isinstance(step, CancelStep):
+            return True
+        return self._begun[0] >= sent and self._since_s(self._begun, tick) >= step.after
+
+    def _fill(self, request: Message, k: int, world: Message) -> None:
+        """Make a request of step k."""
+        step = self._steps[k]
+        request.clear()
+        request.id, request.body = k + 1, -1
+        if isinstance(step, MotionStep):
+            request.segment, request.acceleration = step.segment, step.acceleration
+            self._fill_motion(request, step, k, world)
+            return
+        self._goals[k] = self._goal_before(k, world)
+        if isinstance(step, StayStep):
+            request.kind, request.segment = MotionKind.STAY, step.seconds
+        elif isinstance(step, GripStep):
+            gripper = self.context.robot.gripper
+            default = gripper.force if gripper is not None else 0.0
+            request.kind, request.segment, request.opening = MotionKind.GRIP, step.seconds, step.opening
+            request.force = default if step.force is None else step.force
+        else:
+            request.kind = MotionKind.CANCEL
+
+    def _fill_motion(self, request: Message, step: Step, k: int, world: Message) -> None:
+        joints = self._goals[k] = self._goal(k, world)
+        tool = self._tool(step)
+        unsolved = tool is not None and joints is self._goal_before(k, world)
+        if tool is not None and (isinstance(step, LineStep) or unsolved):
+            request.kind, request.position, request.quaternion = MotionKind.POSE, *tool
+        else:
+            request.kind, request.joints = MotionKind.JOINTS, joints
+        if isinstance(step, LineStep) and step.body is not None:
+            request.body, request.live = self._bodies.index(step.body), step.live
+
+    def _goal_before(self, k: int, world: Message) -> Array:
+        """Return joint positions at the end of the step before step k, planning it if need be, as after a restart."""
+        if k == 0:
+            return self._home
+        if k - 1 not in self._goals:
+            self._goals[k - 1] = self._goal(k - 1, world)
+        return self._goals[k - 1]
+
+    def _goal(self, k: int, world: Message) -> Array:
+        """Return joint positions at the end of step k; those before it where there are none."""
+        step, before = self._steps[k], self._goal_before(k, world)
+        if isinstance(step, HomeStep):
+            return self._home
+        if isinstance(step, MoveStep) and step.joints is not None:
+            return np.array(step.joints)
+        target = self._tool(step)
+        if target is None:
+            return before
+        if isinstance(step, LineStep) and step.body is not None:
+            if not world.revision:
+                return before
+            row = self._bodies.index(step.body)
+            target = pose(world.position[row], world.quaternion[row]) @ target
+        found = self._ik.reach(target, before)
+        if found is not None:
+            return found
+        others = self._ik.reachable(target, before)
+        return others[0] if others else before
+
+    def _tool(self, step: Step) -> Pose | None:
+        """Return the pose of the tool that a step gives, in its frame; None: it gives none."""
+        if not isinstance(step, MoveStep | LineStep) or step.position is None:
+            return None
+        return pose(step.position, self._upright if step.quaternion is None else step.quaternion)

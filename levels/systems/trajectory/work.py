@@ -1,0 +1,199 @@
+"""Does the requests of the agenda, sample by sample."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pydantic import Field
+
+from rack.levels.algebra import Array
+from rack.levels.messages import Error
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.robot.limits import Limits
+from rack.levels.systems.trajectory.goal import ToolGoal, WorldSight
+from rack.levels.systems.trajectory.legs import JointLeg, Leg, Times, ToolLeg, Unfit
+from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
+from rack.levels.systems.trajectory.motion import SampledMotion
+from rack.levels.systems.trajectory.requests import Agenda, MotionRequest
+from rack.levels.tables import Positive, Table
+
+
+class TrajectoryParams(Table):
+    """Times of motions and of following, in `[board.<name>.params]`."""
+
+    acceleration: Positive = Field(0.3, description="half the time of a blend, where a request gives none, s")
+    gripping: Positive = Field(0.6, description="time of a GRIP, where a request gives none, s")
+    follow: Positive = Field(0.25, description="time constant with which a live goal follows its body, s")
+    blind: Positive = Field(0.3, description="time for which a body's motion is extrapolated, s")
+
+
+class MotionTools(NamedTuple):
+    """What makes legs."""
+
+    ik: InverseKinematics
+    limits: Limits
+    sight: WorldSight
+    params: TrajectoryParams
+    period_s: float
+
+
+class RequestWork:
+    """Begins, blends and ends requests; interrupted motion goes on from where the arm rests."""
+
+    def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
+        self.agenda, self.motion, self._tools = agenda, motion, tools
+        self.goal: ToolGoal | None = None  # of the leg under way or reached; None: it is one in joint space
+        self.passed_s = 0.0  # time that the request under way has stayed or gripped
+        self.grip = 0.0, 0.0  # opening, m, and force, N, wanted by the last GRIP
+        self._interrupted = True  # motion must begin anew from rest
+        self._left = 1.0  # part of an interrupted leg's time that is left
+
+    def recall(self, passed_s: float, progress: float) -> None:
+        """Continue after a restart of the level."""
+        self.passed_s, self._left = passed_s, 1.0 - progress
+
+    def interrupt(self) -> None:
+        """Note that the arm was brought to rest elsewhere than at the goal."""
+        if not self._interrupted:
+            self._left = 1.0 - self.progress
+        self._interrupted, self.goal = True, None
+
+    def cancel(self) -> None:
+        """Ramp to rest; no request is under way but a CANCEL."""
+        self._left, self._interrupted, self.goal = 1.0, False, None
+        self.motion.stop()
+
+    def end_guarded(self) -> None:
+        """End the request under way, GUARDED: the arm ramps to rest, and goes on from there with the next one."""
+        self.agenda.end(RequestEnd.GUARDED)
+        self.agenda.goal = None  # the arm is not there
+        self.cancel()
+
+    def step(self, time_s: float, hold: bool) -> None:
+        """Go on to the sample at `time_s`; with `hold`, ramp to rest."""
+        motion, agenda = self.motion, self.agenda
+        try:
+            if self.goal is not None:
+                self.goal.update(time_s + self._tools.period_s)
+            motion.advance(time_s)
+        except Unfit as unfit:
+            self._fail(RequestEnd.FAILED, str(unfit))
+        if hold:
+            if motion.leg is not None:
+                self.interrupt()
+                motion.stop()
+            return
+        if self._interrupted:
+            self._go_on()
+        elif agenda.current is not None and self._is_done(agenda.current):
+            agenda.end(RequestEnd.DONE)
+        if not self._interrupted and agenda.next is not None:
+            self._consider(agenda.next)
+
+    @property
+    def progress(self) -> float:
+        """Part of the time of the request under way that has passed, 0 to 1."""
+        current, leg = self.agenda.current, self.motion.leg
+        if current is None:
+            return 0.0
+        if not current.moves:
+            lasts = self._lasts_s(current)
+            return min(self.passed_s / lasts, 1.0) if lasts > 0.0 else 1.0
+        if leg is None:
+            return 1.0 - self._left
+        return 1.0 - self._left * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
+
+    def _fail(self, how: RequestEnd, reason: str, code: Error = Error.NONE) -> None:
+        self.agenda.fail(how, code or (Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT), reason)
+        self.goal, self._left, self._interrupted = None, 1.0, False
+
+    def _go_on(self) -> None:
+        """Begin anew the motion that was interrupted, once the arm rests."""
+        goal, current = self.agenda.goal, self.agenda.current
+        if not self.motion.settled:
+            return
+        if goal is None or (current is None and not goal.live):
+            self._interrupted, self._left = False, 1.0
+        elif self._can_begin(goal):
+            self._interrupted = False
+            under_way = current is not None and current.id == goal.id
+            self._move(goal, 0.0, goal.segment * self._left if under_way else 0.0)
+
+    def _is_done(self, current: MotionRequest) -> bool:
+        if not self.motion.settled:
+            return False
+        if current.moves or current.kind == MotionKind.CANCEL:
+            return True
+        self.passed_s += self._tools.period_s
+        return self.passed_s >= self._lasts_s(current)
+
+    def _lasts_s(self, request: MotionRequest) -> float:
+        return request.segment or (self._tools.params.gripping if request.kind == MotionKind.GRIP else 0.0)
+
+    def _consider(self, request: MotionRequest) -> None:
+        """Begin `request` if its time has come: nothing is under way, or the leg under way is to be blended into it."""
+        current, leg = self.agenda.current, self.motion.leg
+        if not self._can_begin(request):
+            return
+        if current is None:
+            if self.motion.settled:
+                self._begin(request, 0.0)
+        elif current.moves and request.moves and leg is not None:
+            half_s = self._blend_s(leg, request)
+            if half_s is not None:
+                self._begin(request, half_s)
+
+    def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
+        """Return half the time in which `leg` slows down, if now is the time to blend it into `request`."""
+        law, passed_s = leg.law, self.motion.leg_s
+        if passed_s > law.ends_s - 2.0 * law.leaving_s:
+            return max(0.5 * (law.ends_s - passed_s), 0.0)  # it slows down already
+        wanted_s = max(request.acceleration or self._tools.params.acceleration, leg.least_s)
+        half_s = min(wanted_s, law.segment_s - law.half_blend_s)
+        law.leave_within(half_s)
+        left_s = law.nominal_s - passed_s
+        return left_s if left_s < half_s + self._tools.period_s else None
+
+    def _can_begin(self, request: MotionRequest) -> bool:
+        return not request.moves or request.body < 0 or self._tools.sight.knows
+
+    def _begin(self, request: MotionRequest, half_s: float) -> None:
+        self.agenda.begin()
+        self.passed_s, self._left = 0.0, 1.0
+        reason = self._misfit(request)
+        if reason:
+            self._fail(RequestEnd.REFUSED, reason)
+            self.motion.stop()
+        elif request.moves:
+            self._move(request, half_s, request.segment)
+        else:
+            self._start(request)
+
+    def _misfit(self, request: MotionRequest) -> str:
+        """Return why a request cannot be done; empty: it may be possible."""
+        return request.misfit(self._tools.limits.position) or self._tools.sight.misfit(request.body)
+
+    def _start(self, request: MotionRequest) -> None:
+        """Begin a request that does not move the arm."""
+        if request.kind == MotionKind.GRIP:
+            self.grip = request.opening, request.force
+
+    def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
+        """Begin the leg to the goal of `request`; the motion so far slows down over twice `half_s`."""
+        params, limits = self._tools.params, self._tools.limits
+        times = Times(segment_s, max(request.acceleration or params.acceleration, half_s))
+        goal = None
+        if request.kind == MotionKind.POSE:
+            goal = ToolGoal(request.goal, request.body, request.live, self._tools.sight, params.follow)
+
+        def make(start: Array) -> Leg:
+            if goal is None:
+                return JointLeg(start, request.joints, times, limits)
+            goal.update(self.motion.time_s + self._tools.period_s)
+            return ToolLeg(start, goal.pose, goal.live, times, (self._tools.ik, limits))
+
+        try:
+            self.motion.begin(make, half_s)
+            self.goal = goal
+        except Unfit as unfit:
+            self._fail(RequestEnd.REFUSED, str(unfit))

@@ -1,0 +1,277 @@
+"""An ordered task level alone: the test gives its orders, and plays the level below and the world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message, State
+from rack.levels.level import Executor, Input, Ports
+from rack.levels.messages import MOVE_STATUS, SERVO_STATUS, TASK_COMMAND, WORLD_MODEL, Error, Verb
+from rack.levels.operator import Operation
+from rack.levels.peer import PEER
+from rack.levels.systems.cell import CELL_ORDER, OrderedTaskExecutor, OrderedTaskPlanner
+from rack.levels.systems.cell.actions import write_action
+from rack.levels.systems.cell.messages import OrderVerb, Response
+from rack.levels.task.program import Goto, Home, Transfer
+from tests.levels.arms import cell, config
+from tests.levels.lockstep import BoardSpec, Lockstep, Operator
+
+ROBOT, SCENE = config("puma560")
+EVERY, MOVE_EVERY = 100, 20
+MOVE_CYCLES = 25
+"""Cycles that the level below needs for a move."""
+TRANSFER = Transfer(object="block1", to=(0.50, -0.20, 0.475))
+HOME = Home()
+
+
+class PlayedMoves(Executor):
+    """A level below that does every move in `MOVE_CYCLES`, if it is not held."""
+
+    inputs = {"command": Input(TASK_COMMAND, "above.command")}
+    outputs = {"status": MOVE_STATUS}
+    spent = 0
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        command, status = read.command.value, write.status
+        ids = [int(serial) for serial in command.moves["id"][: command.count]]
+        if ids and ids[0] > status.done + 1:
+            status.done, self.spent = ids[0] - 1, 0
+        moves = status.done + 1 in ids and not command.hold
+        self.spent += moves
+        if self.spent >= MOVE_CYCLES:
+            status.done, self.spent = status.done + 1, 0
+        status.current = status.done + 1 if self.spent else 0
+        status.progress, status.resting = self.spent / MOVE_CYCLES, not moves
+        status.operator = command.operator
+
+
+class OrderBench(Lockstep):
+    """The task level of an arm; orders come from the rack `cell`, whose time is `ahead` of the arm's."""
+
+    def __init__(self, ahead: float = 0.0, uncertainty: float = 0.0, **params: Any) -> None:
+        outside = {"lan.orders": CELL_ORDER, "lan.peer_cell": PEER, "servo.status": SERVO_STATUS}
+        table = {"coordinator": "cell", **params}
+        boards = [
+            BoardSpec("task", EVERY, OrderedTaskExecutor, OrderedTaskPlanner, 4, below="elemental_move", params=table),
+            BoardSpec("elemental_move", MOVE_EVERY, PlayedMoves, above="task"),
+        ]
+        super().__init__(boards, ROBOT, SCENE, outside={**outside, "world.model": WORLD_MODEL})
+        servo = self.message("servo.status")
+        servo.target = np.array(ROBOT.home)
+        self.write("servo.status", servo)
+        self.compare(ahead, uncertainty)
+        self.revision = 0
+        self.see()
+
+    def compare(self, ahead: float, uncertainty: float) -> None:
+        """Say what is known of the other rack's time."""
+        peer = self.message("lan.peer_cell")
+        peer.ahead, peer.uncertainty = ahead, uncertainty
+        self.write("lan.peer_cell", peer)
+
+    def see(self) -> None:
+        """Show the world, with a new revision."""
+        puma, world = cell("puma560"), self.message("world.model")
+        start = puma.start()
+        self.revision += 1
+        world.position, world.quaternion = start.xpos[puma.bodies], start.xquat[puma.bodies]
+        world.revision = self.revision
+        self.write("world.model", world)
+
+    def order(self, what: OrderVerb, action: Transfer | Goto | Home = HOME, number: int = 1000, **said: Any) -> None:
+        """Give an order now."""
+        order = self.message("lan.orders")
+        write_action(action, order)
+        order.program, order.id, order.what = 1, number, what
+        for name, value in said.items():
+            setattr(order, name, value)
+        self.write("lan.orders", order)
+
+    def lose_orders(self, is_lost: bool) -> None:
+        """Lose the rack that gives the orders, or have it back."""
+        self.boxes["lan.orders"].lost = is_lost
+
+    def until(self, *responses: Response, seconds: float = 20.0) -> Message:
+        """Run until the report says one of these; return it."""
+        assert self.run(seconds, lambda rack: rack.read("task.report").response in responses), self.report
+        return self.report
+
+    def ask_and_do(self, action: Transfer | Goto | Home, number: int = 1000) -> None:
+        """Have an order begun."""
+        self.order(OrderVerb.ASK, action, number)
+        self.until(Response.POSSIBLE)
+        self.order(OrderVerb.DO, action, number)
+        self.until(Response.DOING)
+
+    @property
+    def report(self) -> Message:
+        """What the level reports."""
+        return self.read("task.report")
+
+    @property
+    def status(self) -> Message:
+        """The level's status."""
+        return self.read("task.status")
+
+    def verb(self) -> Verb:
+        """Return what the move under way is."""
+        command, current = self.read("task.command"), self.read("elemental_move.status").current
+        shown = command.moves[: command.count]
+        return Verb(int(shown["verb"][shown["id"] == current][0])) if current in shown["id"] else Verb.NONE
+
+
+def test_times_are_those_of_the_rack_that_gives_the_orders() -> None:
+    bench = OrderBench(ahead=100.0)
+    bench.run(1.0)
+    bench.order(OrderVerb.ASK, Home(by=114.0))
+    report = bench.until(Response.POSSIBLE)
+    assert 105.0 < report.earliest < 114.0
+    assert report.until == pytest.approx(bench.read("task.request").begin + 214.0 - report.earliest)
+    bench.order(OrderVerb.ASK, Home(by=103.0), 1001)
+    report = bench.until(Response.REFUSED)
+    assert report.reason == f"home, by 103 s: the earliest is {report.earliest:.2f} s"
+    assert report.error == Error.TOO_LATE
+
+
+def test_time_of_a_rack_whose_clock_is_not_compared_is_waited_for() -> None:
+    bench = OrderBench(uncertainty=-1.0)
+    bench.order(OrderVerb.ASK, Home(by=30.0))
+    bench.run(2.0)
+    why = "the clock of rack 'cell' has not been compared yet"
+    assert (bench.status.state, bench.status.reason, bench.report.reason) == (State.HOLDING, why, why)
+    bench.compare(50.0, 0.001)
+    assert bench.until(Response.REFUSED).reason.startswith("home, by 30 s: it is 5")
+
+
+@pytest.mark.parametrize(("changes", "plans"), [(False, 1), (True, 2)])
+def test_promised_plan_is_made_anew_only_if_the_world_has_changed(changes: bool, plans: int) -> None:
+    bench = OrderBench()
+    bench.order(OrderVerb.ASK, TRANSFER)
+    bench.until(Response.POSSIBLE)
+    if changes:
+        bench.see()
+    bench.order(OrderVerb.DO, TRANSFER)
+    assert bench.until(Response.DONE).moves_done == 8
+    assert bench.read("task.plan").id == bench.boxes["task.plan"].at(bench.tick)[0] == plans
+
+
+def test_cancelled_order_is_forgotten() -> None:
+    bench = OrderBench()
+    bench.order(OrderVerb.ASK)
+    bench.until(Response.POSSIBLE)
+    bench.order(OrderVerb.CANCEL)
+    bench.until(Response.CANCELLED)
+    bench.order(OrderVerb.DO)
+    bench.run(3.0)
+    assert (bench.report.response, bench.read("task.command").count) == (Response.CANCELLED, 0)
+
+
+def test_order_under_way_is_broken_off_once_the_work_on_the_object_is_done() -> None:
+    bench = OrderBench()
+    bench.ask_and_do(TRANSFER)
+    assert bench.run(20.0, lambda rack: bench.verb() is Verb.APPROACH)
+    bench.order(OrderVerb.CANCEL, TRANSFER)
+    report = bench.until(Response.STOPPED)
+    assert (report.moves_done, report.halted, bench.read("task.command").hold) == (4, 1, 1)
+    done = bench.read("elemental_move.status").done
+    bench.run(2.0)
+    assert bench.read("elemental_move.status").done == done
+    bench.ask_and_do(HOME, 1001)
+    assert (bench.until(Response.DONE).halted, bench.read("task.command").hold) == (0, 0)
+
+
+def test_free_motion_is_broken_off_at_once_for_the_end_of_the_program() -> None:
+    bench = OrderBench()
+    bench.ask_and_do(TRANSFER)
+    assert bench.run(5.0, lambda rack: bench.verb() is Verb.MOVE)
+    bench.order(OrderVerb.END, reason="k1607 has failed")
+    assert bench.run(3.0, lambda rack: rack.read("task.status").state == State.ERROR)
+    assert (bench.report.response, bench.status.error) == (Response.ENDED, Error.GIVEN_UP)
+    assert (bench.status.reason, bench.status.moves) == ("k1607 has failed", 8)
+    assert bench.read("elemental_move.status").done == 1
+
+
+def test_run_ends_a_cycle_after_the_end_was_reported() -> None:
+    bench = OrderBench()
+    bench.order(OrderVerb.END)
+    bench.until(Response.ENDED)
+    assert bench.status.state == State.EXECUTING
+    bench.run(1.5 * EVERY * 2.5e-3)
+    assert bench.status.state == State.DONE
+
+
+def test_arm_is_held_while_its_orders_are_lost_and_goes_on_with_the_same_order() -> None:
+    bench = OrderBench()
+    bench.ask_and_do(TRANSFER)
+    bench.run(1.0)
+    bench.lose_orders(True)
+    bench.run(1.0)
+    why = "rack 'cell' is lost: held until it is back"
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, why)
+    assert bench.read("task.command").hold
+    bench.lose_orders(False)
+    assert bench.until(Response.DONE).moves_done == 8
+
+
+def test_arm_whose_coordinator_stays_away_ends_its_run_and_says_so() -> None:
+    bench = OrderBench(stalled_s=3.0)
+    bench.run(3.0)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "no orders from rack 'cell' yet")
+    bench.run(1.0)
+    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
+    assert bench.status.reason == "nothing has moved for 3 s: no orders from rack 'cell' yet"
+
+
+def test_arm_waits_for_its_next_order_as_long_as_its_coordinator_is_there() -> None:
+    bench = OrderBench(stalled_s=3.0)
+    bench.order(OrderVerb.NONE, number=0)
+    bench.run(8.0)
+    assert bench.status.state == State.IDLE
+    bench.ask_and_do(HOME)
+    assert bench.until(Response.DONE).echo == 1000
+
+
+def test_arm_that_its_coordinator_holds_does_not_stall() -> None:
+    bench = OrderBench(stalled_s=3.0)
+    bench.ask_and_do(TRANSFER)
+    bench.order(OrderVerb.DO, TRANSFER, hold=1, reason="k1607 is lost")
+    bench.run(8.0)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "k1607 is lost")
+    bench.order(OrderVerb.DO, TRANSFER)
+    bench.until(Response.DONE)
+
+
+def test_order_that_stands_still_fails_with_the_reason() -> None:
+    bench = OrderBench(stalled_s=3.0)
+    bench.ask_and_do(TRANSFER)
+    bench.lose("elemental_move", 100_000)
+    report = bench.until(Response.FAILED)
+    assert report.error == Error.STALLED
+    assert report.reason.startswith("nothing has moved for 3 s: no status from the level below")
+    assert bench.status.state != State.ERROR
+
+
+def test_arm_that_its_operator_holds_answers_when_it_is_released() -> None:
+    bench = OrderBench()
+    operator = Operator(bench)
+    operator.say("task", Operation.HOLD)
+    bench.order(OrderVerb.ASK)
+    bench.run(3.0)
+    assert (bench.report.response, bench.report.operated) == (Response.NONE, 1)
+    assert bench.report.reason == "task held by the operator: `resume` releases it"
+    operator.say("task", Operation.RESUME)
+    bench.until(Response.POSSIBLE)
+
+
+@pytest.mark.parametrize("board", ["task", "task.planner"])
+@pytest.mark.parametrize("cycle", range(1, 14, 2))
+def test_order_is_done_once_in_whatever_cycle_a_board_dies(board: str, cycle: int) -> None:
+    bench = OrderBench()
+    bench.after(cycle * EVERY + 10, lambda: bench.lose(board, 60))
+    bench.ask_and_do(HOME)
+    assert bench.until(Response.DONE).moves_done == 1
+    bench.run(1.0)
+    assert (bench.status.action, bench.status.actions) == (1, 1)

@@ -1,0 +1,172 @@
+"""An arm with a wrist sensor that presses against a wall: what it measures, and when it stops."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message, State
+from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import norm
+from rack.levels.messages import Error
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.pose import pose
+from rack.levels.robot.cell import build_cell
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.systems.force.arm_executor import ForceArmExecutor
+from rack.levels.systems.joint_boards import JointServo
+from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE
+from tests.levels.lockstep import BoardSpec, Lockstep
+from tests.levels.servo.rig import Found
+from tests.levels.systems.force.pad import pad
+
+CLOCK_NS = 1_000_000
+PERIOD = 20
+"""Ticks between references."""
+FORWARD = (0.7071067811865476, 0.0, 0.7071067811865476, 0.0)
+"""Orientation of a tool that points along the world's x axis."""
+FREE_M, WALL_M = 0.74, 0.76
+"""x of the tool before the wall, and with the pad on it."""
+
+
+class PressRig:
+    """An arm board and a board that servoes its joints, under references for the tool, forwards and backwards."""
+
+    def __init__(self, folder: Path, reach: float = 150.0, resolution: float = 0.0, **arm: Any) -> None:
+        robot, scene = pad(folder, reach=reach, resolution=resolution)
+        boards = [
+            BoardSpec("arm", 1, ForceArmExecutor, above="servo", params=arm),
+            BoardSpec("servo", 1, JointServo, above="level", below="arm"),
+        ]
+        ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
+        self._near = ik.solutions(pose((FREE_M, 0.0, 0.75), FORWARD), np.array(robot.home), lambda q: True)[0]
+        robot = robot.model_copy(update={"home": tuple(self._near)})
+        cell = build_cell(robot, scene, CLOCK_NS)
+        self.rack = Lockstep(boards, robot, scene, outside={"level.command": JOINT_REFERENCE}, clock_ns=CLOCK_NS)
+        self._ik, self._dynamics, self.x = ik, Dynamics(cell), FREE_M
+        self.command = self.rack.message("level.command")
+        self.found: list[Found] = []
+        self.forces: list[float] = []
+        self.braked: list[bool] = []
+
+    @property
+    def arm(self) -> ForceArmExecutor:
+        return cast(ForceArmExecutor, self.rack.tasks["arm"].level)
+
+    @property
+    def status(self) -> Message:
+        return cast(Message, self.rack.tasks["arm"].write.status)
+
+    @property
+    def wrench(self) -> Message:
+        return cast(Message, self.rack.tasks["arm"].write.wrench)
+
+    def go(self, x: float, seconds: float) -> None:
+        """Move the tool to `x`, m, along the world's x axis, at a constant velocity."""
+        cycles = round(seconds / (PERIOD * 1e-3))
+        for to in np.linspace(self.x, x, cycles + 1)[1:]:
+            speed, before = (x - self.x) / seconds, self._near
+            self._near = self._ik.nearby(pose((to, 0.0, 0.75), FORWARD), before)
+            assert self._near is not None
+            still = to == x
+            velocity = np.zeros(6) if still or speed == 0.0 else (self._near - before) / (PERIOD * 1e-3)
+            terms = self._dynamics.terms(self._near, velocity)
+            command, self.command.due = self.command, self.rack.tick + 2 * PERIOD
+            command.id += 1
+            command.position, command.velocity = self._near, velocity
+            command.inertia, command.load = np.diagonal(terms.inertia), terms.bias
+            self.rack.write("level.command", command)
+            self.run(PERIOD)
+        self.x = x
+
+    def run(self, ticks: int) -> None:
+        for _ in range(ticks):
+            arm = self.arm
+            self.rack.step()
+            self.found += [Found(self.rack.tick - 1, finding) for finding in arm.findings]
+            arm.findings.clear()
+            self.forces.append(norm(self.wrench.wrench[:3]))
+            self.braked.append(bool(self.status.braked))
+
+    def alarms(self) -> list[Alarm]:
+        """Return the alarms, but those of the brakes."""
+        brakes = Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED
+        return [finding.alarm for _, finding in self.found if finding.alarm not in brakes]
+
+
+def pressed(folder: Path, depth: float, seconds: float = 0.4, **arm: Any) -> PressRig:
+    """Return a rig whose tool has been moved `depth`, m, beyond the wall's surface."""
+    rig = PressRig(folder, **arm)
+    rig.go(FREE_M, 0.1)
+    rig.go(WALL_M + depth, seconds)
+    rig.go(rig.x, 0.2)
+    return rig
+
+
+def test_a_contact_within_the_limits_is_measured_and_no_fault(tmp_path: Path) -> None:
+    rig = pressed(tmp_path, 0.002)
+    force = rig.wrench.wrench[:3]
+    assert -60.0 < force[0] < -10.0
+    assert np.abs(force[1:]).max() < 0.4 * abs(force[0])  # friction
+    assert (rig.alarms(), rig.status.reason, any(rig.braked[100:])) == ([], "", False)
+    assert (rig.wrench.exceeded, rig.wrench.saturated, rig.status.touches) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("resolution", "most"), [(0.0, 0.1), (2e-4, 2.0)])
+def test_free_motion_is_no_contact(tmp_path: Path, resolution: float, most: float) -> None:
+    rig = PressRig(tmp_path, resolution=resolution)
+    rig.go(FREE_M, 0.1)
+    rig.go(FREE_M - 0.10, 0.2)
+    assert max(rig.forces) < most
+
+
+@pytest.mark.parametrize(("on_force_limit", "is_braked"), [("brake", True), ("stop", True), ("hold", False)])
+def test_a_contact_beyond_the_limit_stops_the_arm(tmp_path: Path, on_force_limit: str, is_braked: bool) -> None:
+    rig = pressed(tmp_path, 0.01, seconds=1.0, retry=2.0, on_force_limit=on_force_limit)
+    assert rig.alarms() == [Alarm.FORCE_LIMIT]
+    found = next(found for found in rig.found if found.finding.alarm is Alarm.FORCE_LIMIT)
+    assert 60.0 < found.finding.value == rig.forces[found.tick] < 80.0
+    assert max(rig.forces[: found.tick]) < 60.0
+    assert rig.wrench.exceeded > 0
+    assert rig.braked[-1] == is_braked
+    assert rig.status.stopped
+    assert rig.status.reason.startswith("contact too strong: force of ")
+    assert "permitted: 60; latched at tick" in rig.status.reason
+    assert (rig.status.state, rig.status.violations) == (State.HOLDING, 0)
+
+
+def test_the_arm_follows_again_when_the_contact_is_over(tmp_path: Path) -> None:
+    rig = pressed(tmp_path, 0.02, retry=0.05)
+    for _ in range(20):
+        rig.go(FREE_M, 0.2)
+        if not rig.status.reason:
+            break
+    assert (rig.status.reason, rig.status.error) == ("", Error.NONE)
+
+
+def test_a_contact_that_stays_too_strong_is_latched(tmp_path: Path) -> None:
+    rig = pressed(tmp_path, 0.02, patience=0.15)
+    assert Alarm.LATCHED in rig.alarms()
+    assert (rig.status.state, rig.status.error) == (State.ERROR, Error.FORCE)
+    assert rig.status.reason.endswith("not over within 0.15 s")
+
+
+def test_a_sensor_at_the_end_of_its_range_stops_the_arm(tmp_path: Path) -> None:
+    rig = PressRig(tmp_path, reach=60.0)
+    rig.arm.contact.take(np.array([60.0, 0, 0, 0, 0, 0]), np.array([rig.arm.cell.home, np.zeros(6)]), np.zeros(6))
+    assert rig.arm.contact.saturated
+    rig.go(FREE_M, 0.1)
+    rig.go(WALL_M + 0.02, 0.4)
+    assert rig.alarms() == [Alarm.FORCE_LIMIT]
+
+
+def test_a_restarted_board_continues_its_count_and_its_sensing(tmp_path: Path) -> None:
+    rig = pressed(tmp_path, 0.02)
+    exceeded = rig.wrench.exceeded
+    rig.rack.lose("arm", ticks=3)
+    rig.run(10)
+    assert rig.wrench.exceeded >= exceeded > 0
+    assert abs(rig.forces[-1] - rig.forces[-20]) < 5.0

@@ -1,0 +1,188 @@
+"""The calls of a client of a server of force and motion, and the contacts of its program."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message
+from rack.levels.errors import LevelError
+from rack.levels.level import LevelContext
+from rack.levels.systems.force.client import ForceMotions
+from rack.levels.systems.force.messages import SERVER_STATUS, Mode
+from rack.levels.systems.force.program import ForceProgram
+from rack.levels.systems.force.server import ForceServer
+from rack.levels.systems.trajectory.messages import MotionKind
+from tests.levels.arms import config
+
+ROBOT, SCENE = config("penn_cell")
+TASK: Mapping[str, Any] = {
+    "frame": {"table": {"x": [0.0, 2.0, 0.0], "z": [0.0, 0.0, -1.0]}},
+    "contact": {
+        "wipe": {"frame": "table", "wrench": {"z": 15.0}, "speed": {"z": 0.1}},
+        "wall": {"frame": "table", "guard": {"x": 8.0, "ry": 0.5}},
+    },
+}
+CONTEXT = LevelContext(
+    board="client",
+    every=1,
+    within_cycles=1,
+    clock_ns=1_000_000,
+    seed=1,
+    robot=ROBOT,
+    scene=SCENE,
+    task=TASK,
+    sizes={"joints": 6},
+)
+
+
+class Bus:
+    """Takes requests, and a tick of the clock for every wait."""
+
+    def __init__(self) -> None:
+        self.tick, self.is_over = 0, False
+        self.requests: list[dict[str, Any]] = []
+        self.status = Message(SERVER_STATUS.dtype({"joints": 6}))
+
+    @property
+    def time_s(self) -> float:
+        return self.tick * CONTEXT.tick_s
+
+    def wait(self, timeout_s: float) -> bool:
+        self.tick += 20
+        return True
+
+    def read(self, port: str) -> Reading:
+        return Reading(self.status, Verdict.NEW)
+
+    def send(self, port: str, **fields: Any) -> bool:
+        self.requests.append(fields)
+        return True
+
+    def sent(self, port: str) -> int:
+        return 0
+
+    def finish(self) -> None:
+        """Do nothing."""
+
+
+@pytest.fixture
+def bus() -> Bus:
+    return Bus()
+
+
+@pytest.fixture
+def arm(bus: Bus) -> ForceMotions:
+    return ForceMotions(bus, CONTEXT)
+
+
+def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
+    arm.comply("wipe", wrench={"z": 20.0, "rx": 0.0})
+    arm.guard("wall")
+    arm.free()
+    comply, guard, free = bus.requests
+    assert [request["kind"] for request in bus.requests] == [MotionKind.COMPLY, MotionKind.GUARD, MotionKind.COMPLY]
+    assert comply["selected"].tolist() == [False, False, True, True, False, False]
+    assert comply["wrench"].tolist() == [0, 0, 20, 0, 0, 0]
+    assert comply["speed"].tolist() == [0, 0, 0.1, 0, 0, 0]
+    assert guard["guard"].tolist() == [8, 0, 0, 0, 0.5, 0]
+    assert np.allclose(comply["frame"], guard["frame"])
+    assert "selected" not in free
+
+
+def test_the_frame_of_a_request_has_the_axes_of_the_config(bus: Bus, arm: ForceMotions) -> None:
+    arm.guard("wall")
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, bus.requests[0]["frame"])
+    assert np.allclose(axes.reshape(3, 3)[:, 0], (0, 1, 0))
+    assert np.allclose(axes.reshape(3, 3)[:, 2], (0, 0, -1))
+
+
+def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
+    request = arm.free()
+    assert not arm.wait(request, until=lambda: bus.tick >= 1000)
+    signs = [fields for fields in bus.requests if fields["id"] == 0]
+    assert len(signs) == 9
+
+
+def test_what_the_server_says_is_read(bus: Bus, arm: ForceMotions) -> None:
+    bus.status.wrench, bus.status.mode, bus.status.place = (0, 0, 14.5, 0, 0, 0), Mode.FORCE, (0.5, 0.1, 0.4)
+    assert arm.wrench()["z"] == 14.5
+    assert arm.mode() is Mode.FORCE
+    assert arm.where() == [0.5, 0.1, 0.4]
+
+
+@pytest.mark.parametrize(
+    ("call", "contact", "changes", "message"),
+    [
+        (
+            "comply",
+            "wipe",
+            {"wrench": {"z": 90.0}},
+            "contact 'wipe': force 90 N; permitted by the arm and its sensor: 80",
+        ),
+        ("comply", "wall", {}, "contact 'wall' has no axis of force; free() ends compliance"),
+        ("guard", "wipe", {}, "contact 'wipe' guards no axis"),
+        ("guard", "wood", {}, "contact 'wood' is not in [task.contact]; permitted: wipe, wall"),
+        (
+            "guard",
+            "wall",
+            {"guard": {"ry": 9.0}},
+            "contact 'wall': torque 9 N m; permitted by the arm and its sensor: 8",
+        ),
+        ("comply", "wipe", {"wrench": {"w": 5.0}}, "wrench.w"),
+        ("comply", "wipe", {"speed": {"x": 0.1}}, "contact 'wipe': axis x has a speed and no force; axes of force: z"),
+    ],
+)
+def test_an_impossible_contact_is_refused_at_once(
+    bus: Bus, arm: ForceMotions, call: str, contact: str, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(LevelError) as refused:
+        getattr(arm, call)(contact, **changes)
+    assert str(refused.value).startswith(f"{call}: {message}")
+    assert "\n" not in str(refused.value)
+    assert not bus.requests
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "reason"),
+    [
+        (
+            {"frame": {"bent": {"x": [1.0, 0.0, 0.0], "z": [0.5, 0.0, 1.0]}}},
+            "frame.bent",
+            "its axes x and z are not at a right angle: no frame",
+        ),
+        (
+            {"frame": {"flat": {"x": [1.0, 0.0, 0.0], "z": [0.0, 0.0, 0.0]}}},
+            "frame.flat",
+            "an axis of length 0: no frame",
+        ),
+        (
+            {"contact": {"wipe": {"frame": "table", "wrench": {"z": 81.0}}}},
+            "contact.wipe",
+            "frame 'table' is not in [task.frame]; permitted: none",
+        ),
+        (
+            {**TASK, "contact": {"wipe": {"frame": "table", "wrench": {"z": 60.0, "x": -60.0}}}},
+            "contact.wipe",
+            "force 84.8528 N; permitted by the arm and its sensor: 80",
+        ),
+    ],
+)
+def test_a_program_that_is_impossible_is_found_before_the_launch(table: Any, key: str, reason: str) -> None:
+    found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
+    assert [(place, why) for place, _, why in found] == [(key, reason)]
+
+
+def test_an_arm_without_a_sensor_has_no_contacts_and_no_server() -> None:
+    bare = ROBOT.model_copy(update={"wrist": None})
+    reasons = [reason for _, _, reason in ForceProgram.model_validate(TASK).misfits(bare, SCENE)]
+    assert reasons == ["the arm has no wrist sensor"] * 2
+    ((key, server, _),) = ForceServer.misfits(replace(CONTEXT, robot=bare), (), ())
+    assert (key, server) == ("executor", "ForceServer")

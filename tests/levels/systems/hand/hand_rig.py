@@ -1,0 +1,86 @@
+"""A hand whose tendons are driven by test boards: each holds its joints at positions, as a joint loop would."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.message import Message
+from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.robot.cell import build_cell
+from rack.levels.systems.hand.executor import HandExecutor
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HAND_STATUS, TENSION_COMMAND
+from rack.levels.tables import PushConfig
+from tests.levels.arms import config
+from tests.levels.lockstep import BoardSpec, Lockstep
+
+CLOCK_NS = 500_000
+EVERY = 4
+STIFFNESS, DAMPING = 2.0, 0.06
+"""Of a joint, N m/rad and N m s/rad."""
+AMPLITUDE_RAD, RATE = 0.15, 6.0
+"""Of the swing of every joint about home, and its frequency, rad/s."""
+
+
+class Swing(Executor):
+    """Swings the joints of the finger `finger`, or of all."""
+
+    inputs = {"status": Input(HAND_STATUS, "below.status"), "before": Input(TENSION_COMMAND, "own.command")}
+    outputs = {"command": TENSION_COMMAND}
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        hand = build_cell(context.robot, context.scene, context.clock_ns).hand
+        assert hand is not None
+        self.hand = hand
+        finger = context.params.get("finger")
+        self.driven = np.ones(len(hand.arms), bool) if finger is None else hand.fingers[hand.names.index(finger)]
+        self.is_blind = False  # it takes no new status
+        self.override: float | None = None  # N: commanded of all tendons instead
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        status, command, hand = read.status.value, write.command, self.hand
+        if not read.status.is_there or self.is_blind:
+            command.sampled = -1 if not read.status.is_there else command.sampled
+            return
+        wanted = np.array(self.context.robot.home) + AMPLITUDE_RAD * np.sin(RATE * tick * self.context.tick_s)
+        torque = STIFFNESS * (wanted - status.position) - DAMPING * status.velocity
+        tension = np.zeros((2, len(torque)))
+        tension[FLEXOR], tension[EXTENSOR] = hand.rest + torque / (2 * hand.arms), hand.rest - torque / (2 * hand.arms)
+        command.tension = np.clip(tension, hand.least, hand.most) if self.override is None else self.override
+        command.driven, command.sampled = self.driven, status.tick
+
+
+class HandRig(Lockstep):
+    """A hand and the boards that swing its fingers: one for each of `fingers`, or one for all."""
+
+    def __init__(self, fingers: tuple[str, ...] = (), pushes: tuple[PushConfig, ...] = ()) -> None:
+        robot, scene = config("utah_mit")
+        above = tuple(fingers) or ("all",)
+        params: dict[str, dict[str, Any]] = {name: {"finger": name} if fingers else {} for name in above}
+        boards = [BoardSpec("hand", EVERY, HandExecutor, above=above)]
+        boards += [BoardSpec(name, EVERY, Swing, below="hand", params=params[name]) for name in above]
+        super().__init__(boards, robot, scene.model_copy(update={"push": pushes}), clock_ns=CLOCK_NS)
+
+    @property
+    def executor(self) -> HandExecutor:
+        """The board of the hand."""
+        level = self.tasks["hand"].level
+        assert isinstance(level, HandExecutor)
+        return level
+
+    def swing(self, board: str = "all") -> Swing:
+        """Return a board above."""
+        level = self.tasks[board].level
+        assert isinstance(level, Swing)
+        return level
+
+    @property
+    def status(self) -> Message:
+        """The newest status that is visible."""
+        return self.read("hand.status")
+
+    def cycles(self, count: int) -> None:
+        """Run `count` cycles of the hand."""
+        self.run(count * EVERY * CLOCK_NS * 1e-9)

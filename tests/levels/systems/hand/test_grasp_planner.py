@@ -1,0 +1,85 @@
+"""Planned grasps: tips on opposite sides of the object, joints that reach them, and no contact before they close."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.levels.algebra import Array, mat_vec
+from rack.levels.errors import LevelError
+from rack.levels.systems.hand.grasp_planner import GraspPlanner, GraspRules
+from rack.levels.systems.hand.kinematics import FingerKinematics
+from tests.levels.arms import cell
+
+HAND = cell("utah_mit")
+CAN_RADIUS_M = 0.024
+RULES = GraspRules()
+START = HAND.start()
+AT, UPRIGHT = START.xpos[HAND.bodies[0]].copy(), np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def planner() -> GraspPlanner:
+    return GraspPlanner(HAND, "thumb", RULES)
+
+
+def tips(posture: Array) -> Array:
+    """Return the tips at joint positions, (fingers, 3), m, in the palm's frame."""
+    assert HAND.hand is not None
+    kinematics = FingerKinematics(HAND, HAND.hand)
+    kinematics.look(posture)
+    return np.array([kinematics.tip(finger) for finger in range(4)])
+
+
+def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planner: GraspPlanner) -> None:
+    found = planner.plan(0, AT, UPRIGHT)
+    assert found is not None
+    radii = np.sqrt((found.contact[:, :2] ** 2).sum(axis=1))
+    assert radii == pytest.approx(np.full(4, CAN_RADIUS_M))
+    assert found.normal[:3] == pytest.approx(-found.normal[[3, 3, 3]])
+    # Each pushes into the object, through its axis.
+    assert found.normal[:, :2] == pytest.approx(-found.contact[:, :2] / CAN_RADIUS_M)
+    assert 0.1 < found.margin < 0.5
+
+
+def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_asked(planner: GraspPlanner) -> None:
+    found = planner.plan(0, AT, UPRIGHT)
+    assert found is not None
+    outside = AT + found.contact - RULES.clear * found.normal
+    palm = START.site_xmat[HAND.tool].reshape(3, 3).T
+    wanted = np.array([mat_vec(palm, point - START.site_xpos[HAND.tool]) for point in outside])
+    assert np.abs(tips(found.posture) - wanted).max() < 2e-3
+
+
+def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(planner: GraspPlanner) -> None:
+    turned = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)])
+    moved = planner.plan(0, AT + np.array([0.006, -0.004, 0.003]), UPRIGHT)
+    rotated = planner.plan(0, AT, turned)
+    assert moved is not None
+    assert rotated is not None
+    for found in (moved, rotated):
+        assert np.sqrt((found.contact[:, :2] ** 2).sum(axis=1)) == pytest.approx(np.full(4, CAN_RADIUS_M))
+    straight = planner.plan(0, AT, UPRIGHT)
+    assert straight is not None
+    spin = np.zeros(9)
+    mujoco.mju_quat2Mat(spin, turned)
+    # In the world it is the same grasp.
+    again = [mat_vec(spin.reshape(3, 3), point) for point in rotated.contact]
+    assert np.array(again) == pytest.approx(straight.contact, abs=1e-6)
+
+
+def test_an_object_out_of_reach_has_no_grasp(planner: GraspPlanner) -> None:
+    assert planner.plan(0, AT + np.array([0.3, 0.0, 0.0]), UPRIGHT) is None
+
+
+def test_the_grip_bears_weight_and_pull_by_friction_with_a_reserve() -> None:
+    found = GraspPlanner(HAND, "thumb", GraspRules(pull=4.0, reserve=2.0)).plan(0, AT, UPRIGHT)
+    assert found is not None
+    # 0.15 kg, friction 1, three fingers that press and a thumb that bears their sum.
+    assert 2.0 * 3.0 * found.grip == pytest.approx(2.0 * (0.15 * 9.81 + 4.0))
+
+
+def test_a_finger_that_the_hand_lacks_cannot_oppose() -> None:
+    with pytest.raises(LevelError, match="opposing = little: the hand has no such finger; fingers: index, middle"):
+        GraspPlanner(HAND, "little", RULES)

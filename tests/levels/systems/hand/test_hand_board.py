@@ -1,0 +1,267 @@
+"""The board of a hand: driven by the tensions of one board or of four, and what it does without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults.kinds import KINDS
+from rack.levels.level import Demand, Fault, LevelContext
+from rack.levels.messages import Error
+from rack.levels.operator import Answer, Operation
+from rack.levels.servo import ServoExecutor
+from rack.levels.systems.hand.executor import HandExecutor
+from rack.levels.systems.hand.messages import EXTENSOR
+from rack.levels.systems.joint_boards import ArmExecutor
+from rack.levels.tables import PushConfig
+from tests.levels.arms import config
+from tests.levels.box import mute
+from tests.levels.lockstep import Operator
+from tests.levels.systems.hand.hand_rig import AMPLITUDE_RAD, CLOCK_NS, EVERY, HandRig, Swing
+
+FINGERS = ("index", "middle", "ring", "thumb")
+
+
+def swinging(fingers: tuple[str, ...] = FINGERS) -> HandRig:
+    rig = HandRig(fingers)
+    rig.cycles(60)
+    assert np.abs(rig.status.velocity).max() > 0.1
+    return rig
+
+
+def assert_follows(rig: HandRig) -> None:
+    rig.cycles(40)
+    status = rig.status
+    assert (status.state, status.holding, status.stopped, status.reason) == (State.EXECUTING, 0, 0, "")
+    rig.cycles(10)
+    assert np.abs(rig.status.position - status.position).min() > 1e-4
+
+
+def test_four_boards_move_the_hand_as_one_does() -> None:
+    together, apart = HandRig(), HandRig(FINGERS)
+    for rig in (together, apart):
+        rig.cycles(150)
+    assert np.array_equal(together.status.position, apart.status.position)
+    off = together.status.position - np.array(config("utah_mit")[0].home)
+    assert np.abs(off).max() == pytest.approx(AMPLITUDE_RAD, abs=0.06)
+    assert (together.status.violations, together.status.touches, together.status.clipped) == (0, 0, 0)
+
+
+def test_hand_is_idle_until_every_board_sends_tensions() -> None:
+    rig = HandRig(FINGERS)
+    rig.tasks["thumb"].due = 25 * EVERY
+    rig.cycles(20)
+    status = rig.status
+    assert (status.state, status.holding, status.stopped) == (State.IDLE, 1, 0)
+    assert status.reason == "no tensions from board 'thumb' yet"
+    assert status.position == pytest.approx(config("utah_mit")[0].home, abs=1e-6)
+    rig.cycles(20)
+    assert_follows(rig)
+
+
+def test_lost_board_closes_the_valves_until_it_is_back() -> None:
+    rig = swinging()
+    rig.lose("ring", ticks=50 * EVERY)
+    rig.cycles(2)
+    status = rig.status
+    assert (status.state, status.holding, status.stopped) == (State.HOLDING, 1, 1)
+    assert status.reason == "board 'ring' is lost: valves closed until it is back"
+    rig.cycles(40)
+    assert rig.executor.hand.braked
+    rig.cycles(20)
+    assert_follows(rig)
+
+
+def test_silent_board_closes_the_valves_after_two_of_its_cycles() -> None:
+    rig = swinging()
+    rig.disturb("index.command", mute, ticks=20 * EVERY)
+    rig.cycles(3)
+    assert not rig.executor.hand.braked
+    rig.cycles(2)
+    assert rig.executor.hand.braked
+    rig.cycles(30)
+    assert_follows(rig)
+
+
+def test_board_that_sees_nothing_new_closes_the_valves() -> None:
+    rig = swinging()
+    rig.swing("index").is_blind = True
+    rig.cycles(8)
+    status = rig.status
+    assert (status.state, status.stopped) == (State.HOLDING, 1)
+    assert status.reason == "stale tensions from board 'index': based on a status more than 20 ticks old"
+    rig.swing("index").is_blind = False
+    rig.cycles(10)
+    assert_follows(rig)
+
+
+@pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
+def test_emergency_stop_closes_the_valves_and_keeps_the_tensions(demand: Demand) -> None:
+    rig = swinging()
+    rig.stop(demand, ticks=40 * EVERY)
+    rig.cycles(2)
+    held = rig.status
+    rig.cycles(30)
+    status = rig.status
+    assert (status.demand, status.stopped, status.state) == (demand, 1, State.HOLDING)
+    assert status.reason.startswith(f"demand '{demand.name.lower()}' on the hand: valves closed until")
+    assert np.abs(status.velocity).max() < 0.5 * np.abs(held.velocity).max()
+    assert status.tension.min() > 10.0  # it does not let go
+    rig.cycles(20)
+    assert_follows(rig)
+
+
+def test_operator_holds_the_hand_and_lets_it_go_on() -> None:
+    rig = swinging(())
+    operator = Operator(rig)
+    serial = operator.say("hand", Operation.HOLD)
+    rig.cycles(4)
+    status = rig.status
+    assert (status.order, status.answer, status.standing) == (serial, Answer.DONE, Operation.HOLD)
+    assert (status.stopped, status.reason) == (1, "held by the operator: valves closed; `resume` opens them")
+    operator.say("hand", Operation.RESUME)
+    rig.cycles(10)
+    assert_follows(rig)
+
+
+def test_tension_that_is_nan_is_refused_and_reported_once() -> None:
+    rig = swinging(())
+    rig.swing().override = np.nan
+    rig.cycles(10)
+    assert rig.executor.hand.braked
+    assert rig.status.reason == "rejected: tension of 'index0', flexor is NaN"
+    assert [found.alarm for found in rig.executor.findings] == [Alarm.TENSION_INVALID]
+    assert np.isfinite(rig.status.wanted).all()
+    rig.swing().override = None
+    rig.cycles(20)
+    assert_follows(rig)
+
+
+@pytest.mark.parametrize(("asked", "given"), [(150.0, 100.0), (0.0, 2.0), (-30.0, 2.0)])
+def test_tension_beyond_its_limits_is_cut(asked: float, given: float) -> None:
+    rig = swinging(())
+    rig.swing().override = asked
+    rig.cycles(5)
+    assert rig.status.wanted == pytest.approx(given)
+    assert rig.status.clipped > 0
+    assert [(found.alarm, found.value) for found in rig.executor.findings] == [(Alarm.TENSION_LIMIT, asked)]
+
+
+def test_restarted_board_finds_the_hand_where_the_valves_have_kept_it() -> None:
+    rig = swinging()
+    before = rig.status.position
+    rig.lose("hand", ticks=50 * EVERY)
+    rig.cycles(52)
+    status = rig.status
+    assert (status.stopped, status.violations) == (1, 0)
+    assert np.abs(status.position - before).max() < 0.3
+    rig.cycles(10)
+    assert_follows(rig)
+
+
+def test_board_restarted_between_two_cycles_continues_bit_for_bit() -> None:
+    whole, broken = swinging(()), swinging(())
+    # Both hands are closed: one by its operator, one too, and restarted then.
+    for rig in (whole, broken):
+        Operator(rig).say("hand", Operation.HOLD)
+        rig.cycles(10)
+    broken.restart("hand")
+    for rig in (whole, broken):
+        rig.cycles(20)
+    assert np.array_equal(whole.read("hand.state").state, broken.read("hand.state").state)
+
+
+def test_push_on_the_object_shows_as_an_error_only_when_something_is_struck() -> None:
+    rig = HandRig(pushes=(PushConfig(body="can", at=0.0, seconds=0.2, force=(3.0, 0.0, 0.0)),))
+    rig.cycles(150)
+    assert rig.status.error == Error.NONE
+    assert rig.read("hand.scene").position[0, 0] > 0.06
+
+
+def tear(rig: HandRig, joint: int, side: int) -> None:
+    kind = KINDS["tendon-torn"]
+    rig.executor.inject([Fault(kind.name, {"joint": joint, "side": side}, 1, rig.tick, kind.step)])
+
+
+def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
+    rig = swinging(())
+    tear(rig, 5, EXTENSOR)
+    assert str(KINDS["tendon-torn"].bound) == "6 cycles"
+    rig.cycles(6)
+    assert [(found.alarm, found.subject) for found in rig.executor.findings] == [(Alarm.TENDON, 5)]
+    assert rig.executor.acted
+    rig.cycles(2)
+    status = rig.status
+    assert (status.state, status.error) == (State.EXECUTING, Error.NONE)
+    assert status.reason == "slack: extensor of 'middle1'"
+    assert status.tension[EXTENSOR, 5] == 0.0
+    assert status.torque[5] > 0.0
+    assert np.delete(status.tension, 5, axis=1).min() >= 2.0
+    rig.executor.inject([])
+    rig.cycles(20)
+    assert rig.status.reason == ""
+    assert_follows(rig)
+
+
+def test_slack_that_closed_valves_bring_about_is_no_torn_tendon() -> None:
+    rig = swinging(())
+    rig.stop(Demand.STOP, ticks=40 * EVERY)
+    rig.cycles(2)
+    rig.executor.hand._data.ctrl[:] = -60.0  # as of fingers that have moved on
+    rig.cycles(30)
+    assert rig.status.tension.max() < 0.9
+    rig.cycles(30)
+    assert rig.executor.findings == []
+
+
+def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContext]:
+    """Return the context of a hand's board, then those of the boards `above` with the fingers that they drive."""
+    robot, scene = config("utah_mit" if hand else "puma560")
+    return [
+        LevelContext(name, EVERY, 1, CLOCK_NS, 0, robot, scene, {}, {}, params={"finger": finger} if finger else {})
+        for name, finger in (("hand", None), *above.items())
+    ]
+
+
+@pytest.mark.parametrize(
+    ("above", "why"),
+    [
+        ({"all": None}, None),
+        ({name: name for name in FINGERS}, None),
+        (
+            {name: name for name in FINGERS[1:]},
+            "joint 'index0' must be commanded by one board; it is commanded by none",
+        ),
+        (
+            {"all": None, "ring": "ring"},
+            "joint 'ring0' must be commanded by one board; it is commanded by 'all', 'ring'",
+        ),
+    ],
+)
+def test_every_joint_must_be_driven_by_one_board(above: dict[str, str | None], why: str | None) -> None:
+    own, *others = context(above)
+    found = [misfit[2] for misfit in HandExecutor.misfits(own, others, [])]
+    assert found[:1] == ([] if why is None else [why])
+    assert len(found) in (0, 4)
+
+
+def test_board_of_a_hand_needs_a_hand() -> None:
+    own, *others = context({"all": None}, hand=False)
+    assert [misfit[2] for misfit in HandExecutor.misfits(own, others, [])] == [
+        "this board drives a hand; [robot.hand] is missing"
+    ]
+
+
+@pytest.mark.parametrize("kind", [ArmExecutor, ServoExecutor])
+def test_board_of_an_arm_drives_no_hand(kind: type[ArmExecutor | ServoExecutor]) -> None:
+    own, *_ = context({})
+    first, *_ = kind.misfits(own, [], [])
+    assert first == ("executor", kind.__name__, "it drives an arm with motors; [robot.hand] is a hand of tendons")
+
+
+def test_rig_swings_by_what_the_hand_has_sensed() -> None:
+    rig = swinging()
+    assert isinstance(rig.swing("thumb"), Swing)
+    assert rig.read("thumb.command").driven.tolist() == [0] * 12 + [1] * 4

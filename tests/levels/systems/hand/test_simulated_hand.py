@@ -1,0 +1,176 @@
+"""The simulated hand: tensions behind valves, limits at every step, forces on fingertips, exact restarts."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import STATE, build_cell, sizes
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
+from rack.levels.systems.hand.simulated import SimulatedHand
+from rack.levels.tables import SensorConfig
+from tests.levels.arms import config
+from tests.levels.systems.hand.hand_rig import CLOCK_NS, EVERY
+
+TICK_S = CLOCK_NS * 1e-9
+INDEX1 = 1
+
+
+def hand_of(stiff: float | None = None) -> SimulatedHand:
+    """Return the hand, with `stiff`, N/m, of its closed valves."""
+    robot, scene = config("utah_mit")
+    if stiff is not None and robot.hand is not None:
+        robot = robot.model_copy(update={"hand": robot.hand.model_copy(update={"closed": stiff})})
+    return SimulatedHand(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS, EVERY)
+
+
+def saved(hand: SimulatedHand) -> Message:
+    state = Message(ARM_STATE.dtype(sizes(hand.cell)))
+    hand.save(state)
+    return state
+
+
+def flexed(hand: SimulatedHand, joint: int, flexor: float) -> Array:
+    """Return the tensions at the start, with another one of a flexor."""
+    tension = np.array(hand.wanted)
+    tension[FLEXOR, joint] = flexor
+    return tension
+
+
+def test_open_hand_carries_its_weight_before_the_first_command() -> None:
+    hand = hand_of()
+    hand.step(1000)
+    assert hand.sense().position == pytest.approx(hand.cell.home, abs=1e-6)
+    assert (hand.braked, hand.touches, hand.violations, hand.fault) == (True, 0, 0, "")
+
+
+def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_the_valve() -> None:
+    hand = hand_of()
+    before = hand.sense().tension[FLEXOR, INDEX1]
+    wanted, risen = flexed(hand, INDEX1, 65.0), []
+    for _ in range(40):
+        hand.pull(wanted)
+        hand.step(1)
+        risen.append((hand.sense().tension[FLEXOR, INDEX1] - before) / (65.0 - before))
+    times = TICK_S * np.arange(1, 41) - 0.001
+    # A sample is that of half a tick before, and controls are delayed by whole steps.
+    assert risen == pytest.approx(np.maximum(0.0, 1.0 - np.exp(-times / 0.008)), abs=0.08)
+    assert risen[0] == 0.0
+    assert risen[-1] > 0.88
+
+
+def test_torque_is_the_arm_times_the_difference_of_the_tensions() -> None:
+    hand = hand_of()
+    hand.pull(flexed(hand, INDEX1, 40.0))
+    hand.step(60)
+    sample = hand.sense()
+    assert sample.torque == pytest.approx(hand.hand.arms * (sample.tension[FLEXOR] - sample.tension[EXTENSOR]))
+
+
+def test_no_pull_breaks_a_limit_at_any_step() -> None:
+    hand, rng = hand_of(), np.random.default_rng(3)
+    for _ in range(20):
+        flex = rng.random(16) < 0.5
+        tension = np.where([flex, ~flex], hand.hand.most, hand.hand.least)
+        for _ in range(20):
+            hand.pull(tension)
+            hand.step(EVERY)
+    assert (hand.violations, hand.pushed, hand.first_violation, hand.fault) == (0, 0, "", "")
+
+
+def test_closed_valves_bring_a_moving_finger_to_rest_and_a_stiffer_one_sooner() -> None:
+    ways = []
+    for stiff in (1000.0, 4000.0):
+        hand = hand_of(stiff)
+        for _ in range(20):
+            hand.pull(flexed(hand, INDEX1, 30.0))
+            hand.step(EVERY)
+        begun = float(hand.sense().position[INDEX1])
+        assert hand.sense().velocity[INDEX1] > 1.0
+        hand.close()
+        hand.step(2000)
+        ways.append(float(hand.sense().position[INDEX1]) - begun)
+        assert abs(hand.sense().velocity[INDEX1]) < 0.05
+    assert 0.0 < ways[1] < 0.7 * ways[0]
+
+
+def test_valves_close_by_themselves_when_no_command_comes() -> None:
+    hand = hand_of()
+    hand.pull(flexed(hand, INDEX1, 20.0))
+    hand.step(2 * EVERY)
+    assert not hand.braked
+    hand.step(1)
+    assert hand.braked
+
+
+def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:
+    hand = hand_of()
+    around = np.array([0.0, 0.70, 0.86, 0.75] * 3 + [0.0, 0.40, 0.72, 0.75])
+    for _ in range(300):
+        sample, tension = hand.sense(), np.array(hand.wanted)
+        torque = 1.5 * (around - sample.position) - 0.1 * sample.velocity
+        tension[FLEXOR], tension[EXTENSOR] = 20.0 + torque / (2 * hand.hand.arms), 20.0 - torque / (2 * hand.hand.arms)
+        hand.pull(tension.clip(hand.hand.least, hand.hand.most))
+        hand.step(EVERY)
+    force = hand.sense().force
+    assert force[:3, 0].min() > 0.2  # fingers and thumb are on either side of the can
+    assert force[3, 0] < -0.6
+    # What MuJoCo finds at the contacts of the index, a step later.
+    data, total = hand._data, np.zeros(3)
+    mujoco.mj_forward(hand.cell.model, data)
+    tip = hand.cell.model.site_bodyid[hand.hand.tips[0]]
+    for number in range(data.ncon):
+        contact, wrench = data.contact[number], np.zeros(6)
+        mujoco.mj_contactForce(hand.cell.model, data, number, wrench)
+        bodies = hand.cell.model.geom_bodyid[[contact.geom1, contact.geom2]]
+        total += (bodies[1] == tip) * (wrench[:3] @ contact.frame.reshape(3, 3))
+        total -= (bodies[0] == tip) * (wrench[:3] @ contact.frame.reshape(3, 3))
+    palm = data.site_xmat[hand.cell.tool].reshape(3, 3)
+    assert force[0] == pytest.approx(total @ palm, abs=0.05)
+
+
+@pytest.mark.parametrize("closes", [False, True])
+def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
+    def run(hand: SimulatedHand, cycles: range) -> None:
+        for cycle in cycles:
+            if closes and cycle > 40:
+                hand.close()
+            else:
+                hand.pull(flexed(hand, INDEX1, 40.0 + 20.0 * np.sin(0.3 * cycle)))
+            hand.step(EVERY)
+
+    first, again, middle = hand_of(), hand_of(), Message(ARM_STATE.dtype(sizes(hand_of().cell)))
+    run(first, range(60))
+    first.save(middle)
+    run(first, range(60, 90))
+    again.restore(middle)
+    run(again, range(60, 90))
+    assert saved(again).raw == saved(first).raw
+    assert all(np.array_equal(a, b) for a, b in zip(again.sense(), first.sense(), strict=True))
+
+
+def test_state_of_the_simulation_holds_what_valves_remember() -> None:
+    hand = hand_of()
+    hand.pull(flexed(hand, INDEX1, 65.0))
+    hand.step(1)  # the command is still in the valve
+    again = hand_of()
+    again.restore(saved(hand))
+    for one in (hand, again):
+        one.pull(np.array(one.wanted))
+        one.step(EVERY)
+    assert hand.sense().tension[FLEXOR, INDEX1] > 16.0
+    assert np.array_equal(again.sense().tension, hand.sense().tension)
+    assert saved(hand).state.shape == (mujoco.mj_stateSize(hand.cell.model, STATE),)
+
+
+def test_encoders_of_a_hand_may_be_coarse() -> None:
+    robot, scene = config("utah_mit")
+    robot = robot.model_copy(update={"sensors": SensorConfig(resolution=0.01)})
+    hand = SimulatedHand(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS, EVERY)
+    position = hand.sense().position
+    assert position == pytest.approx(np.round(position / 0.01) * 0.01)
+    assert position == pytest.approx(hand.cell.home, abs=0.0051)

@@ -1,0 +1,142 @@
+"""A gateway between a trajectory level and boards that servo joints: on time, extrapolating, frozen, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message, MessageType, State
+from rack.levels.level import LevelContext, Pace, Ports
+from rack.levels.messages import Error
+from rack.levels.robot.cell import sizes
+from rack.levels.systems.joint_boards.gateway import JointGateway
+from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from tests.levels.arms import cell, config
+
+TICK_S = 0.001
+PERIOD, EVERY, DELAY, MISSING = 10, 2, 2, 5
+LATENCY = DELAY + 2 * EVERY
+SPEED = 0.5
+"""rad/s, of every joint."""
+BOARDS = ("near", "far")
+
+
+def message(kind: MessageType) -> Message:
+    return Message(kind.dtype(sizes(cell("puma560"))))
+
+
+class GatewayRig:
+    """Runs a gateway; references of a steady motion are visible when those of a trajectory level are."""
+
+    def __init__(self) -> None:
+        robot, scene = config("puma560")
+        paces = {"above": {"above": Pace(PERIOD, 1)}, "below": {name: Pace(1, 1) for name in BOARDS}}
+        params = {"delay": DELAY * TICK_S, "missing": MISSING}
+        context = LevelContext("gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, {}, **paces, params=params)
+        self.gateway = JointGateway(context)
+        self.write = Ports(command=message(JOINT_REFERENCE), status=message(JOINT_STATUS))
+        self.statuses = {name: message(JOINT_STATUS) for name in BOARDS}
+        for k, status in enumerate(self.statuses.values()):
+            status.driven[k::2] = 1
+            status.target[k::2] = 1.0 + k
+        self.lost: set[str] = set()
+        self.tick = 0
+        self.made = -1  # tick of the newest reference read
+        self.given: list[tuple[int, int, float]] = []  # tick, due and position of the references given
+
+    @property
+    def status(self) -> Message:
+        return self.write.status
+
+    def run(self, ticks: int, late: int = 0, missing: bool = False) -> None:
+        """Run up to a tick; references come `late` ticks late, or are `missing`; the motion goes on meanwhile."""
+        for _ in range(ticks // EVERY):
+            made = (self.tick - PERIOD - late) // PERIOD * PERIOD
+            reference = message(JOINT_REFERENCE)
+            is_new = made > self.made and made >= 0 and not missing
+            if is_new:
+                self.made = made
+                reference.id, reference.due = made // PERIOD + 1, made + 2 * PERIOD
+                reference.position, reference.velocity = SPEED * TICK_S * reference.due, SPEED
+            command = Reading(reference, Verdict.NEW if is_new else Verdict.OLD)
+            statuses = {name: Reading(status, Verdict.NEW, name in self.lost) for name, status in self.statuses.items()}
+            before = self.write.command.due
+            self.gateway.process(Ports(command=command, statuses=statuses), self.write, self.tick)
+            if self.write.command.due != before:
+                self.given.append((self.tick, self.write.command.due, float(self.write.command.position[0])))
+            self.tick += EVERY
+
+
+def test_references_are_handed_on_later_by_a_constant_time_and_in_time_to_be_followed() -> None:
+    rig = GatewayRig()
+    rig.run(200)
+    ticks, dues, positions = zip(*rig.given, strict=True)
+    assert np.diff(dues).tolist() == [PERIOD] * (len(dues) - 1)
+    assert dues[0] == 2 * PERIOD + LATENCY
+    assert [due - LATENCY for due in dues] == pytest.approx([position / (SPEED * TICK_S) for position in positions])
+    # Visible a cycle later, each comes before the one before it is due.
+    assert all(tick + EVERY <= due for tick, due in zip(ticks[1:], dues, strict=False))
+
+
+@pytest.mark.parametrize("count", [1, MISSING])
+def test_missing_references_are_extrapolated_without_a_gap(count: int) -> None:
+    rig = GatewayRig()
+    rig.run(100)
+    rig.run(count * PERIOD, missing=True)
+    rig.run(100)
+    assert np.diff([due for _, due, _ in rig.given]).tolist() == [PERIOD] * (len(rig.given) - 1)
+    # At the speed of the newest: the motion was steady.
+    wanted = [SPEED * TICK_S * (due - LATENCY) for _, due, _ in rig.given]
+    assert [position for _, _, position in rig.given] == pytest.approx(wanted)
+
+
+def test_references_that_are_always_late_are_extrapolated_from_the_newest() -> None:
+    rig = GatewayRig()
+    rig.run(100)
+    rig.run(300, late=3 * PERIOD)
+    assert rig.write.command.due > rig.tick
+    assert rig.given[-1][2] == pytest.approx(SPEED * TICK_S * (rig.given[-1][1] - LATENCY))
+
+
+def test_after_too_many_missing_the_arm_is_left_to_the_boards_and_then_joined_again() -> None:
+    rig = GatewayRig()
+    rig.run(100)
+    newest = rig.made + 2 * PERIOD + LATENCY
+    rig.run(150, missing=True)
+    assert [due for _, due, _ in rig.given[-2:]] == [newest + MISSING * PERIOD, 0]
+    assert (rig.status.state, rig.status.reason) == (
+        State.HOLDING,
+        "no reference from 'above': held after 5 extrapolated",
+    )
+    rig.run(50)
+    assert rig.write.command.due > rig.tick
+    assert rig.status.reason == ""
+
+
+def test_a_level_above_that_wants_no_motion_is_obeyed_without_extrapolation() -> None:
+    rig = GatewayRig()
+    rig.run(200, missing=True)
+    assert (rig.given, rig.write.command.due, rig.status.reason) == ([], 0, "")
+
+
+def test_the_boards_appear_as_one_after_the_delay() -> None:
+    rig = GatewayRig()
+    rig.run(50)
+    rig.statuses["far"].stopped, rig.statuses["far"].reason, rig.statuses["far"].error = 1, "braked", Error.LIMIT
+    rig.run(DELAY)
+    assert not rig.status.stopped
+    rig.run(EVERY)
+    status = rig.status
+    assert (status.stopped, status.reason, status.error) == (1, "braked", Error.LIMIT)
+    assert status.driven.tolist() == [1] * 6
+    assert status.target.tolist() == [1.0, 2.0] * 3
+
+
+def test_a_lost_board_stops_the_level_above() -> None:
+    rig = GatewayRig()
+    rig.run(50)
+    rig.lost.add("near")
+    rig.run(10)
+    assert (rig.status.stopped, rig.status.state) == (1, State.HOLDING)
+    assert rig.status.reason == "no status from 'near': waiting for its board"

@@ -1,0 +1,103 @@
+"""A small vocabulary and a table for tests: a door that opens on command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rack.levels.systems.state_table.checks import flaws
+from rack.levels.systems.state_table.level import vocabulary
+from rack.levels.systems.state_table.table import StateTable, read_text
+from rack.levels.systems.state_table.vocabulary import Condition, Phrase
+from rack.levels.tables import Positive, Table
+
+DOOR = """
+start = "shut"
+
+[[row]]
+name = "open it"
+state = "shut"
+when = { command = "open", new = "yes", lock = "free" }
+next = "moving"
+do = ["take", "drive slowly"]
+status = "executing"
+
+[[row]]
+name = "locked"
+state = "shut"
+when = { command = "open", new = "yes", lock = ["stuck", "locked"] }
+next = "shut"
+do = []
+status = "holding"
+reason = "locked"
+
+[[row]]
+name = "stay shut"
+state = "shut"
+else = true
+next = "same"
+do = []
+status = "idle"
+
+[[row]]
+name = "moves"
+state = "moving"
+when = { place = "between", late = "no" }
+next = "moving"
+do = []
+status = "executing"
+
+[[row]]
+name = "arrived"
+state = "moving"
+when = { place = ["open", "shut"] }
+next = "shut"
+do = ["drive stop"]
+status = "done"
+
+[[row]]
+name = "jams"
+state = "moving"
+when = { place = "between", late = "yes" }
+next = "shut"
+do = ["drive stop"]
+status = "error"
+reason = "the door jams"
+
+[plan]
+width = 0.9
+"""
+
+
+class DoorPlan(Table):
+    """The plan of a door."""
+
+    width: Positive = 1.0
+
+
+DOORS = vocabulary(
+    conditions={
+        "lock": Condition(("free", "stuck", "locked"), "the lock"),
+        "place": Condition(("open", "between", "shut"), "where the door is"),
+    },
+    commands={"open": Phrase((), "open the door"), "paint": Phrase(("colour",), "paint it")},
+    actions={"drive": Phrase((("slowly", "fast", "stop"),), "drive the door")},
+    plan=DoorPlan,
+)
+LEXICON = {"colour": ("red", "green")}
+
+
+def found(folder: Path, text: str) -> list[str]:
+    """Return the mistakes in the text of a table."""
+    return flaws(read_text(written(folder, text), DOORS), DOORS, LEXICON)
+
+
+def table(folder: Path, text: str = DOOR) -> StateTable:
+    """Return the table in a text, unchecked."""
+    return read_text(written(folder, text), DOORS).table()
+
+
+def written(folder: Path, text: str) -> Path:
+    """Write a text to a file."""
+    path = folder / "door.toml"
+    path.write_text(text)
+    return path

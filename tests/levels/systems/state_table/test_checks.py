@@ -1,0 +1,204 @@
+"""Every mistake in a state table is found, with its row; a table without one never runs out of rows."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rack.levels.systems.state_table.checks import flaws, without
+from rack.levels.systems.state_table.table import RowConfig, TableError, TableText, read_text
+from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, table, written
+
+MISTAKES = {
+    "unknown condition": (
+        'when = { place = "between", late = "no" }',
+        'when = { plaice = "between", late = "no" }',
+        "row 4 'moves': when: unknown condition 'plaice'; known: lock, place, late, command, new",
+    ),
+    "unknown value": (
+        'when = { place = "between", late = "no" }',
+        'when = { place = "ajar", late = "no" }',
+        "row 4 'moves': when: place is never 'ajar'; its values: open, between, shut",
+    ),
+    "no value": (
+        'when = { place = "between", late = "no" }',
+        'when = { place = [], late = "no" }',
+        "row 4 'moves': when: place has an empty list; its values: open, between, shut",
+    ),
+    "unknown action": (
+        'do = ["take", "drive slowly"]',
+        'do = ["take", "fly"]',
+        "row 1 'open it': do: unknown 'fly'; known: drive, take",
+    ),
+    "unknown parameter": (
+        'do = ["take", "drive slowly"]',
+        'do = ["drive gently"]',
+        "row 1 'open it': do: 'gently' of 'drive gently' is unknown; known: slowly, fast, stop",
+    ),
+    "missing parameter": (
+        'do = ["take", "drive slowly"]',
+        'do = ["drive"]',
+        "row 1 'open it': do: 'drive' has 0 parameters; 'drive' takes 1",
+    ),
+    "missing next": (
+        'next = "moving"\ndo = ["take"',
+        'do = ["take"',
+        "row 1 'open it': next: missing; next state, or same",
+    ),
+    "missing do": (
+        'do = ["take", "drive slowly"]\n',
+        "",
+        "row 1 'open it': do: missing; actions with their parameters, in order; may be an empty list",
+    ),
+    "missing status": (
+        'do = ["take", "drive slowly"]\nstatus = "executing"\n',
+        'do = ["take", "drive slowly"]\n',
+        "row 1 'open it': status: missing; state shown upwards: idle, executing, done, error, holding",
+    ),
+    "unknown status": (
+        'status = "done"',
+        'status = "finished"',
+        "row 5 'arrived': status: unknown 'finished'; known: idle, executing, done, error, holding",
+    ),
+    "missing reason": (
+        'reason = "the door jams"\n',
+        "",
+        "row 6 'jams': reason: missing; status error needs one, a line for the user",
+    ),
+    "reason without a use": (
+        'status = "done"',
+        'status = "done"\nreason = "why not"',
+        "row 5 'arrived': reason: status done shows none; statuses that do: error, holding",
+    ),
+    "unknown next state": (
+        'next = "moving"\ndo = ["take"',
+        'next = "ajar"\ndo = ["take"',
+        "row 1 'open it': next: no row has the state 'ajar'; states: shut, moving",
+    ),
+    "unreachable state": (
+        'next = "moving"\ndo = ["take"',
+        'next = "shut"\ndo = ["take"',
+        "row 4, 5, 6: unreachable: no row leads from 'shut' to the state 'moving'",
+    ),
+    "unknown start": ('start = "shut"', 'start = "ajar"', "start: no row has the state 'ajar'; states: shut, moving"),
+    "overlap": (
+        'when = { place = ["open", "shut"] }',
+        "when = { }",
+        "row 5 'arrived': overlaps row 4 'moves' in 'moving' when place = between, late = no; "
+        "let them exclude each other, or give the later one else = true",
+    ),
+    "hole": (
+        'when = { place = "between", late = "yes" }',
+        'when = { place = "between", late = "yes", lock = "free" }',
+        "hole: no row of 'moving' takes lock = locked|stuck, place = between, late = yes",
+    ),
+    "row that never fires": (
+        'when = { place = ["open", "shut"] }',
+        'when = { place = ["between"], late = "no" }\nelse = true',
+        "row 5 'arrived': never fires in 'moving': the rows above it take every case of it",
+    ),
+    "unknown key": ('status = "idle"', 'status = "idle"\nspeed = 3', "row 3: speed: unknown key; known: name, state"),
+    "unknown key of the plan": ("width = 0.9", "height = 0.9", "plan: height: unknown key; known: width"),
+    "value of the plan": ("width = 0.9", "width = -1.0", "plan: width: '-1.0': input should be greater than 0"),
+}
+
+
+def test_a_table_without_a_mistake_passes(tmp_path: Path) -> None:
+    assert found(tmp_path, DOOR) == []
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_every_mistake_is_found_with_its_row(tmp_path: Path, mistake: str) -> None:
+    before, after, expected = MISTAKES[mistake]
+    assert before in DOOR
+    assert any(line.startswith(expected) for line in found(tmp_path, DOOR.replace(before, after))), expected
+
+
+def test_all_mistakes_of_a_table_are_reported_together(tmp_path: Path) -> None:
+    text = DOOR
+    for mistake in ("unknown condition", "unknown parameter", "unknown status", "missing reason"):
+        before, after, _ = MISTAKES[mistake]
+        text = text.replace(before, after)
+    assert [line.split(":")[0] for line in found(tmp_path, text)] == [
+        "row 1 'open it'",
+        "row 4 'moves'",
+        "row 5 'arrived'",
+        "row 6 'jams'",
+    ]
+
+
+@pytest.mark.parametrize("text", ["start = ", "start = 3", 'start = "shut"', "\x00", 'start = "shut"\nrow = 5'])
+def test_a_file_that_is_no_table_is_one_error(tmp_path: Path, text: str) -> None:
+    with pytest.raises(TableError):
+        read_text(written(tmp_path, text), DOORS)
+
+
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(TableError, match="cannot be read: No such file"):
+        read_text(tmp_path / "none.toml", DOORS)
+
+
+def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
+    door = table(tmp_path)
+    case = {"command": "open", "new": "yes", "lock": "free", "place": "shut", "late": "no"}
+    names = [
+        door.decide(state, case | change)
+        for state, change in [("shut", {}), ("shut", {"new": "no"}), ("shut", {"lock": "stuck"}), ("moving", {})]
+    ]
+    assert [row.name for row in names if row is not None] == ["open it", "stay shut", "locked", "arrived"]
+    assert door.decide("nowhere", case) is None
+
+
+NAMES = tuple(DOORS.conditions)
+CONDITIONS = st.dictionaries(
+    st.sampled_from(NAMES),
+    st.sets(st.sampled_from(sorted({v for name in NAMES for v in DOORS.conditions[name].values})), min_size=1),
+    max_size=3,
+)
+
+
+def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowConfig:
+    """Return a row of the state "on" that is sound but for its cases."""
+    known = {name: sorted(values & set(DOORS.conditions[name].values)) for name, values in when.items()}
+    kept = {name: values for name, values in known.items() if values}
+    return RowConfig(
+        **{"name": f"row {number}", "state": "on", "when": kept, "else": otherwise},
+        next="on",
+        do=[],
+        status="idle",
+    )
+
+
+@given(st.lists(st.tuples(CONDITIONS, st.booleans()), min_size=1, max_size=7))
+def test_a_table_passes_exactly_if_one_row_fires_in_every_case(rows: list[tuple[dict[str, set[str]], bool]]) -> None:
+    configs = {number: row_config(number, *row) for number, row in enumerate(rows, 1)}
+    text = TableText("on", 1.0, configs, DOORS.plan(), 0, ())
+    complaints = flaws(text, DOORS, LEXICON)
+    table = text.table()
+    cases = [
+        dict(zip(NAMES, values, strict=True)) for values in product(*(DOORS.conditions[name].values for name in NAMES))
+    ]
+    fires = [[row for row in table.rows["on"] if row.matches(case)] for case in cases]
+    assert any("hole" in line for line in complaints) == any(not rows for rows in fires)
+    assert any("overlaps" in line for line in complaints) == any(not row.is_else for rows in fires for row in rows[1:])
+    if not complaints:
+        assert all(table.decide("on", case) is not None for case in cases)
+
+
+BOXES = st.fixed_dictionaries({name: st.frozensets(st.sampled_from("abc"), min_size=1) for name in "xyz"})
+
+
+@given(BOXES, BOXES)
+def test_what_is_left_of_a_box_is_all_that_is_not_taken(
+    box: dict[str, frozenset[str]], taken: dict[str, frozenset[str]]
+) -> None:
+    def cases(of: dict[str, frozenset[str]]) -> set[tuple[str, ...]]:
+        return set(product(*(of[name] for name in "xyz")))
+
+    pieces = [cases(piece) for piece in without(box, taken)]
+    assert set().union(*pieces) == cases(box) - cases(taken)
+    assert sum(map(len, pieces)) == len(set().union(*pieces))

@@ -1,0 +1,84 @@
+"""The level of the paper's figures 2 to 4: it computes for the given times."""
+
+from __future__ import annotations
+
+from time import process_time_ns
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message, State
+from rack.levels.errors import LevelError
+from rack.levels.level import LevelContext, Ports
+from rack.levels.systems.figures import FIGURE_PLAN, FIGURE_STATUS, FigureExecutor, FigurePlanner
+
+MS = 1_000_000
+
+
+def context(**params: Any) -> LevelContext:
+    return cast(LevelContext, SimpleNamespace(every=4, params=params))
+
+
+def ports(**inputs: Message | None) -> Ports:
+    return Ports(**{name: Reading(m, Verdict.NEW if m is not None else Verdict.NONE) for name, m in inputs.items()})
+
+
+def plan_of(tick: int) -> Message:
+    found = Message(FIGURE_PLAN.dtype({}))
+    found.made_at = tick
+    return found
+
+
+def computing_ns(executor: FigureExecutor, tick: int) -> int:
+    """Return the processor time of one cycle."""
+    write = Ports(status=Message(FIGURE_STATUS.dtype({})))
+    start = process_time_ns()
+    executor.process(ports(plan=None), write, tick)
+    return process_time_ns() - start
+
+
+def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
+    executor = FigureExecutor(context(process_ms=3.0))
+    times = [computing_ns(executor, tick) for tick in (0, 4, 8)]
+    assert all(time >= 3 * MS for time in times)
+    assert min(times) < 4 * MS
+
+
+def test_several_times_are_taken_in_turn_cycle_by_cycle() -> None:
+    executor = FigureExecutor(context(process_ms=[6.0, 1.0]))
+    # A cycle that is skipped takes its turn with it.
+    assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [True, False, False, True]
+
+
+def test_an_executor_reports_which_plan_is_in_force() -> None:
+    executor, write = FigureExecutor(context(process_ms=0.0)), Ports(status=Message(FIGURE_STATUS.dtype({})))
+    executor.process(ports(plan=None), write, 8)
+    assert (write.status.cycle, write.status.plan, write.status.state) == (8, -1, State.EXECUTING)
+    executor.process(ports(plan=plan_of(4)), write, 12)
+    assert (write.status.cycle, write.status.plan) == (12, 4)
+
+
+def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
+    planner, write, status = FigurePlanner(context(plan_ms=4.0)), plan_of(-1), Message(FIGURE_STATUS.dtype({}))
+    status.cycle = 8
+    assert planner.wanted(ports(status=None), 0)
+    start = process_time_ns()
+    planner.plan(ports(status=status), write, 16)
+    assert process_time_ns() - start >= 4 * MS
+    assert (write.made_at, write.cycle) == (16, 8)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"process_ms": -1.0}, "params.process_ms"),
+        ({"process_ms": []}, "params.process_ms"),
+        ({"plan_ms": "long"}, "params.plan_ms = 'long'"),
+        ({"proces_ms": 1.0}, "keys: process_ms, plan_ms"),
+    ],
+)
+def test_a_time_that_is_none_is_refused_by_name(params: dict[str, Any], message: str) -> None:
+    with pytest.raises(LevelError, match=message):
+        FigureExecutor(context(**params))

@@ -1,0 +1,168 @@
+"""A trajectory level alone: requests from lists, and boards that obey its set points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.level import Input, LevelContext, Output, Pace, Ports
+from rack.levels.messages import WORLD_MODEL
+from rack.levels.operator import OPERATOR_COMMAND, Operation
+from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.systems.joint_boards.messages import JOINT_STATUS
+from rack.levels.systems.trajectory.executor import TrajectoryExecutor
+from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MotionKind
+from tests.levels.arms import config
+
+CLOCK_NS, EVERY = 1_000_000, 20
+PERIOD_S = EVERY * CLOCK_NS * 1e-9
+
+
+class TrajectoryRig:
+    """Runs the level cycle by cycle. Boards follow its set points exactly, and hold without."""
+
+    level_class: type[TrajectoryExecutor] = TrajectoryExecutor
+    request_type = MOTION_REQUEST
+
+    def __init__(self, arm: str = "puma560_crossing", boards: int = 2, **params: Any) -> None:
+        robot, scene = config(arm)
+        self.cell = build_cell(robot, scene, CLOCK_NS)
+        self.sizes = sizes(self.cell)
+        self._kinds: dict[str, np.dtype] = {}
+        self.tick = 0
+        paces = {f"joints{k}": Pace(1, 1) for k in range(boards)}
+        self.context = LevelContext(
+            board="trajectory",
+            every=EVERY,
+            within_cycles=1,
+            clock_ns=CLOCK_NS,
+            seed=1,
+            robot=robot,
+            scene=scene,
+            task={},
+            sizes=self.sizes,
+            below=paces,
+            params=params,
+        )
+        self.level = self.level_class(self.context)
+        self.write = Ports(**{port: self._output(kind) for port, kind in self.level.outputs.items()})
+        self.statuses = {name: self.message(JOINT_STATUS) for name in paces}
+        for k, status in enumerate(self.statuses.values()):
+            status.driven[k::boards] = 1
+            status.target[:] = self.cell.home
+            status.holding = 1
+        self.world = self.message(WORLD_MODEL)
+        self.world.quaternion[:, 0] = 1.0
+        self.world.revision = 1
+        self.lost: set[str] = set()
+        self.queue: list[Message] = []
+        self.ids = 0
+        self.order = self.message(OPERATOR_COMMAND)
+        self.ordered = False
+        self.positions: list[Array] = []  # those of set points, by cycle
+        self.velocities: list[Array] = []
+
+    def _output(self, kind: Any) -> Message:
+        return self.message(kind.type if isinstance(kind, Output) else kind)
+
+    def message(self, kind: Any) -> Message:
+        """Return an empty message."""
+        if kind.name not in self._kinds:
+            self._kinds[kind.name] = kind.dtype(self.sizes)
+        return Message(self._kinds[kind.name])
+
+    def request(self, kind: MotionKind, **fields: Any) -> int:
+        """Queue a request; return its id."""
+        self.ids += 1
+        request = self.message(self.request_type)
+        request.id, request.kind, request.body, request.quaternion = self.ids, kind, -1, (0.0, 0.0, 1.0, 0.0)
+        for name, value in fields.items():
+            setattr(request, name, value)
+        self.queue.append(request)
+        return self.ids
+
+    def joints(self, change: Sequence[float] | Array, **fields: Any) -> int:
+        """Queue a motion to home plus `change`, rad; return its id."""
+        return self.request(MotionKind.JOINTS, joints=self.cell.home + np.asarray(change), **fields)
+
+    def say(self, what: Operation) -> None:
+        """Give an operator's command."""
+        self.order.id, self.order.what, self.ordered = self.order.id + 1, what, True
+
+    def restart(self) -> None:
+        """Replace the level, as after the death of its board: its set points end, and the boards hold."""
+        self.level = self.level_class(self.context)
+        self.brake()
+
+    def brake(self) -> None:
+        """Let the boards hold where they are."""
+        for status in self.statuses.values():
+            status.holding, status.target_velocity = 1, 0.0
+
+    def _read(self) -> Ports:
+        taken, self.queue = self.queue[: self.level.room("requests")], self.queue[self.level.room("requests") :]
+        empty = self.message(self.request_type)
+        requests = Reading(taken[-1], Verdict.NEW, False, tuple(taken[:-1])) if taken else Reading(empty, Verdict.OLD)
+        boards = {
+            name: Reading(status, Verdict.OLD if name in self.lost else Verdict.NEW, name in self.lost)
+            for name, status in self.statuses.items()
+        }
+        ordered, self.ordered = self.ordered, False
+        own = {port: self._last(source) for port, source in self.level.inputs.items() if source.source[:4] == "own."}
+        own["operator"] = Reading(self.order, Verdict.NEW if ordered else Verdict.OLD)
+        world = Reading(self.world, Verdict.NEW)
+        return Ports(requests=requests, boards=boards, world=world, **own, **self.others())
+
+    def others(self) -> dict[str, Reading]:
+        """Return what else the level reads."""
+        return {}
+
+    def _last(self, source: Input) -> Reading:
+        name = source.source.partition(".")[2]
+        there = self.tick > 0 and name in self.level.outputs
+        message = self.message(source.type)
+        if there:
+            message.copy_from(getattr(self.write, name))
+        return Reading(message, Verdict.OLD if there else Verdict.NONE)
+
+    def obey(self) -> None:
+        """Let the boards do what the last cycle commanded."""
+        before = self.write.command
+        for status in self.statuses.values():
+            if before.due and not status.stopped:
+                status.holding, status.target, status.target_velocity = 0, before.position, before.velocity
+            else:
+                status.holding, status.target_velocity = 1, 0.0
+
+    def cycle(self) -> Message:
+        """Run one cycle; return the status."""
+        self.obey()
+        self.level.process(self._read(), self.write, self.tick)
+        self.tick += EVERY
+        if self.write.command.due:
+            self.positions.append(self.write.command.position.copy())
+            self.velocities.append(self.write.command.velocity.copy())
+        return self.write.status
+
+    def run(self, seconds: float) -> Message:
+        """Run for simulated `seconds`; return the status."""
+        for _ in range(round(seconds / PERIOD_S)):
+            self.cycle()
+        return self.write.status
+
+    def ends(self) -> dict[int, int]:
+        """Return how the last requests ended, by id."""
+        status = self.write.status
+        return {int(request): int(how) for request, how in zip(status.ended, status.ends, strict=True) if request}
+
+    def excess(self) -> tuple[float, float]:
+        """Return the greatest velocity and acceleration of the positions so far, as parts of the limits."""
+        speeds = np.diff(self.positions, axis=0) / PERIOD_S
+        bends = np.diff(speeds, axis=0) / PERIOD_S
+        limits = self.cell.limits
+        return float(np.abs(speeds / limits.velocity).max()), float(np.abs(bends / limits.acceleration).max())

@@ -1,0 +1,157 @@
+"""The command environment of the host side: calls become requests, in order, each until it is done."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message
+from rack.levels.errors import LevelError
+from rack.levels.level import LevelContext
+from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
+from rack.levels.systems.trajectory.messages import MOTION_STATUS, MotionKind, RequestEnd
+from tests.levels.arms import config
+
+PUMA, SCENE = config("puma560")
+SIZES = {"joints": 6}
+
+
+class Level:
+    """A bus with a level at its other end, which does one request at each wait, a second. `room` messages may wait."""
+
+    def __init__(self, room: int = 100, sent: int = 0) -> None:
+        self.room, self.serial, self.is_over, self.tick = room, sent, False, 0
+        self.time_s = 0.0
+        self.queue: deque[dict[str, Any]] = deque()
+        self.done: list[dict[str, Any]] = []
+        self.loses: set[int] = set()
+        self.status = Message(MOTION_STATUS.dtype(SIZES))
+
+    def wait(self, timeout_s: float) -> bool:
+        """Do the next request, or lose it."""
+        self.time_s += 1.0
+        if self.queue:
+            request = self.queue.popleft()
+            if request["id"] in self.loses:
+                self.loses.remove(request["id"])
+            elif request["id"] == self.status.done + 1 or not self.done or request["kind"] == MotionKind.CANCEL:
+                self.done.append(request)
+                self.status.done = self.status.taken = request["id"]
+                self.status.ended[0], self.status.ends[0] = request["id"], RequestEnd.DONE
+        return True
+
+    def read(self, port: str) -> Reading:
+        """Return the status."""
+        assert port == "motion"
+        return Reading(self.status, Verdict.NEW)
+
+    def send(self, port: str, **fields: Any) -> bool:
+        """Queue a request."""
+        assert port == "requests"
+        if len(self.queue) >= self.room:
+            return False
+        self.serial += 1
+        self.queue.append(fields)
+        return True
+
+    def sent(self, port: str) -> int:
+        """Return the number of messages."""
+        return self.serial
+
+    def finish(self) -> None:
+        """Do nothing."""
+
+
+def motions(level: Level) -> Motions:
+    return Motions(level, PUMA, SCENE)
+
+
+def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> None:
+    level = Level()
+    arm = motions(level)
+    arm.release()
+    arm.line((0.1, 0.2, 0.3), body="block2", segment=2.0)
+    arm.grip(0.01, force=5.0)
+    last = arm.move()
+    assert (last, arm.done()) == (4, False)
+    assert arm.wait()
+    assert [request["id"] for request in level.done] == [1, 2, 3, 4]
+    kinds = [MotionKind.GRIP, MotionKind.POSE, MotionKind.GRIP, MotionKind.JOINTS]
+    assert [request["kind"] for request in level.done] == kinds
+    assert (level.done[1]["body"], level.done[1]["segment"]) == (SCENE.bodies.index("block2"), 2.0)
+    assert level.done[3]["joints"] == PUMA.home
+    assert arm.end_of(last) is RequestEnd.DONE
+
+
+def test_a_full_queue_is_waited_for_and_nothing_is_left_out() -> None:
+    level = Level(room=2)
+    arm = motions(level)
+    for _ in range(10):
+        arm.stay(0.1)
+    assert arm.wait()
+    assert [request["id"] for request in level.done] == [*range(1, 11)]
+
+
+def test_a_request_that_is_lost_is_sent_again_with_those_after_it() -> None:
+    level = Level()
+    level.loses = {2}
+    arm = motions(level)
+    for _ in range(4):
+        arm.stay(0.1)
+    assert arm.wait()
+    assert [request["id"] for request in level.done] == [1, 2, 3, 4]
+
+
+def test_a_process_that_is_restarted_cancels_first_and_numbers_beyond_all_before() -> None:
+    level = Level(sent=7)
+    arm = motions(level)
+    arm.stay(0.1)
+    assert [(request["id"], request["kind"]) for request in level.queue] == [
+        (8, MotionKind.CANCEL),
+        (9, MotionKind.STAY),
+    ]
+
+
+def test_a_wait_ends_when_its_condition_holds() -> None:
+    level = Level()
+    arm = motions(level)
+    first = arm.stay(0.1)
+    last = arm.stay(0.1)
+    assert not arm.wait(until=lambda: arm.done(first))
+    assert not arm.done(last)
+
+
+def test_an_unknown_body_is_refused() -> None:
+    with pytest.raises(LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "):
+        motions(Level()).line((0.0, 0.0, 0.1), body="block9")
+
+
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], CommandEnvironment]:
+    """Make a command environment that runs a script of this text."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def make(text: str) -> CommandEnvironment:
+        (tmp_path / "moves.py").write_text(text)
+        params = {"script": "moves.py"}
+        return CommandEnvironment(LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params))
+
+    return make
+
+
+def test_a_script_finds_the_calls_by_name(environment: Callable[[str], CommandEnvironment]) -> None:
+    level = Level()
+    environment("move()\nstay(0.5)\nwait()\n").run(level)
+    assert [request["kind"] for request in level.done] == [MotionKind.JOINTS, MotionKind.STAY]
+
+
+def test_a_script_that_is_not_there_is_one_line() -> None:
+    params = {"script": "nowhere.py"}
+    program = CommandEnvironment(LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params))
+    with pytest.raises(LevelError, match=r"params.script = nowhere.py: not in a folder of python_path"):
+        program.run(Level())

@@ -1,0 +1,106 @@
+"""A guarded line: a lasting change of a torque ends it; one across brakes, holds or missed cycles does not."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
+from tests.levels.systems.trajectory.rig import EVERY, TrajectoryRig
+
+DOWN = (0.0, 0.0, 1.0, 0.0)
+MOST, TOUCH = 6.0, 20.0
+"""A guard, and a change of torque by a touch, N m."""
+
+
+@pytest.fixture
+def rig() -> TrajectoryRig:
+    """A level on its way down, at speed."""
+    rig = TrajectoryRig()
+    x, y, z = rig.run(0.2).tool
+    rig.request(MotionKind.POSE, position=(x, y, z - 0.1), quaternion=DOWN, segment=4.0, touch=MOST)
+    rig.run(1.0)
+    assert rig.write.status.current == 1
+    return rig
+
+
+def press(rig: TrajectoryRig, torque: float) -> None:
+    """Let a joint of the first board need more torque, N m."""
+    next(iter(rig.statuses.values())).torque[2] += torque
+
+
+def end(rig: TrajectoryRig, seconds: float = 0.6) -> int:
+    """Run for a while; return how the guarded line has ended."""
+    rig.run(seconds)
+    return rig.ends().get(1, RequestEnd.NONE)
+
+
+@pytest.mark.parametrize("torque", [TOUCH, -TOUCH])
+def test_a_touch_ends_the_line_and_the_next_request_goes_on_from_there(rig: TrajectoryRig, torque: float) -> None:
+    height = float(rig.write.status.tool[2])
+    press(rig, torque)
+    assert end(rig) == RequestEnd.GUARDED
+    assert rig.write.status.resting
+    assert height - rig.write.status.tool[2] < 0.01
+    rig.joints([0.1, 0, 0, 0, 0, 0])
+    rig.run(4.0)
+    assert rig.ends()[2] == RequestEnd.DONE
+    assert max(rig.excess()) <= 1.0
+
+
+def test_less_than_the_guard_is_no_touch(rig: TrajectoryRig) -> None:
+    press(rig, 0.9 * MOST)
+    assert end(rig) == RequestEnd.NONE
+
+
+def test_what_is_over_at_once_is_no_touch(rig: TrajectoryRig) -> None:
+    press(rig, TOUCH)
+    rig.cycle()
+    press(rig, -TOUCH)
+    assert end(rig) == RequestEnd.NONE
+
+
+def test_a_change_across_a_hold_is_no_touch(rig: TrajectoryRig) -> None:
+    rig.brake()
+    rig.level.process(rig._read(), rig.write, rig.tick)
+    rig.tick += EVERY
+    press(rig, TOUCH)
+    assert end(rig) == RequestEnd.NONE
+
+
+def test_a_change_across_missed_cycles_of_the_level_is_no_touch(rig: TrajectoryRig) -> None:
+    rig.tick += 2 * EVERY
+    press(rig, TOUCH)
+    assert end(rig) == RequestEnd.NONE
+
+
+def test_a_change_across_a_stale_status_is_no_touch(rig: TrajectoryRig) -> None:
+    rig.lost = {next(iter(rig.statuses))}
+    rig.cycle()
+    rig.lost = set()
+    press(rig, TOUCH)
+    assert end(rig) == RequestEnd.NONE
+
+
+def test_a_touch_after_all_that_is_found(rig: TrajectoryRig) -> None:
+    rig.brake()
+    rig.tick += 2 * EVERY
+    rig.run(1.5)
+    press(rig, TOUCH)
+    assert end(rig) == RequestEnd.GUARDED
+
+
+def test_the_guard_outlives_the_level(rig: TrajectoryRig) -> None:
+    rig.restart()
+    rig.run(1.5)
+    assert rig.write.status.current == 1
+    press(rig, TOUCH)
+    assert end(rig) == RequestEnd.GUARDED
+
+
+@pytest.mark.parametrize("most", [-1.0, float("nan")])
+def test_a_guard_that_is_none_is_refused(most: float) -> None:
+    rig = TrajectoryRig()
+    place = rig.run(0.2).tool
+    rig.request(MotionKind.POSE, position=place, quaternion=DOWN, touch=most)
+    assert end(rig) == RequestEnd.REFUSED
+    assert "guard" in rig.write.status.reason

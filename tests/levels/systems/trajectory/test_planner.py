@@ -1,0 +1,189 @@
+"""The planning level alone: requests of a program, a few ahead of the arm, none lost and none done twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message, State
+from rack.levels.errors import ProgramError
+from rack.levels.level import LevelContext, Ports
+from rack.levels.messages import TASK_STATUS, WORLD_MODEL, Error
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind
+from rack.levels.systems.trajectory.planner import RequestExecutor, RequestPlanner
+from rack.levels.systems.trajectory.program import MotionProgram
+from tests.levels.arms import config
+
+ROBOT, SCENE = config("puma560_crossing")
+CELL = build_cell(ROBOT, SCENE, 1_000_000)
+SIZES = sizes(CELL)
+EVERY = 100
+MOVES = [{"do": "move", "joints": [0.1 * k, 1.4, -3.1, 0.0, -1.44, 0.0]} for k in range(6)]
+
+
+class PlanningRig:
+    """Runs a planner; the test says how far the level below is."""
+
+    def __init__(self, steps: Sequence[Mapping[str, Any]], places: int = 32, **params: Any) -> None:
+        self.context = LevelContext(
+            board="planning",
+            every=EVERY,
+            within_cycles=2,
+            clock_ns=1_000_000,
+            seed=1,
+            robot=ROBOT,
+            scene=SCENE,
+            task={"step": list(steps)},
+            sizes=SIZES,
+            params=params,
+        )
+        self.tick, self.places = 0, places
+        self.below = Message(MOTION_STATUS.dtype(SIZES))
+        self.world = Message(WORLD_MODEL.dtype(SIZES))
+        self.world.quaternion[:, 0] = 1.0
+        self.sent: list[np.ndarray] = []
+        self.start()
+
+    def start(self) -> None:
+        """Begin anew, as after a restart."""
+        self.planner = RequestPlanner(self.context)
+
+    def run(self, cycles: int = 1) -> list[int]:
+        """Plan in some cycles; return the ids sent in them."""
+        before = len(self.sent)
+        for _ in range(cycles):
+            read = Ports(status=Reading(self.below, Verdict.NEW), world=Reading(self.world, Verdict.NEW))
+            if self.planner.wanted(read, self.tick):
+                self.planner.plan(read, Outbox(self), self.tick)
+            self.tick += EVERY
+        return [int(record["id"]) for record in self.sent[before:]]
+
+
+class Outbox:
+    """The planner's port of a queue with some places."""
+
+    def __init__(self, rig: PlanningRig) -> None:
+        object.__setattr__(self, "rig", rig)
+        object.__setattr__(self, "message", Message(MOTION_REQUEST.dtype(SIZES)))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.message, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self.message, name, value)
+
+    def send(self) -> bool:
+        """Take a copy, if there is a place."""
+        rig: PlanningRig = self.rig
+        if len(rig.sent) - rig.below.taken >= rig.places:
+            return False
+        rig.sent.append(self.message.record.copy())
+        return True
+
+
+def test_requests_are_queued_a_few_ahead_of_the_arm() -> None:
+    rig = PlanningRig(MOVES, ahead=3)
+    assert rig.run(5) == [1, 2, 3]
+    rig.below.taken, rig.below.done = 3, 1
+    assert rig.run(5) == [4]
+    rig.below.taken = rig.below.done = 4
+    assert rig.run(5) == [5, 6]
+    assert [record["joints"][0] for record in rig.sent] == pytest.approx([0.1 * k for k in range(6)])
+
+
+def test_a_full_queue_is_tried_again_later() -> None:
+    rig = PlanningRig(MOVES, places=1, ahead=4)
+    assert rig.run(3) == [1]
+    rig.below.taken = 1
+    assert rig.run(3) == [2]
+
+
+def test_a_restarted_planner_goes_on_after_the_newest_request_taken() -> None:
+    rig = PlanningRig(MOVES, ahead=3)
+    rig.run(3)
+    rig.below.taken, rig.below.done = 2, 2
+    rig.start()
+    # Request 3 may still be in the queue: sent twice, it is done once.
+    assert rig.run(4) == [3, 4, 5]
+
+
+def test_a_request_that_is_not_taken_is_sent_again() -> None:
+    rig = PlanningRig(MOVES, ahead=3)
+    rig.run(2)
+    rig.below.taken = 1
+    assert rig.run(5) == []
+    assert rig.run(5) == [2, 3]
+
+
+def test_a_cancel_waits_for_its_time() -> None:
+    rig = PlanningRig([*MOVES[:2], {"do": "cancel", "after": 1.0}, MOVES[0]])
+    rig.run(1)
+    rig.below.taken, rig.below.current = 2, 1
+    assert rig.run(20) == []
+    rig.below.current = 2
+    assert rig.run(10) == []
+    assert rig.run(4) == [3, 4]
+    assert [record["kind"] for record in rig.sent[2:]] == [MotionKind.CANCEL, MotionKind.JOINTS]
+
+
+def test_tool_goals_become_joint_positions_near_those_before() -> None:
+    place = [0.45, 0.30, 0.75]
+    rig = PlanningRig([{"do": "move", "position": place}, {"do": "line", "position": [0.6, 0.1, 0.65]}, {"do": "home"}])
+    rig.run(3)
+    ik = InverseKinematics(CELL, 1)
+    assert np.allclose(ik.tool_at(rig.sent[0]["joints"]).position, place, atol=1e-4)
+    assert [record["kind"] for record in rig.sent] == [MotionKind.JOINTS, MotionKind.POSE, MotionKind.JOINTS]
+    assert np.array_equal(rig.sent[2]["joints"], CELL.home)
+    assert rig.sent[1]["body"] == -1
+    assert np.allclose(rig.sent[1]["quaternion"], ik.tool_at(CELL.home).quaternion)
+
+
+def test_a_goal_out_of_reach_is_queued_as_it_stands() -> None:
+    rig = PlanningRig([{"do": "move", "position": [3.0, 0.0, 0.5]}])
+    rig.run(1)
+    assert rig.sent[0]["kind"] == MotionKind.POSE
+    assert rig.sent[0]["position"].tolist() == [3.0, 0.0, 0.5]
+
+
+def test_live_goals_name_their_body() -> None:
+    rig = PlanningRig([{"do": "line", "position": [0.0, 0.0, 0.1], "body": "post", "live": True}])
+    rig.run(1)
+    assert (rig.sent[0]["body"], rig.sent[0]["live"]) == (SCENE.bodies.index("post"), 1)
+
+
+@pytest.mark.parametrize(
+    ("step", "why"),
+    [
+        ({"do": "move", "joints": [0.0]}, "task.step[0].joints = [0.0]: 1 values; permitted: 6, one per joint"),
+        ({"do": "line", "position": [0, 0, 0], "body": "car"}, "task.step[0].body = 'car': not in the scene; bodies: "),
+        ({"do": "line", "position": [0, 0, 0], "live": True}, "a live goal needs a body that it follows"),
+        ({"do": "move"}, "a move has either position or joints"),
+    ],
+)
+def test_a_program_that_does_not_fit_is_refused(step: dict[str, Any], why: str) -> None:
+    with pytest.raises(ProgramError) as refused:
+        MotionProgram.read({"step": [step]}, ROBOT, SCENE)
+    assert why in str(refused.value)
+
+
+def test_the_level_reports_the_program_done_or_failed() -> None:
+    rig = PlanningRig(MOVES)
+    level, write = RequestExecutor(rig.context), Ports(status=Message(TASK_STATUS.dtype(SIZES)))
+
+    def state(done: int) -> int:
+        rig.below.done = done
+        level.process(Ports(status=Reading(rig.below, Verdict.NEW)), write, rig.tick)
+        return int(write.status.state)
+
+    assert state(0) == State.EXECUTING
+    assert state(6) == State.DONE
+    assert (write.status.action, write.status.actions) == (6, 6)
+    rig.below.error, rig.below.reason = Error.LIMIT, "request 4: too fast"
+    assert state(4) == State.ERROR
+    assert write.status.reason == "request 4: too fast"

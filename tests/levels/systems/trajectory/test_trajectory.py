@@ -1,0 +1,276 @@
+"""The trajectory level as its neighbours see it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.levels.operator import Answer, Operation
+from rack.levels.systems.trajectory.messages import HELD, MotionKind, RequestEnd
+from tests.levels.systems.trajectory.rig import EVERY, PERIOD_S, TrajectoryRig
+
+DOWN = (0.0, 0.0, 1.0, 0.0)
+POST = 3  # row of a body that moves
+
+
+class TrackingRig(TrajectoryRig):
+    """With a body that moves along y from a second on."""
+
+    def __init__(self, speed: float = 0.1) -> None:
+        super().__init__()
+        self.speed, self.at = speed, 1.0
+        self.tool = self.cycle().tool.copy()
+        self.track()
+
+    def track(self) -> None:
+        """Place the body as sensed now."""
+        now_s = self.tick * 1e-3
+        self.world.position[POST] = np.add(self.tool, [0.0, self.speed * max(now_s - self.at, 0.0), -0.1])
+        self.world.velocity[POST] = [0.0, self.speed * (now_s >= self.at), 0.0]
+        self.world.sensed = self.tick
+
+    def follow(self, seconds: float) -> None:
+        """Run while the body moves."""
+        for _ in range(round(seconds / PERIOD_S)):
+            self.track()
+            self.cycle()
+
+
+def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
+    rig = TrackingRig()
+    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
+    rig.request(MotionKind.STAY, segment=3.0)
+    rig.joints([0] * 6)
+    rig.follow(3.5)
+    status = rig.write.status
+    assert status.current == 2
+    assert 0.0 < status.astray < 1e-3
+    # The set point is due two cycles later: the tool is where the body will be then.
+    ahead_s = (rig.tick + EVERY) * 1e-3 - rig.at
+    assert np.allclose(status.tool - rig.tool, [0, rig.speed * ahead_s, 0], atol=1e-3)
+    rig.follow(4.0)
+    speed, acceleration = rig.excess()
+    assert speed <= 1.0
+    assert acceleration <= 1.0
+    assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
+
+
+def test_a_live_goal_is_evaluated_once_a_sample() -> None:
+    rig = TrackingRig()
+    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
+    rig.follow(1.0)
+    goal = rig.level._work.goal
+    assert goal is not None
+    before = goal.evaluations
+    rig.follow(1.0)
+    assert goal.evaluations == before + round(1.0 / PERIOD_S)
+
+
+def test_a_copied_goal_stays_where_the_body_was() -> None:
+    rig = TrackingRig()
+    rig.request(MotionKind.POSE, position=(0.05, 0, 0.1), quaternion=DOWN, body=POST, live=0)
+    rig.follow(5.0)
+    assert np.allclose(rig.write.status.tool - rig.tool, [0.05, 0, 0], atol=1e-4)
+
+
+def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest() -> None:
+    rig = TrackingRig(speed=1.2)
+    rig.at = 3.0
+    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
+    rig.request(MotionKind.STAY, segment=9.0)
+    rig.follow(6.0)
+    status = rig.write.status
+    assert status.state == State.ERROR
+    assert rig.ends()[2] == RequestEnd.FAILED
+    assert "request 2: " in status.reason
+    assert status.resting
+    speed, acceleration = rig.excess()
+    assert speed <= 1.05
+    assert acceleration <= 1.1
+
+
+def test_an_error_refuses_what_comes_until_a_cancel() -> None:
+    rig = TrajectoryRig()
+    tool = rig.cycle().tool.copy()
+    rig.joints([0.3, 0, 0, 0, 0, 0])
+    wrong = rig.request(MotionKind.POSE, position=np.add(tool, [0, 0, -3.0]), quaternion=DOWN)
+    dropped = rig.joints([0] * 6)
+    rig.run(3.0)
+    late = rig.joints([0] * 6)
+    status = rig.run(0.1)
+    assert status.state == State.ERROR
+    assert f"request {wrong}: no joint positions" in status.reason
+    assert status.resting
+    ends = rig.ends()
+    assert (ends[1], ends[wrong], ends[dropped], ends[late]) == (
+        RequestEnd.DONE,
+        RequestEnd.REFUSED,
+        RequestEnd.CANCELLED,
+        RequestEnd.REFUSED,
+    )
+    rig.request(MotionKind.CANCEL)
+    again = rig.joints([0] * 6)
+    status = rig.run(3.0)
+    assert status.state == State.DONE
+    assert rig.ends()[again] == RequestEnd.DONE
+    assert not status.reason
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"kind": MotionKind.JOINTS, "joints": [9.0] * 6}, "joint 1 to 9 rad; permitted: -2.788 to 2.788"),
+        ({"kind": MotionKind.JOINTS, "joints": [np.nan] * 6}, "joint 1 to nan rad"),
+        ({"kind": MotionKind.POSE, "position": [np.nan] * 3}, "the pose is not finite"),
+        ({"kind": MotionKind.POSE, "position": [0.5] * 3, "body": 7}, "body 7 is not in the world model"),
+        ({"kind": MotionKind.STAY, "segment": -1.0}, "times 0 and -1 s"),
+        ({"kind": 9}, "kind 9; permitted: 1 to 5"),
+    ],
+)
+def test_a_request_that_nobody_could_do_is_refused_in_one_line(fields: dict, why: str) -> None:
+    rig = TrajectoryRig()
+    rig.request(**fields)
+    status = rig.run(0.2)
+    assert status.reason.startswith(f"request 1: {why}")
+    assert rig.ends() == {1: RequestEnd.REFUSED}
+    assert status.resting
+
+
+def test_a_restarted_level_neither_repeats_nor_loses_a_request() -> None:
+    rig = TrajectoryRig()
+    rig.joints([0.5, 0, 0, 0, 0, 0])
+    rig.joints([0.5, 0.3, 0, 0, 0, 0])
+    rig.request(MotionKind.STAY, segment=0.5)
+    rig.joints([0.2, 0, 0, 0, 0, 0])
+    rig.run(2.0)
+    before, current = rig.write.status.done, rig.write.status.current
+    rig.restart()
+    rig.run(0.3)
+    assert (rig.write.status.done, rig.write.status.current) == (before, current)
+    for _ in range(2):
+        rig.run(1.7)
+        rig.restart()
+    status = rig.run(8.0)
+    assert status.state == State.DONE
+    assert rig.ends() == dict.fromkeys((1, 2, 3, 4), RequestEnd.DONE)
+    assert np.allclose(rig.positions[-1] - rig.cell.home, [0.2, 0, 0, 0, 0, 0], atol=1e-9)
+
+
+def test_a_request_sent_twice_is_done_once() -> None:
+    rig = TrajectoryRig()
+    rig.joints([0.3, 0, 0, 0, 0, 0])
+    rig.queue.append(rig.queue[0])
+    rig.run(4.0)
+    assert rig.ends() == {1: RequestEnd.DONE}
+    assert rig.write.status.taken == 1
+
+
+def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
+    rig = TrajectoryRig()
+    for part in (0.1, 0.2, 0.3):
+        rig.joints([part, 0, 0, 0, 0, 0])
+    lost = rig.queue.pop(1)
+    later = rig.queue[-1]
+    status = rig.run(3.0)
+    assert (status.taken, status.done, status.state) == (1, 1, State.HOLDING)
+    assert status.reason == "request 2 is missing: send all again from there, or a cancel"
+    rig.queue += [lost, later]
+    status = rig.run(4.0)
+    assert (status.taken, status.done, status.state) == (3, 3, State.DONE)
+
+
+def test_more_than_the_level_holds_waits_in_the_queue() -> None:
+    rig = TrajectoryRig()
+    for k in range(HELD + 4):
+        rig.joints([0.01 * k, 0, 0, 0, 0, 0])
+    rig.cycle()  # it takes none before it has recalled what it holds
+    assert rig.write.status.taken == 0
+    rig.cycle()
+    assert len(rig.queue) == 4
+    assert rig.write.status.taken == HELD
+    rig.run(20.0)
+    assert not rig.queue
+    assert rig.write.status.done == HELD + 4
+
+
+def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -> None:
+    rig = TrajectoryRig()
+    rig.joints([0.5, 0, 0, 0, 0, 0])
+    rig.run(1.0)
+    name, stopped = next(iter(rig.statuses.items()))
+    stopped.stopped, stopped.reason = 1, "brakes engaged"
+    status = rig.run(0.3)
+    assert rig.write.command.due == 0
+    assert status.state == State.HOLDING
+    assert status.reason == f"waiting for {name}: brakes engaged"
+    stopped.target[0] += 0.02  # it sagged meanwhile
+    stopped.stopped, stopped.reason = 0, ""
+    rig.cycle()
+    rig.cycle()
+    assert abs(rig.write.command.position[0] - stopped.target[0]) < 1e-3
+    status = rig.run(4.0)
+    assert status.state == State.DONE
+    assert np.allclose(rig.positions[-1][0] - rig.cell.home[0], 0.5, atol=1e-9)
+
+
+def test_a_lost_board_holds_all_joints() -> None:
+    rig = TrajectoryRig()
+    rig.joints([0.5] * 6)
+    rig.run(1.0)
+    rig.lost.add("joints1")
+    status = rig.run(0.2)
+    assert rig.write.command.due == 0
+    assert status.state == State.HOLDING
+    assert status.reason.startswith("waiting for joints1: no status for")
+    rig.lost.clear()
+    rig.brake()
+    assert rig.run(6.0).state == State.DONE
+
+
+def test_an_operator_holds_and_resumes() -> None:
+    rig = TrajectoryRig()
+    rig.joints([0.5, 0, 0, 0, 0, 0])
+    rig.run(1.0)
+    rig.say(Operation.HOLD)
+    status = rig.run(1.5)
+    assert status.resting
+    assert status.state == State.HOLDING
+    assert "held by the operator" in status.reason
+    assert status.answer == Answer.DONE
+    assert rig.write.command.operator == rig.order.id
+    where = rig.positions[-1].copy()
+    rig.run(0.5)
+    assert np.array_equal(rig.positions[-1], where)
+    assert 0.0 < status.progress < 1.0
+    rig.say(Operation.RESUME)
+    assert rig.run(4.0).state == State.DONE
+    speed, acceleration = rig.excess()
+    assert speed <= 1.0
+    assert acceleration <= 1.0
+
+
+def test_the_gripper_keeps_the_last_grip_and_the_arm_waits_for_it() -> None:
+    rig = TrajectoryRig()
+    rig.request(MotionKind.GRIP, opening=0.012, force=9.0, segment=0.4)
+    rig.joints([0.2, 0, 0, 0, 0, 0])
+    status = rig.run(0.3)
+    assert status.current == 1
+    assert status.resting
+    assert (rig.write.command.opening, rig.write.command.force) == (0.012, 9.0)
+    rig.restart()
+    rig.run(4.0)
+    assert (rig.write.command.opening, rig.write.command.force) == (0.012, 9.0)
+    assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE}
+
+
+def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> None:
+    rig = TrajectoryRig()
+    rig.joints([0.5, 0.5, 0, 0, 0, 0])
+    rig.run(1.0)
+    command = rig.write.command
+    assert command.due == rig.tick + EVERY
+    terms = rig.level._dynamics.terms(command.position, command.velocity)
+    assert np.array_equal(command.load, terms.bias)
+    assert np.array_equal(command.inertia, terms.inertia.diagonal())
+    assert np.abs(command.velocity).max() > 0.1

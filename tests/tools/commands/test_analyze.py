@@ -1,0 +1,155 @@
+"""`rack analyze`: a run against the timing model, as a user sees it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.config import load
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.timing.analysis.analysis import Analysis
+from rack.tools.timing.analysis.document import document
+from rack.tools.timing.analysis.tables import text
+from tests.shared_runs import slow_run
+from tests.tools.command_line import rack
+from tests.tools.recordings import MS, Cycle, recorded
+
+SETTLED = 40
+PLAIN = (0.0, 0.1, 1.0, 0.1)
+BUDGET = ["board.lower.budget.process_ms=1.0", "board.lower.budget.read_ms=0.2", "board.lower.budget.write_ms=0.2"]
+USUAL = ["--percentile", "50"]
+"""What a machine whose host stalls it cannot change."""
+
+
+def run_of(figure: str, name: str, folder: Path) -> Path:
+    """Run the rack of a figure in real time for 1.5 s; return its folder."""
+    run_rack(load(figure, [f"name={name}"]), 1.5, folder, Display())
+    return folder
+
+
+def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
+    """Return which equations hold on which subjects, on one side of the document."""
+    return {
+        (row["equation"], row["subject"]): row[side]["holds"] for row in found["equations"] if row[side] is not None
+    }
+
+
+@pytest.mark.alone
+def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_path: Path) -> None:
+    done = rack("analyze", run_of("fig4", rack_name, tmp_path / "run"), *USUAL, "--json")
+    found = json.loads(done.stdout)
+    assert (done.returncode, found["holds"]) == (0, True), done.stderr
+    predicted, measured = verdicts(found, "predicted"), verdicts(found, "measured")
+    assert all(predicted.values())
+    assert {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")} <= set(measured)
+    assert all(measured.values())
+    assert not any(row["disagrees"] for row in found["equations"])
+    level = found["levels"]["level"]
+    assert level["measured"]["execution_ns"] == pytest.approx(level["predicted"]["execution_ns"], rel=0.1)
+    assert level["measured"]["plan_ns"] == pytest.approx(level["predicted"]["plan_ns"], rel=0.1)
+    assert "fits into 2 of its 2 cycles" in level["summary"]
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"analysis.json", "residuals.png", "residuals.svg"} <= written
+    assert json.loads((tmp_path / "run" / "analysis.json").read_text()) == found
+
+
+@pytest.mark.alone
+def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_path: Path) -> None:
+    folder = run_of("fig4-overload", rack_name, tmp_path / "run")
+    done = rack("analyze", folder, *USUAL, "--out", tmp_path / "analysis")
+    assert done.returncode == 1, done.stderr
+    assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == [
+        *("analysis.json", "residuals.png", "residuals.svg"),
+    ]
+    found = json.loads((tmp_path / "analysis" / "analysis.json").read_text())
+    for side in ("predicted", "measured"):
+        failed = {key for key, holds in verdicts(found, side).items() if not holds}
+        assert {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")} <= failed
+    broken = [breach for breach in found["breaches"] if breach["task"] == "level"]
+    # Every cycle takes 7 of 6 ms.
+    assert len(broken) >= found["tasks"]["level"]["cycles"]
+    assert "failed: level 3.1" in done.stdout
+    assert "more: --json has them all" in done.stdout
+
+
+def test_a_folder_without_a_run_is_refused_in_one_line(tmp_path: Path) -> None:
+    done = rack("analyze", tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "not a run" in done.stderr
+
+
+def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Path) -> None:
+    config = load(small, ["clock.mode=realtime", *BUDGET])
+    trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1), flags=int(k == 7)) for k in range(40)]
+    analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": trace}))
+    differing = {pair.equation for pair in analysis.pairs if pair.disagrees}
+    assert differing >= {"3.1", "3.6", "response time"}
+    assert not analysis.holds
+    found = text(analysis)
+    assert "not as predicted: lower 3.1" in found
+    assert "lower: 2.8 of 2.5 ms used in the worst cycle, 1.2 usually" in found
+    assert "over its budget: X 2.6 of 1 ms" in found
+    assert "lower: 1 of 40 (2.5 %)" in found
+    assert "upper: never ran" in found
+
+
+def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(small: Path, tmp_path: Path) -> None:
+    config = load(small, ["clock.mode=realtime", *BUDGET])
+    trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1)) for k in range(400)]
+    recording = recorded(tmp_path / "run", config, {"lower": trace})
+    analysis = Analysis.of(recording)
+    assert not analysis.holds
+    assert "failed in more than 1 of 100 cycles: none" in text(analysis)
+    assert Analysis.of(recording, 99.0).holds
+    # The cycle is listed all the same.
+    assert [breach.tick for breach in Analysis.of(recording, 99.0).breaches] == [SETTLED + 7]
+
+
+def test_alpha_and_deviation_are_those_of_equation_3_6(small: Path, tmp_path: Path) -> None:
+    trace = [Cycle(SETTLED, (0.0, 0.1, 2.0, 0.1)), Cycle(SETTLED + 1, (0.0, 0.4, 1.0, 0.1))]
+    recording = recorded(tmp_path / "run", load(small, ["clock.mode=realtime"]), {"lower": trace})
+    found = document(Analysis.of(recording))
+    # 2.5 less the longest execution and the longest communication, each part at its longest.
+    assert found["levels"]["lower"]["measured"]["residual_ns"] == pytest.approx(0, abs=1)
+    # Residuals of 0.3 and 1.0 ms.
+    assert found["tasks"]["lower"]["deviation_ms"] == pytest.approx(0.35)
+    assert found["levels"]["lower"]["predicted"] is None
+
+
+def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Path) -> None:
+    trace = [Cycle(SETTLED + k, PLAIN, late=0.3 if k == 5 else 0.1) for k in (*range(8), 11)]
+    traces = {"lower": trace}
+    found = document(Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces)))
+    task = found["tasks"]["lower"]
+    assert (task["lateness_ms"]["max"], task["lateness_ms"]["p50"]) == (0.3, 0.1)
+    assert task["largest_gap_ms"] == 4 * 2.5
+    assert found["core_loads"] == {"core 0": pytest.approx(1.2 / 2.5)}
+    lockstep = Analysis.of(recorded(tmp_path / "b", load(small), traces))
+    task = document(lockstep)["tasks"]["lower"]
+    assert (task["lateness_ms"], task["largest_gap_ms"], task["response_ms"]) == (None, None, None)
+    assert "late max" not in text(lockstep)
+    assert "lockstep: no deadlines, no lateness" in text(lockstep)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_tables_of_an_analysis_fit_the_terminal(small: Path, tmp_path: Path, width: int) -> None:
+    traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(8)] for name in ("lower", "upper")}
+    analysis = Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
+    lines = text(analysis, width).splitlines()
+    rows = [line for line in lines if line.startswith(("lower ", "upper ", "3.", "task ", "eq. ", "level "))]
+    assert len(rows) >= 20
+    assert max(map(len, rows)) <= width
+    assert max(map(len, text(analysis).splitlines())) > 120
+
+
+def test_a_run_in_lockstep_is_analyzed_with_its_system_response(tmp_path_factory: pytest.TempPathFactory) -> None:
+    found = json.loads(rack("analyze", slow_run(tmp_path_factory), "--json").stdout)
+    measured = [(row["equation"], row["measured"]) for row in found["equations"] if row["measured"] is not None]
+    # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
+    responses = [(found["left"], found["right"]) for equation, found in measured if equation == "3.3"]
+    assert responses == [(45 * 2.5 * MS, 45 * 2.5 * MS), (80 * 2.5 * MS, 80 * 2.5 * MS)]
+    assert "response time" not in dict(measured)

@@ -1,0 +1,127 @@
+"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a recording."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.boards.crate.line import CrateLine
+from rack.tools.commands.replay import replay
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.time_line import on_one_time_line
+from rack.tools.timing.analysis.report import write_report
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.window import ViewerWindow
+from tests.boards.lan.racks import configs, ring_texts
+from tests.processes import RACK
+from tests.tools.machines import A, B, recorded
+
+WATCHED = """
+[adapter.lan.permit]
+operator = ["watch"]
+"""
+ROOT = Path(__file__).resolve().parents[2]
+WATCHDOG_S = 50.0
+
+
+def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: str, tmp_path: Path) -> None:
+    config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
+    with Rack(config) as rack:
+        rack.start()
+        command = [*RACK, "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
+            deadline = time.monotonic() + WATCHDOG_S
+            while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:
+                rack.watch(0.1)
+            rack.stop("recorded")
+            while rack.watch(0.5):
+                continue
+            answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
+    assert recorder.returncode == 0
+    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "notes": []}
+    assert rack.outcome is not None
+    report, _ = write_report(tmp_path / "run")
+    assert report["rack"] == rack_name
+    assert report["tasks"]["lower"]["traced"] > 0
+    ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
+    assert ticks[-1] == rack.outcome.ticks - 1
+    assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
+
+
+def test_racks_that_work_together_are_recorded_on_one_time_line(rack_name: str, tmp_path: Path) -> None:
+    names = [f"{rack_name}-a", f"{rack_name}-b"]
+    one, other = configs(ring_texts(names, lan=WATCHED), tmp_path, "adapter.lan.rate_hz=100")
+    port = one.adapter.lan.listen[0].rpartition(":")[2]
+    with CrateLine() as crate, Rack(one, crate=crate) as near, Rack(other) as far:
+        far.start()
+        near.start()
+        folder = tmp_path / "run"
+        # One from its own machine, one from afar.
+        command = [*RACK, "record", names[1], "--with", f"127.0.0.1:{port}/{names[0]}", "--out", str(folder), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as recorder:
+            deadline = time.monotonic() + WATCHDOG_S
+            while not all((folder / name / "run.rrd").is_file() for name in names) and time.monotonic() < deadline:
+                near.watch(0.02)
+                far.watch(0.02)
+            near.stop("recorded")
+            far.stop("recorded")
+            while any([near.watch(0.05), far.watch(0.05)]):
+                continue
+            out, err = recorder.communicate(timeout=WATCHDOG_S)
+    assert recorder.returncode == 0, err.decode()
+    (note,) = json.loads(out)["notes"]
+    assert note.startswith(f"rack '{names[0]}' is on the time line of '{names[1]}'")
+    for name in names:
+        report, _ = write_report(folder / name)
+        assert report["tasks"]["pulse"]["traced"] > 0
+    recordings = [Recording(folder / name) for name in names[::-1]]
+    place = on_one_time_line(recordings)[1]
+    assert place.note == note
+    # The two were on one clock: what that showed is the truth.
+    true_ns = place.line.time_ns(np.array([place.own.epoch_ns]))[0]
+    assert abs(place.times_ns(np.zeros(1, dtype=int), 0)[0] - true_ns) <= place.uncertainty_ns
+    assert len(read(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
+
+
+def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path) -> None:
+    places = [recorded(machine, others, tmp_path / machine.rack) for machine, others in ((A, [B]), (B, []))]
+    runs, out = [place.folder for place in places], tmp_path / "both.rrd"
+    replay(runs, out)
+    made = out.read_bytes()
+    for given, file, why in (
+        (runs, out, "both.rrd: exists already"),
+        (runs, tmp_path / "both.png", "permitted: a name that ends in .rrd"),
+        ([runs[0], out], tmp_path / "new.rrd", "both.rrd: not the folder of a run"),
+        ([runs[0], tmp_path / "c"], tmp_path / "new.rrd", "c: no such folder"),
+        ([runs[0], runs[0]], tmp_path / "new.rrd", "both are of rack 'a'"),
+    ):
+        with pytest.raises(Failure, match=why) as refused:
+            replay(given, file)
+        assert refused.value.status == 2
+    assert out.read_bytes() == made
+    # A folder of such runs stands for all of them.
+    replay([tmp_path], tmp_path / "again.rrd")
+    lanes = [f"/{name}/boards/2-pulse/executor" for name in "ab"]
+    for lane in lanes:
+        again, first = (read(file, lane, "StateChange:state") for file in (tmp_path / "again.rrd", out))
+        assert again.ticks.tolist() == first.ticks.tolist()
+
+
+def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(Failure, match=r"no screen: .*: rerun run\.rrd"):
+        ViewerWindow("run.rrd")
+
+
+def test_a_folder_without_a_recording_is_no_run_to_replay(tmp_path: Path) -> None:
+    with pytest.raises(Failure, match=r"it has no run\.rrd"):
+        replay([tmp_path])

@@ -1,0 +1,76 @@
+"""The surroundings of trials: leftovers are noticed, the load loads, and the violation counter is checked."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.process import name_process
+from rack.backplane.segment import SHM_FOLDER
+from rack.boards import config
+from rack.levels.arm.monitors import LimitMonitor
+from rack.tools.console.answer import Failure
+from rack.tools.faults.campaigns.environment import children, examine, left_behind, load
+from tests.processes import FORKS, forked, runs, wait_until
+
+
+def test_a_file_left_in_shared_memory_is_noticed(rack_name: str) -> None:
+    path = SHM_FOLDER / f"sem.nasrem-rack.{rack_name}.lower"
+    path.touch()
+    try:
+        assert left_behind(rack_name, children()) == [str(path)]
+    finally:
+        path.unlink()
+    assert left_behind(rack_name, children()) == []
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rack.tools.faults.campaigns.environment.BOUND_S", 0.05)
+    rack = f"p{os.getpid()}x"
+
+    def board() -> None:
+        name_process(f"{rack}:lower")
+        signal.pause()
+
+    before = children()
+    with forked(board) as pid:
+        wait_until(lambda: Path(f"/proc/{pid}/comm").read_text().startswith(rack))
+        assert left_behind(rack, before) == [f"process {pid} ({rack}:lower)"]
+        # One that was there before is left out only as a descendant, not under the rack's name.
+        assert left_behind(rack, children()) == [f"process {pid} ({rack}:lower)"]
+        assert left_behind("other", before) == [f"process {pid} ({rack}:lower)"]
+        assert left_behind("other", children()) == []
+
+
+@pytest.mark.parametrize("has_stress", [True, False])
+def test_a_load_is_a_busy_process_a_core_and_one_that_writes(has_stress: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if has_stress and shutil.which("stress-ng") is None:
+        pytest.skip("stress-ng is not installed")
+    if not has_stress:
+        monkeypatch.setattr("shutil.which", lambda name: None)
+    before, cores = children(), len(os.sched_getaffinity(0))
+    with load() as told:
+        # stress-ng has a process of its own above the others.
+        wait_until(lambda: len(children() - before) >= cores + 1 + has_stress)
+        busy = children() - before
+    wait_until(lambda: not any(runs(pid) for pid in busy))
+    assert told == (f"stress-ng --cpu {cores} --io 1" if has_stress else f"{cores} busy processes and one that writes")
+
+
+def test_a_counter_of_violations_that_counts_passes() -> None:
+    examine(config.load("nasrem"))
+
+
+def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LimitMonitor, "_count", lambda monitor, *_: None)
+    with pytest.raises(Failure, match=r"violation counter: joint 'j1' at \d+.* rad/s, twice its limit, is not counted"):
+        examine(config.load("nasrem"))
+
+
+def test_a_rack_without_an_arm_has_no_limits_to_violate() -> None:
+    examine(config.load("fig4"))

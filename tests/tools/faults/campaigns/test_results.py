@@ -1,0 +1,165 @@
+"""When a trial falls short, and how its task ended: from hand-made trials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rack.boards.events import Cause, Event, Outcome
+from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.faults.campaigns.results import Faultless, Judged, Results, keep, kept, misses_of
+from rack.tools.faults.campaigns.trial import Trial
+from rack.tools.faults.ending import ArmEnd, Strike
+from tests.tools.fault_events import LAYOUT, event, flows, found, strike
+
+FAULT = strike("mute", "lower", 100, 150)
+SEEN = found(105, "mute", "upper", "lower.status")
+FLOWS = flows(152)
+
+
+def outcome(cause: Cause = "task done", *faults: str) -> Outcome:
+    return Outcome(cause, 10_000, "done", "", "digest", faults)
+
+
+def trial(*events: Event, strikes: tuple[Strike, ...] = (FAULT,)) -> Trial:
+    return Trial(
+        plan=Plan(1, "faults", lockstep=False),
+        layout=LAYOUT,
+        outcome=outcome(),
+        refused="",
+        events=(*events, event(9999, "end", "")),
+        strikes=strikes,
+        arm=ArmEnd(),
+        left=(),
+        wall_s=1.0,
+        offset_ns=0,
+    )
+
+
+def refused(kind: str, why: str, again: Outcome | None = None) -> Judged:
+    plan = Plan(1, "faults", True, ({"kind": kind, "board": "lower"},))
+    return Judged.of(replace(trial(strikes=()), plan=plan, outcome=None, refused=why, again=again))
+
+
+def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_nothing() -> None:
+    good = Judged.of(trial(SEEN, FLOWS))
+    assert (good.ended, good.shortfalls) == ("task done", [])
+
+
+@pytest.mark.parametrize(
+    ("bad", "line"),
+    [
+        (trial(FLOWS), "mute of lower.status, struck at tick 100: not detected"),
+        (
+            trial(found(140, "mute", "upper", "lower.status"), FLOWS),
+            "mute of lower.status, struck at tick 100: mute by upper after 40 ticks; bound 10",
+        ),
+        (
+            trial(SEEN, FLOWS, event(110, "reaction", "restart", "lower")),
+            "mute of lower.status, struck at tick 100: restart never undone; bound 152",
+        ),
+        (trial(SEEN), "mute of lower.status, struck at tick 100: loss of messages never undone; bound 152"),
+        (
+            trial(SEEN, flows(300)),
+            "mute of lower.status, struck at tick 100: loss of messages undone after 200 ticks; bound 152",
+        ),
+        (
+            trial(found(100, "command_invalid", "lower"), strikes=(strike("command-nan", "lower", 100, 110),)),
+            "command-nan of lower, struck at tick 100: no brakes closed follows",
+        ),
+        (
+            replace(trial(SEEN, FLOWS), outcome=outcome("task failed", "level 'lower': blocked")),
+            "the task is not done, and no fault had to end it: task failed; level 'lower': blocked",
+        ),
+        (replace(trial(SEEN, FLOWS), arm=ArmEnd(violations=3)), "limits violated at 3 substeps"),
+        (replace(trial(SEEN, FLOWS), left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),
+        (
+            trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status")),
+            "upper: gap: no fault explains it (tick 9000)",
+        ),
+        (
+            replace(trial(SEEN, FLOWS), outcome=outcome("stopped"), levels="lower executing"),
+            "the task is neither done nor safely stopped: stopped; lower executing",
+        ),
+    ],
+)
+def test_each_shortfall_is_a_line(bad: Trial, line: str) -> None:
+    assert Judged.of(bad).shortfalls == [line]
+
+
+def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated() -> None:
+    lost = replace(trial(SEEN, FLOWS), outcome=outcome("board lost", "board 'lower' ended"))
+    assert Judged.of(lost).ended == "safely stopped"
+    assert Judged.of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
+    assert Judged.of(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
+
+
+def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -> None:
+    events = (found(100, "command_invalid", "lower"), event(100, "reaction", "brakes_closed"))
+    released = event(110, "recovery", "brakes_opened")
+    braked = trial(*events, released, strikes=(strike("command-nan", "lower", 100, 110),))
+    late = replace(braked, outcome=outcome("task refused"), is_late=True)
+    assert Judged.of(late).shortfalls == []
+    assert Judged.of(replace(late, is_late=False)).shortfalls != []
+    assert Judged.of(replace(late, strikes=(FAULT,), events=(SEEN, FLOWS))).shortfalls != []
+
+
+def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_it() -> None:
+    good = refused("self-test", "board 'lower': the self-test fails", outcome("time over"))
+    assert (good.ended, good.shortfalls) == ("not armed", [])
+    assert good.verdict.faults[0].seen == "detected"
+    assert refused("self-test", "board 'upper': the self-test fails").verdict.faults[0].seen == "missed"
+
+
+@pytest.mark.parametrize("again", [None, outcome("board lost", "board 'lower' ended")], ids=["not armed", "lost"])
+def test_a_self_test_that_failed_is_recovered_from_when_the_rack_then_runs_without_it(again: Outcome | None) -> None:
+    why = "board 'lower': the self-test fails"
+    assert refused("self-test", why, outcome("time over")).verdict.faults[0].is_recovered
+    assert refused("self-test", why, again).shortfalls == [
+        "self-test of lower, struck at tick 0: not armed never undone; bound None"
+    ]
+
+
+def test_a_self_test_that_fails_and_lets_the_rack_arm_is_missed() -> None:
+    launched = Judged.of(trial(strikes=(strike("self-test", "lower", 0),)))
+    assert launched.verdict.faults[0].seen == "missed"
+
+
+def test_a_rack_that_does_not_launch_without_a_reason_falls_short() -> None:
+    judged = refused("kill", "boards lower: not ready within 60 s")
+    assert judged.ended == "neither"
+    assert judged.verdict.faults[0].seen == "not struck"
+
+
+def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
+    calm = [
+        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).result(),
+        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).result(),
+    ]
+    document = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm)).document()
+    # One in half an hour: below 4.74 in that time, with 95 %.
+    assert (document["trips"], document["trips_per_hour"]) == (1, {"an_hour": 2.0, "below": 9.488})
+    assert document["misses"] == misses_of(calm) == {"late": 2}
+    assert [event["code"] for event in document["tripped"]] == ["stale"]
+    assert [run.stray_misses for run in calm] == [2, 0]
+
+
+def test_what_any_run_breaks_counts_whatever_the_run_is_for() -> None:
+    nominal = Judged.of(trial(strikes=())).result()
+    swept = Judged.of(replace(trial(SEEN, FLOWS), arm=ArmEnd(violations=2))).result()
+    results = Results(nominal, trials=[Judged.of(trial(SEEN, FLOWS)).result()], sizes=[swept])
+    assert sum(run.violations for run in results.runs) == 2
+    assert len(results.faults) == 1
+
+
+def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+    judged, path = (
+        Judged.of(trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status"))),
+        tmp_path / "trials" / "1.json",
+    )
+    assert kept(path) is None
+    keep(judged, path)
+    assert kept(path) == judged.result()
+    assert [file.name for file in path.parent.iterdir()] == ["1.json"]

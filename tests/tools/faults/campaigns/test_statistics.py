@@ -1,0 +1,109 @@
+"""The figures of a campaign, from hand-made judgements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from rack.tools.faults.campaigns.statistics import by_kind, curve, part_of_bound, rate, spread, totals, wilson
+from rack.tools.faults.ending import EXTERNAL
+from rack.tools.faults.judge import Judgement
+from tests.tools.fault_events import TICK_NS
+
+FOUND = Judgement(
+    kind="mute",
+    board="lower",
+    mailbox="",
+    joint="",
+    size=None,
+    began=90,
+    struck=100,
+    seen="detected",
+    is_judged=True,
+    cycle=2,
+)
+
+
+def judgement(kind: str = "mute", delay: int | None = 5, bound: int = 10, **more: Any) -> Judgement:
+    delay_ms = None if delay is None else delay * 2.5
+    found = replace(FOUND, kind=kind, delay=delay, delay_ms=delay_ms, bound=bound)
+    is_within = delay is not None and delay <= bound
+    return replace(replace(found, seen="missed" if delay is None else "detected", is_within=is_within), **more)
+
+
+def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> None:
+    faults = [judgement(), judgement(delay=12), judgement(delay=None), judgement(seen="not struck", struck=-1)]
+    found = totals(faults)
+    assert (found["drawn"], found["not_struck"], found["injected"]) == (4, 1, 3)
+    assert (found["detected"], found["missed"], found["within_bound"], found["recovered"]) == (2, 1, 1, 3)
+
+
+def test_a_size_that_need_not_be_found_counts_nowhere() -> None:
+    small = judgement("sensor-bias", delay=None, is_judged=False, size=1e-4)
+    assert totals([small])["injected"] == 0
+    assert by_kind([small], TICK_NS) == {}
+
+
+def test_cycles_are_of_the_task_concerned_and_parts_of_each_bound() -> None:
+    faults = [judgement(delay=2), judgement(delay=4), judgement(delay=12, cycle=12, bound=12)]
+    figures = by_kind(faults, TICK_NS)["mute"]
+    assert figures["ticks"] == {"median": 4, "max": 12}
+    assert figures["cycles"] == {"median": 1.0, "max": 2.0}
+    assert figures["part_of_bound"] == {"median": 0.4, "max": 1.0}
+    assert figures["bound_ticks"] == {"least": 10, "most": 12}
+
+
+def test_kinds_stand_in_the_order_of_the_table_of_kinds_and_kills_from_outside_last() -> None:
+    faults = [judgement(EXTERNAL), judgement("command-nan"), judgement("kill"), judgement("mute")]
+    assert list(by_kind(faults, TICK_NS)) == ["kill", "mute", "command-nan", EXTERNAL]
+
+
+def test_recovery_is_in_ms_of_simulated_time() -> None:
+    faults = [judgement(recovery=100, reactions=("restart",)), judgement(recovery=200), judgement()]
+    figures = by_kind(faults, TICK_NS)["mute"]
+    assert figures["recovery_ms"] == {"median": 375.0, "max": 500.0}
+    assert figures["reactions"] == ["restart"]
+
+
+def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:
+    assert part_of_bound(1, 2, 4.0, 5.0) == 0.8
+    assert part_of_bound(1, 2, 4.0, None) == 0.5
+    assert part_of_bound(0, 0, 0.0, None) is None
+    assert part_of_bound(None, 2, None, None) is None
+
+
+def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
+    faults = [judgement("sensor-bias", size=0.1), judgement("sensor-bias", size=0.001, delay=None), judgement()]
+    assert [(point["size"], point["delay_ms"]) for point in curve(faults, "sensor-bias", TICK_NS)] == [
+        (0.001, None),
+        (0.1, 12.5),
+    ]
+
+
+def test_nothing_has_no_median() -> None:
+    assert spread([]) is None
+    assert by_kind([judgement(delay=None)], TICK_NS)["mute"]["ticks"] is None
+
+
+def test_bounds_of_a_share_are_wilsons() -> None:
+    # As in any table of them.
+    assert wilson(100, 100) == (0.963007, 1.0)
+    assert wilson(5, 10) == (0.236593, 0.763407)
+    assert wilson(0, 10) == (0.0, 0.277533)
+    assert wilson(0, 0) is None
+
+
+def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
+    # Three in as much time as there was, with 95 %, is what none seen permits.
+    assert rate(0, 3600.0) == {"an_hour": 0.0, "below": 2.996}
+    assert rate(2, 7200.0) == {"an_hour": 1.0, "below": 3.148}
+    assert rate(0, 0.0) is None
+
+
+def test_every_share_of_a_kind_has_its_bounds() -> None:
+    faults = [judgement(), judgement(delay=12), judgement(is_recovered=False)]
+    assert by_kind(faults, TICK_NS)["mute"]["wilson"] == {
+        "detected": wilson(3, 3),
+        "within_bound": wilson(2, 3),
+        "recovered": wilson(2, 3),
+    }

@@ -1,0 +1,127 @@
+"""Comparisons: figures and ratios of given samples, the table, the picture, who is absent, and taking turns."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from rack.tools.lab.benches.comparison import (
+    EXTRA,
+    Absent,
+    Comparison,
+    Sample,
+    absent_package,
+    absent_program,
+    interleaved,
+    turns,
+)
+
+SAMPLES = (
+    Sample("small", "ours", (3.0, 1.0, 2.0), "us"),
+    Sample("small", "theirs", (4.0, 4.0, 10.0), "us"),
+    Sample("large", "ours", tuple(float(n) for n in range(1, 102)), "us"),
+    Sample("large", "theirs", (0.0, 0.0), "us"),
+)
+BOTH = Comparison("pair", "Two contestants", SAMPLES, {"small": "theirs", "large": "theirs"})
+
+
+class Hidden:
+    """A finder that hides a package, as if it were not installed."""
+
+    def __init__(self, package: str) -> None:
+        self._package = package
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if name.partition(".")[0] == self._package:
+            raise ModuleNotFoundError(f"No module named '{name}'")
+        return None
+
+
+def test_a_sample_has_median_p99_best_and_count() -> None:
+    small, _, large, _ = SAMPLES
+    assert (small.median, small.best, small.count) == (2.0, 1.0, 3)
+    assert (large.median, large.p99) == (51.0, 100.0)
+    with pytest.raises(ValueError, match="no measurements"):
+        Sample("small", "ours", (), "us")
+
+
+def test_ratios_are_to_the_baseline_of_the_same_case() -> None:
+    small, theirs, large, _ = SAMPLES
+    assert BOTH.ratio(small) == 0.5
+    assert BOTH.ratio(theirs) == 1.0
+    assert BOTH.ratio(small, "best") == 0.25
+    assert BOTH.ratio(large) is None, "the baseline's median is 0"
+    assert Comparison("pair", "", SAMPLES, {"small": "nobody"}).ratio(small) is None
+    assert Comparison("pair", "", SAMPLES, {}).ratio(small) is None
+
+
+def test_the_document_has_every_figure_and_says_who_is_absent() -> None:
+    missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
+    found = Comparison("pair", "Two contestants", SAMPLES, {"small": "theirs"}, (missing,)).document()
+    assert json.loads(json.dumps(found)) == found
+    names = ("case", "who", "unit", "count", "median", "best", "ratio")
+    assert [found["samples"][0][name] for name in names] == ["small", "ours", "us", 3, 2.0, 1.0, 0.5]
+    assert found["samples"][0]["p99"] == pytest.approx(2.98)
+    assert found["samples"][0]["p99_ratio"] == pytest.approx(2.98 / 9.88)
+    assert found["absent"] == [
+        {"who": "cyclictest", "reason": "no program 'cyclictest'", "install": "apt-get install rt-tests"}
+    ]
+
+
+def test_the_table_fits_the_terminal_and_names_who_is_absent() -> None:
+    missing = Absent("zenoh", "No module named 'zenoh'", EXTRA)
+    found = Comparison("pair", "Two contestants", SAMPLES, BOTH.baselines, (missing,))
+    lines = list(found.lines())
+    assert lines[0] == "Two contestants"
+    assert lines[-1] == "absent: zenoh: No module named 'zenoh'; to install: pip install .[bench]"
+    assert " ".join(lines[2].split()) == "small ours 3 2 2.98 1 3 us 0.50 0.30"
+    assert max(map(len, found.lines(50))) <= 75
+    assert max(map(len, list(found.lines(50))[1:-1])) <= 50
+
+
+def test_the_picture_is_written_as_png_and_svg(tmp_path: Path) -> None:
+    paths = BOTH.plot(tmp_path)
+    assert [path.name for path in paths] == ["pair.png", "pair.svg"]
+    text = paths[1].read_text()
+    assert all(f"<!-- {word} -->" in text for word in ("small", "large", "ours", "theirs", "2  (0.50)"))
+
+
+def test_a_package_that_cannot_be_imported_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert absent_package("JSON", "json") is None
+    monkeypatch.setattr(sys, "meta_path", [Hidden("iceoryx2"), *sys.meta_path])
+    monkeypatch.delitem(sys.modules, "iceoryx2", raising=False)
+    assert absent_package("blackboard", "iceoryx2") == Absent("blackboard", "No module named 'iceoryx2'", EXTRA)
+
+
+def test_a_program_that_is_not_on_the_path_is_absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert absent_program("shell", "sh", "dash") is None
+    monkeypatch.setenv("PATH", str(tmp_path))
+    found = absent_program("cyclictest", "cyclictest", "rt-tests")
+    assert found == Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
+
+
+def test_everybody_has_one_turn_a_round_and_no_fixed_neighbour() -> None:
+    order = list(turns("abcd", 50))
+    assert order == list(turns("abcd", 50))
+    for turn in range(50):
+        assert sorted(name for number, name in order if number == turn) == list("abcd")
+    pairs = Counter((one[1], other[1]) for one, other in pairwise(order) if one[0] == other[0])
+    assert len(pairs) == 12
+    assert max(pairs.values()) < 30
+
+
+def test_results_are_kept_by_contestant_in_the_order_of_rounds() -> None:
+    calls: list[str] = []
+    contestants = {name: lambda name=name: (calls.append(name), calls.count(name))[1] for name in "xyz"}
+    assert interleaved(contestants, 3) == {name: [1, 2, 3] for name in "xyz"}
+    assert len(calls) == 9

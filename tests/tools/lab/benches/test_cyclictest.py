@@ -1,0 +1,69 @@
+"""cyclictest: its histogram as the lateness of every wake, and what it says when it is absent or refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.comparison import Absent
+from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
+from tests.machine import needs_fifo
+from tests.tools.lab.benches import peers
+
+GRID = WakeGrid((0,), 1_000_000, 50, 80)
+needs_cyclictest = pytest.mark.skipif(shutil.which("cyclictest") is None, reason="needs cyclictest (rt-tests)")
+
+
+@needs_fifo
+@needs_cyclictest
+def test_every_wake_has_its_lateness() -> None:
+    found = cyclictest(GRID)
+    assert len(found) == GRID.wakes
+    assert (found >= 0).all()
+
+
+def test_wakes_beyond_the_histogram_count_as_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)))
+    found = cyclictest(GRID)
+    assert np.unique(found, return_counts=True)[1].tolist() == [47, 1, 2]
+    assert found.max() == 150_000.0
+    # A thread on every core.
+    assert len(cyclictest(WakeGrid((0, 1), 1_000_000, 50, 80))) == 100
+
+
+def test_idle_cores_are_left_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = f"open({str(tmp_path / 'words')!r}, 'w').write(' '.join(sys.argv))"
+    monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", f"{peers.CYCLICTEST}{told}\n")))
+    cyclictest(GRID)
+    # Without it cyclictest itself holds every core awake.
+    assert "--laptop" in (tmp_path / "words").read_text().split()
+
+
+def test_a_refusal_is_a_failure_in_its_own_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.REFUSED)))
+    with pytest.raises(Failure, match="cyclictest: Unable to change scheduling policy!"):
+        cyclictest(GRID)
+
+
+def test_it_is_absent_without_the_program_or_the_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    absent = absent_cyclictest()
+    assert isinstance(absent, Absent)
+    assert "apt-get install rt-tests" in absent.line
+    peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
+    monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: False)
+    absent = absent_cyclictest()
+    assert isinstance(absent, Absent)
+    assert "SCHED_FIFO is refused" in absent.line
+
+
+def test_a_wake_late_by_cycles_is_overdue_at_each_point_it_passed() -> None:
+    period_ns = 1_000_000
+    assert overdue(np.array([0.0, 999.0]), period_ns) == 0.0
+    # The second wake came 3.2 cycles late: three points are lost, two of which had no wake of their own.
+    assert overdue(np.array([0.0, 3200.0]), period_ns) == 3 / 4
+    assert overdue(np.array([]), period_ns) == 0.0

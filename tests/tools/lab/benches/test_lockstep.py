@@ -1,0 +1,75 @@
+"""The bench of lockstep: the levels alone do the work of a rack, bit for bit, and speeds follow from given times."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.boards.config import load, resolve
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.bare import run_bare
+from rack.tools.lab.benches.lockstep import BARE, differences, measure, speeds
+from rack.tools.recording.recording import Recording
+from tests.shared_runs import nasrem_run
+
+
+def test_levels_without_a_rack_write_what_they_write_in_one(tmp_path_factory: pytest.TempPathFactory) -> None:
+    recording = Recording(nasrem_run(tmp_path_factory))
+    resolved = resolve(load("nasrem", ["clock.mode=lockstep"]))
+    bare = apart(run_bare, resolved.layout, resolved.tasks, recording.ended["outcome"]["ticks"])
+    assert list(differences(recording, bare)) == []
+    assert bare.processor_s > 0.0
+    # Other work is noticed: one message less, or one value that differs in its last bit.
+    fewer = replace(bare, serials={**bare.serials, "servo.plan": bare.serials["servo.plan"] - 1})
+    assert list(differences(recording, fewer)) == ["the number of messages in servo.plan"]
+    status = bare.last["servo.status"].copy()
+    status["position"][0] = np.nextafter(status["position"][0], 10.0)
+    other = replace(bare, last={**bare.last, "servo.status": status})
+    assert list(differences(recording, other)) == ["servo.status, field position"]
+
+
+def test_speeds_are_ratios_to_the_other_checkout_and_to_the_limit() -> None:
+    times = {("nasrem", "this tree"): [200.0, 240.0, 250.0], ("nasrem", "base"): [500.0], ("nasrem", BARE): [160.0]}
+    found = speeds(times, ["this tree", "base"])
+    assert found.speeds == {("nasrem", "this tree"): 1000 / 240, ("nasrem", "base"): 2.0, ("nasrem", BARE): 6.25}
+    own = [sample for sample in found.comparison.samples if sample.who == "this tree"]
+    assert [found.comparison.ratio(sample) for sample in own] == [0.48, 1.5]
+    assert found.comparison.cases == ["nasrem", "nasrem and its limit"]
+    alone = speeds({key: value for key, value in times.items() if key[1] != "base"}, ["this tree"])
+    assert alone.comparison.cases == ["nasrem and its limit"]
+    assert list(alone.lines(80))[1].split() == ["rack", "this", "tree", "no", "rack"]
+
+
+def test_a_short_bench_runs_a_rack_and_its_levels_alone(tmp_path: Path) -> None:
+    found = measure(None, {"fig4": 0.5}, 1, Progress())
+    assert {(sample.who, sample.count) for sample in found.comparison.samples} == {("this tree", 1), (BARE, 1)}
+    assert json.loads(json.dumps(found.document())) == found.document()
+    assert all(one["value"] > 0.0 for one in found.document()["simulated_seconds_a_second"])
+    assert [path.name for path in found.plot(tmp_path)] == ["lockstep.png", "lockstep.svg"]
+
+
+def fails() -> None:
+    raise Failure("no reason")
+
+
+def exits() -> None:
+    raise SystemExit(4)
+
+
+def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
+    with pytest.raises(Failure, match=r"^no reason$"):
+        apart(fails)
+    with pytest.raises(Failure, match="ended with status 4"):
+        apart(exits)
+
+
+def test_a_rack_whose_boards_interrupt_each_other_does_not_run_bare(small: Path) -> None:
+    resolved = resolve(load(small, ["protocol.default=interrupt"]))
+    with pytest.raises(Failure, match="interrupts its readers; only racks without any run without boards"):
+        run_bare(resolved.layout, resolved.tasks, 1)

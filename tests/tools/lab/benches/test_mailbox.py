@@ -1,0 +1,153 @@
+"""The bench of mailboxes: real transports, every message received as sent, nothing left, the best peer as baseline."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.backplane.layout import PROTOCOLS
+from rack.backplane.message import Message
+from rack.backplane.segment import SHM_FOLDER
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.comparison import EXTRA, Absent, Sample, absent_package
+from rack.tools.lab.benches.mailbox import CASES, MESSAGE, SIZES, Case, Exchange, compare, measure
+from rack.tools.lab.benches.transports import PEERS, REFERENCES, Peer, Transport, raw_copy
+from tests.processes import BOUND_S, RACK
+from tests.tools.command_line import ROOT
+from tests.tools.lab.benches.test_comparison import Hidden
+
+NET = ("tcp", "tcp6", "udp", "udp6")
+
+
+def left_by(pid: int) -> list[str]:
+    return [path.name for path in SHM_FOLDER.iterdir() if str(pid) in path.name or path.name.endswith(".zenoh")]
+
+
+def network_sockets() -> set[str]:
+    """Return the sockets of this process that are on a network, by inode."""
+    known = {line.split()[9] for name in NET for line in Path("/proc/self/net", name).read_text().splitlines()[1:]}
+    links = [str(fd.readlink()) for fd in Path("/proc/self/fd").iterdir() if fd.is_symlink()]
+    return known & {link.removeprefix("socket:[").removesuffix("]") for link in links}
+
+
+def test_messages_have_the_sizes_that_the_cases_name() -> None:
+    assert {case.size: MESSAGE.dtype(case.lengths).itemsize for case in CASES} == SIZES
+    assert {case.readers for case in CASES} == {1, 4}
+
+
+@pytest.mark.parametrize("peer", [*REFERENCES, *PEERS], ids=lambda peer: peer.name)
+def test_every_reader_receives_every_message_and_nothing_is_left(peer: Peer, tmp_path: Path) -> None:
+    if absent_package(peer.name, peer.module) is not None:
+        pytest.skip(f"{peer.module} is not installed")
+    # In a new process: threads of zenoh outlive its sessions, and do not start in a fork of a process with threads.
+    user = get_context("spawn").Process(target=use, args=(peer, tmp_path))
+    user.start()
+    try:
+        user.join(BOUND_S)
+        assert user.exitcode == 0
+    finally:
+        user.kill()
+    assert not left_by(user.pid or 0)
+    assert not list(tmp_path.iterdir())
+
+
+def use(peer: Peer, folder: Path) -> None:
+    tempfile.tempdir = str(folder)
+    case = Case("2 kB", 3)
+    with peer.opened(MESSAGE.dtype(case.lengths), case.readers) as transport:
+        # No name is left even while messages pass.
+        assert not list(folder.iterdir())
+        assert not left_by(os.getpid())
+        for serial in range(1, 40):
+            transport.message.id = serial
+            transport.message.position[:] = np.arange(case.lengths["joints"]) + serial
+            transport.send(serial)
+            received = [read(serial) for read in transport.readers]
+            assert [bytes(message.raw) for message in received] == [bytes(transport.message.raw)] * 3
+        assert not network_sockets()
+    assert not list(folder.iterdir())
+    assert not left_by(os.getpid())
+
+
+def test_a_transport_that_loses_messages_is_noticed() -> None:
+    case = Case("64 B", 2)
+
+    @contextmanager
+    def lossy() -> Iterator[Transport]:
+        with raw_copy(MESSAGE.dtype(case.lengths), 1) as transport:
+            stale = Message(MESSAGE.dtype(case.lengths))
+            yield transport._replace(readers=[*transport.readers, lambda tick: stale])
+
+    with lossy() as transport, pytest.raises(Failure, match=r"^lossy: a reader received another message"):
+        Exchange("lossy", transport, case.lengths).batch()
+
+
+def test_the_baseline_of_a_case_is_its_best_peer() -> None:
+    medians = {"raw copy": 1.0, "zenoh, one session": 2.0, "time-slice": 3.0, "iceoryx2 blackboard": 5.0, "zenoh": 4.0}
+    samples = [Sample("64 B", who, (value,), "us") for who, value in medians.items()]
+    samples += [Sample("200 B", "time-slice", (3.0,), "us")]
+    found = compare(samples, ())
+    assert found.baselines == {"64 B": "zenoh"}
+    assert [found.ratio(sample) for sample in samples] == [0.25, 0.5, 0.75, 1.25, 1.0, None]
+
+
+def test_a_bench_measures_every_protocol_and_names_who_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "meta_path", [Hidden("zenoh"), *sys.meta_path])
+    for name in [name for name in sys.modules if name.partition(".")[0] == "zenoh"]:
+        monkeypatch.delitem(sys.modules, name)
+    cases = (Case("200 B", 1), Case("200 B", 4))
+    found = measure(cases, 3, Progress())
+    assert found.cases == ["200 B, 1 reader", "200 B, 4 readers"]
+    assert set(found.contestants) >= {*PROTOCOLS, "raw copy", "multiprocessing pipe", "multiprocessing queue"}
+    assert all(sample.count == 3 and sample.best > 0 for sample in found.samples)
+    named = {"zenoh", "zenoh, one session"}
+    assert {one for one in found.absent if one.who in named} == {
+        Absent(who, "No module named 'zenoh'", EXTRA) for who in named
+    }
+    assert not named & set(found.contestants)
+    assert set(found.baselines) == set(found.cases)
+    assert set(found.baselines.values()) <= {peer.name for peer in PEERS}
+    assert not left_by(os.getpid())
+
+
+def test_the_command_prints_one_document_and_writes_its_pictures(tmp_path: Path) -> None:
+    command = [*RACK, "bench", "mailbox", "--rounds", "1", "--json", "--plot", tmp_path / "pictures"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, timeout=3 * BOUND_S)
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["bench"] == "mailbox"
+    assert {sample["case"] for sample in document["samples"]} == {case.name for case in CASES}
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == ["mailbox.png", "mailbox.svg"]
+
+
+def test_an_interrupted_bench_leaves_nothing(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*RACK, "bench", "mailbox", "--rounds", "100000"],
+        cwd=ROOT,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() + process.stdout.readline() == b"about 1 minutes\n64 B, 1 reader\n"
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=BOUND_S)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert not left_by(process.pid)
+    assert not list(tmp_path.iterdir())

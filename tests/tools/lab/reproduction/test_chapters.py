@@ -1,0 +1,131 @@
+"""The page as a whole: every section, equation and figure of the paper is on it, and every ruling has its reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.tools.console.answer import Failure
+from rack.tools.lab.reproduction.experiments.experiment import KEPT, Workshop
+from rack.tools.lab.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
+from rack.tools.lab.reproduction.sections import application, model, opening, time
+from rack.tools.lab.reproduction.sections.page import Assessment, Ruling
+from rack.tools.lab.reproduction.sections.statement import Chapter, Findings
+
+SECTIONS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
+NOWHERE = Workshop(Path("nowhere"), share=True)
+
+
+def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_order() -> None:
+    assert [chapter.name for chapter in CHAPTERS] == SECTIONS
+    names = [statement.name for chapter in CHAPTERS for statement in chapter.statements]
+    assert len(names) == len(set(names))
+    assert [name for name in names if name.startswith("equation-")] == [f"equation-3.{n}" for n in range(1, 11)]
+    assert {f"figure-{n}" for n in range(1, 6)} <= set(names)
+
+
+def test_no_two_experiments_share_a_name_or_a_picture() -> None:
+    found = experiments(CHAPTERS)
+    assert len({one.name for one in found}) == len(found)
+    assert sum(one.seconds for one in found) < 15 * 60
+
+
+def test_a_section_that_the_paper_lacks_is_refused() -> None:
+    with pytest.raises(Failure, match=r"--only 6: no such section; permitted: abstract, 1, 2"):
+        chapters_named(["6"])
+
+
+def judged(chapter: Chapter, name: str, found: dict[str, Any]) -> Assessment:
+    """Return the judgement of one statement of a chapter."""
+    (statement,) = [one for one in chapter.statements if one.name == name]
+    return statement.tested(Findings(found, NOWHERE))
+
+
+def run(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> dict[str, Any]:
+    """Return what a run leaves of which the digest counts."""
+    difference = None if differs is None else {"tick": differs, "mailbox": "servo.status"}
+    head = {"run": mode, "mode": mode, "digest": digest, "ticks": 10, "wall_s": 1.0, "messages": 5}
+    return {**head, "missed": int(miss is not None), "first_miss": miss, "difference": difference}
+
+
+LOCKSTEP = [run("lockstep", "a"), run("lockstep", "a")]
+
+
+@pytest.mark.parametrize(
+    ("runs", "ruling"),
+    [
+        ([*LOCKSTEP, run("realtime", "a")], Ruling.HOLDS),
+        ([*LOCKSTEP, run("realtime", "b", miss=4, differs=5), run("realtime", "a")], Ruling.HOLDS),
+        ([*LOCKSTEP, run("realtime", "b", miss=4, differs=5)], Ruling.BOUNDED),
+        ([*LOCKSTEP, run("realtime", "b", miss=6, differs=5)], Ruling.FAILS),
+        ([*LOCKSTEP, run("realtime", "b", differs=5)], Ruling.FAILS),
+        ([run("lockstep", "a"), run("lockstep", "b", differs=1), run("realtime", "a")], Ruling.FAILS),
+    ],
+    ids=["equal", "equal at last", "after a miss", "before a miss", "without a miss", "lockstep differs"],
+)
+def test_determinism_is_judged_by_digests_and_by_the_first_miss(runs: list[dict[str, Any]], ruling: Ruling) -> None:
+    assert judged(opening.ABSTRACT, "determinism", {"determinism": {"runs": runs}}).ruling is ruling
+
+
+@pytest.mark.parametrize(
+    ("lockstep", "realtime", "ruling"),
+    [
+        ({"5": 9}, {"5": 9}, Ruling.HOLDS),
+        ({"5": 9}, {"5": 8, "6": 1}, Ruling.BOUNDED),
+        ({"5": 8, "6": 1}, {"5": 9}, Ruling.FAILS),
+        ({"5": 9}, {"4": 1, "5": 8}, Ruling.FAILS),
+    ],
+    ids=["exact", "late in real time", "late in lockstep", "too early"],
+)
+def test_five_levels_take_five_cycles(lockstep: dict[str, int], realtime: dict[str, int], ruling: Ruling) -> None:
+    found = {"pipeline": {"predicted": 5, "cycles": {"lockstep": lockstep, "realtime": realtime}}}
+    assert judged(model.CHAPTER, "pipeline", found).ruling is ruling
+
+
+@pytest.mark.parametrize(
+    ("refused", "done_s", "ruling"),
+    [(True, 9.9, Ruling.HOLDS), (True, 10.2, Ruling.FAILS), (False, 9.9, Ruling.FAILS)],
+    ids=["met", "too late", "not refused"],
+)
+def test_a_time_is_refused_or_met(refused: bool, done_s: float, ruling: Ruling) -> None:
+    end = {"cause": "task done", "reason": "", "moved": True}
+    early = {**end, "by_s": 4.0, "done_s": None if refused else 5.0, "moved": not refused}
+    runs = [{**end, "by_s": None, "done_s": 9.0}, early, {**end, "by_s": 10.0, "done_s": done_s}]
+    assert judged(time.CHAPTER, "soft-and-real-time", {"goto": {"runs": runs, "place": [0, 0, 0]}}).ruling is ruling
+
+
+def test_state_tables_must_answer_the_disturbance() -> None:
+    def task(*rows: str) -> dict[str, Any]:
+        fired = [{"name": name, "cycles": 1, "first_s": 1.0} for name in rows]
+        return {"rows": {"elemental_move": fired}, "outcome": {"worked": True}}
+
+    answered = {"nist-state-table": {"disturbed": task("pick", "aim again"), "undisturbed": task("pick")}}
+    ignored = {"nist-state-table": {"disturbed": task("pick"), "undisturbed": task("pick")}}
+    assert judged(application.CHAPTER, "state-tables", answered).ruling is Ruling.HOLDS
+    assert judged(application.CHAPTER, "state-tables", ignored).ruling is Ruling.FAILS
+
+
+def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None:
+    from rack.tools.lab.reproduction.experiments.experiment import Kept
+
+    workshop = Workshop(tmp_path, share=True)
+    workshop.prepare()
+    (statement,) = time.CHAPTER.statements
+    unmade = statement.claim(workshop, {})
+    failed = statement.claim(workshop, {"goto": "the rack did not run"})
+    lacking = statement.claim(workshop, {"goto": Kept({}, 1.0, "now", "this machine has one processor")})
+    assert (unmade.tested.ruling, failed.tested.ruling) == (Ruling.UNMADE, Ruling.UNMADE)
+    assert "the rack did not run" in failed.tested.why
+    assert lacking.tested.ruling is Ruling.UNTESTABLE
+    assert lacking.tested.why == "this machine has one processor."
+    assert all(claim.predicted.items for claim in (unmade, failed, lacking))
+
+
+def test_a_section_is_made_again_when_it_is_forgotten(tmp_path: Path) -> None:
+    (tmp_path / KEPT).mkdir()
+    for name in ("goto", "nasrem"):
+        (tmp_path / KEPT / f"{name}.json").touch()
+    forget(chapters_named(["3"]), tmp_path)
+    assert [path.name for path in (tmp_path / KEPT).iterdir()] == ["nasrem.json"]

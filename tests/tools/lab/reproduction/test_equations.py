@@ -1,0 +1,52 @@
+"""Equations 3.1 to 3.10 on the page: predicted, judged by a run, and a rack in which each fails."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.sections import timing
+from rack.tools.lab.reproduction.sections.equations import PaperEquation, judged
+from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
+from rack.tools.lab.reproduction.sections.statement import Findings
+
+EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
+RUN = {"outcome": {"ticks": 800}, "breaches": {}, "steal": {}}
+
+NOWHERE = Workshop(Path("nowhere"), share=True)
+
+
+def test_all_ten_equations_are_there_in_their_order() -> None:
+    assert [one.number for one in EQUATIONS] == [f"3.{number}" for number in range(1, 11)]
+    named = [s.name for chapter in (timing.RESPONSE, timing.LOW, timing.HIGH) for s in chapter.statements]
+    assert [name for name in named if name.startswith("equation")] == [f"equation-{one.number}" for one in EQUATIONS]
+
+
+@pytest.mark.parametrize("equation", EQUATIONS, ids=lambda one: one.number)
+def test_each_fails_in_the_rack_that_is_to_show_it(equation: PaperEquation) -> None:
+    _, shown = equation.biting.side(equation.number)
+    if isinstance(shown, Listing):
+        assert re.search("60 Hz does not divide the 400 Hz clock", shown.text)
+    else:
+        assert isinstance(shown, Columns)
+        assert any("FAILS" in row for row in shown.rows)
+
+
+def verdict(holds: bool, mostly: bool) -> dict[str, object]:
+    """Return a pair as a run keeps it: one equation, measured for one level."""
+    sides = {"left": 3e6 if not holds else 1e6, "sign": "<=", "right": 2.5e6, "margin": 1.5e6 if holds else -0.5e6}
+    measured = {"equation": "3.1", "subject": "servo", **sides, "holds": holds, "meaning": "", "unit": "ns"}
+    return {"equation": "3.1", "subject": "servo", "predicted": None, "measured": measured, "mostly": mostly}
+
+
+@pytest.mark.parametrize(
+    ("holds", "mostly", "ruling"),
+    [(True, True, Ruling.HOLDS), (False, True, Ruling.BOUNDED), (False, False, Ruling.FAILS)],
+    ids=["always", "mostly", "seldom"],
+)
+def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(holds: bool, mostly: bool, ruling: Ruling) -> None:
+    found = judged(timing.FITS, Findings({"nasrem": {**RUN, "pairs": [verdict(holds, mostly)]}}, NOWHERE))
+    assert found.ruling is ruling

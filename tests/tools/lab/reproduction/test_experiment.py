@@ -1,0 +1,85 @@
+"""Experiments are kept, and made again only when what they depend on has changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.tools.console.answer import Failure
+from rack.tools.lab.reproduction.experiments.experiment import KEPT, Experiment, Kept, Lacking, Workshop, kept, made
+
+
+class Counted:
+    """An experiment that counts how often it is made; `inputs` is what it depends on."""
+
+    def __init__(self) -> None:
+        self.times, self.inputs = 0, {"config": "a"}
+
+    def make(self, workshop: Workshop) -> dict[str, Any]:
+        self.times += 1
+        path = workshop.picture("one").with_suffix(".svg")
+        path.write_text("<svg/>")
+        return {"times": self.times, "pictures": {"one": workshop.shown([path])}}
+
+    def experiment(self) -> Experiment:
+        return Experiment("counted", "counting", 1.0, lambda: self.inputs, self.make)
+
+
+@pytest.fixture
+def workshop(tmp_path: Path) -> Workshop:
+    found = Workshop(tmp_path / "page", share=True)
+    found.prepare()
+    return found
+
+
+def test_a_result_is_kept_until_its_inputs_change(workshop: Workshop) -> None:
+    counted = Counted()
+    one = counted.experiment()
+    assert kept(one, workshop.folder) is None
+    first = made(one, workshop)
+    assert kept(one, workshop.folder) == first
+    counted.inputs = {"config": "b"}
+    assert kept(one, workshop.folder) is None
+    assert made(one, workshop).found["times"] == 2
+
+
+def test_a_result_whose_picture_is_gone_is_made_again(workshop: Workshop) -> None:
+    one = Counted().experiment()
+    found = made(one, workshop)
+    (workshop.folder / found.found["pictures"]["one"]).unlink()
+    assert kept(one, workshop.folder) is None
+
+
+@pytest.mark.parametrize("rest", ['{"found": ', "[]", "{}", '{"found": 1, "took_s": 1, "made_at": "", "lacking": ""}'])
+def test_a_file_that_is_no_result_is_made_again(rest: str, workshop: Workshop) -> None:
+    (workshop.folder / KEPT / "counted.json").write_text(rest)
+    assert kept(Counted().experiment(), workshop.folder) is None
+
+
+def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(workshop: Workshop) -> None:
+    def lack(workshop: Workshop) -> dict[str, Any]:
+        raise Lacking("no second processor")
+
+    def fail(workshop: Workshop) -> dict[str, Any]:
+        raise Failure("the rack did not run")
+
+    lacking, failing = (Experiment(make.__name__, "", 1.0, dict, make) for make in (lack, fail))
+    made(lacking, workshop)
+    found = kept(lacking, workshop.folder)
+    assert found is not None
+    assert found.lacking == "no second processor"
+    with pytest.raises(Failure, match="did not run"):
+        made(failing, workshop)
+    assert kept(failing, workshop.folder) is None
+
+
+def test_what_a_result_depends_on_stands_next_to_it(workshop: Workshop) -> None:
+    one = Counted().experiment()
+    found = made(one, workshop)
+    document = json.loads((workshop.folder / KEPT / "counted.json").read_text())
+    assert document["depends"] == json.loads(json.dumps(one.depends()))
+    assert {"inputs", "program", "machine"} <= set(document["depends"])
+    assert isinstance(found, Kept)

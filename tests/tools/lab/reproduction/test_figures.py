@@ -1,0 +1,77 @@
+"""Section 3.4 of the paper by computation: where figures 2 to 4 are what it says, and where they are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.figures import FigureRack, planning, sweep
+from rack.tools.lab.reproduction.sections import gantt
+from rack.tools.lab.reproduction.sections.page import Listing, Plate, Ruling
+from rack.tools.lab.reproduction.sections.statement import Findings
+
+NOWHERE = Workshop(Path("nowhere"), share=True)
+
+
+def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
+    rows = {one.process_ms: one for one in sweep("fig2", gantt.PAPER_X)}
+    # R X W P U in 8 ms: P has 5 - X ms a cycle, 2 ms with the longest X, not "at least 3 ms".
+    assert {x: one.each_ms for x, one in rows.items()} == {1.0: 4.0, 1.5: 3.5, 2.0: 3.0, 2.5: 2.5, 3.0: 2.0}
+    assert [one.process_ms for one in gantt.contradicting(list(rows.values()))] == [2.5, 3.0]
+    # With one U for each plan: 2 x 3 ms for P and U, which need 7.
+    assert (rows[3.0].once_ms, rows[3.0].cycles_once, rows[3.0].permitted) == (3.0, 3, 2)
+    assert rows[3.0].cycles_each == 3
+    assert not rows[3.0].in_time
+    assert "3.8" in rows[3.0].failing
+    assert not rows[2.0].failing
+
+
+def test_figure_3_has_a_plan_in_time_with_the_shortest_x() -> None:
+    short, usual = planning("fig3", gantt.LEAST_X), planning("fig3", 2.0)
+    assert (short.in_time, short.failing) == (True, ())
+    assert not usual.in_time
+    assert "3.8" in usual.failing
+
+
+def test_figure_4_has_no_idle_time_with_the_longest_x() -> None:
+    usual, full, newer = (planning("fig4", x) for x in (2.0, gantt.MOST_X, gantt.NEWER_X))
+    assert (usual.pattern, usual.failing) == ("C R X W -", ())
+    assert (full.pattern, full.failing, full.idle_ms) == ("C R X W", ("3.6",), 0.0)
+    assert {"3.1", "3.6"} <= set(newer.failing)
+
+
+def document(late: int, jobs: int = 100) -> dict[str, object]:
+    """Return what a run of a figure leaves, with so many late plans."""
+    counts = {
+        "level": {"jobs": jobs, "late": 0, "skipped": 0},
+        "level.planner": {"jobs": jobs, "late": late, "skipped": 0},
+    }
+    patterns = {"level": [[["R X W P | R X W P U -", jobs]], []]}
+    return {"tasks": counts, "patterns": patterns, "steal": {}, "pictures": {"measured": "pictures/x.svg"}}
+
+
+@pytest.mark.parametrize(
+    ("late", "ruling"), [(0, Ruling.HOLDS), (3, Ruling.BOUNDED), (97, Ruling.FAILS)], ids=["in time", "stray", "late"]
+)
+def test_a_figure_that_works_is_judged_by_its_run(late: int, ruling: Ruling) -> None:
+    (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2"]
+    assert statement.tested(Findings({"fig2": document(late)}, NOWHERE)).ruling is ruling
+
+
+def test_runs_that_do_not_confirm_the_contradiction_make_it_no_finding() -> None:
+    (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2-x"]
+    confirmed = {gantt.SHORT_2.label: document(0), gantt.LONG_2.label: document(100)}
+    assert statement.tested(Findings(confirmed, NOWHERE)).ruling is Ruling.CONTRADICTS
+    assert statement.tested(Findings({**confirmed, gantt.LONG_2.label: document(0)}, NOWHERE)).ruling is Ruling.FAILS
+
+
+def test_a_schedule_is_drawn_as_the_paper_draws_it(tmp_path: Path) -> None:
+    workshop = Workshop(tmp_path, share=True)
+    workshop.prepare()
+    plate, letters = gantt.drawn(FigureRack("fig2", 2), workshop)
+    assert isinstance(plate, Plate)
+    assert isinstance(letters, Listing)
+    assert (tmp_path / plate.path).read_text().startswith("<?xml")
+    assert "RXXWPPPPRXXWPPU-" in letters.text

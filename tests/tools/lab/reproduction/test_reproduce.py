@@ -1,0 +1,56 @@
+"""`rack reproduce` as a command: one section by real runs, killed, continued, and kept."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rack.tools.lab.reproduction.experiments.deadline import DEADLINE
+from rack.tools.lab.reproduction.experiments.experiment import KEPT, kept
+from tests.processes import wait_until
+from tests.tools.command_line import BOUND_S, rack
+
+pytestmark = pytest.mark.timeout(200)
+SECTION = "3"
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a page whose command was killed in the middle of a run."""
+    folder = tmp_path_factory.mktemp("page") / "paper"
+    command = [sys.executable, "-m", "rack.tools.cli", "reproduce", "--out", str(folder), "--only", SECTION, "--share"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    begun = folder / "runs" / "goto" / "events.jsonl"
+    wait_until(lambda: begun.exists() or process.poll() is not None, BOUND_S)
+    assert process.poll() is None, "it ended before its first run"
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    return folder
+
+
+def test_a_killed_command_leaves_no_half_result_and_goes_on(killed: Path) -> None:
+    assert not list((killed / KEPT).iterdir())
+    done = rack("reproduce", "--out", killed, "--only", SECTION, "--share", "--json")
+    found = json.loads(done.stdout)
+    (claim,) = next(one for one in found["sections"] if one["section"] == SECTION)["claims"]
+    assert (done.returncode, done.stderr, claim["ruling"]) == (0, "", "holds")
+    assert [path.name for path in (killed / KEPT).iterdir()] == ["goto.json"]
+    assert kept(DEADLINE, killed) is not None
+    page, text = ((killed / name).read_text() for name in ("index.html", "README.md"))
+    assert not [
+        target for target in re.findall(r'(?:src|href)="([^"]+)"', page) if target[:1] != "#" and target[:5] != "data:"
+    ]
+    assert all((killed / path).is_file() for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text))
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = rack("reproduce", "--out", tmp_path / "file")
+    assert (done.returncode, done.stderr) == (2, f"--out {tmp_path / 'file'}: exists, and is not a folder\n")

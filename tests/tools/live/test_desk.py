@@ -1,0 +1,197 @@
+"""`rack command` on running racks: giving a command, waiting for the reply, and refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.operator_table import OperatorTable
+from rack.backplane.segment import Segment
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.tools.commands.command import goal_of
+from rack.tools.console.answer import Failure
+from rack.tools.live import desk
+from rack.tools.live.desk import LiveDesk, Replies
+from rack.tools.live.watched import LocalRack
+from tests.boards.commanded_racks import COMMANDED
+from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
+
+
+def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
+    """Start a rack that runs until it is stopped; return when it does."""
+    path.write_text(COMMANDED)
+    given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
+    command = [*RACK, "run", str(path), "--no-record", *given]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(name) and "tick 0 " not in line:
+            break
+    return process
+
+
+def end(process: subprocess.Popen[str], name: str) -> None:
+    rack("stop", name)
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture(scope="module", params=["realtime", "lockstep"])
+def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The name of a rack that runs until it is stopped."""
+    name = f"test-command-{request.param}-{os.getpid()}"
+    process = start(tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}")
+    yield name
+    end(process, name)
+
+
+def test_a_command_is_given_and_taken_up(running: str) -> None:
+    done = rack("command", running, "upper", "hold", "--json")
+    answer = json.loads(done.stdout)
+    assert done.returncode == 0, done.stderr
+    assert (answer["level"], answer["text"], answer["worked"]) == ("upper", "hold", True)
+    assert answer["fate"] in ("taken", "done")
+    # Read at the first release after its tick, if none was skipped.
+    assert answer["given"] < answer["taken_up"]
+    assert answer["taken_up"] % 8 == 0
+    again = rack("command", running, "upper", "resume")
+    assert again.returncode == 0
+    assert again.stdout.startswith(f"command {answer['serial'] + 1} to 'upper', resume: given at tick ")
+
+
+def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
+    answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
+    assert answer["fate"] == "done"
+    # The level below has answered: two cycles later.
+    assert answer["given"] < answer["taken_up"] < answer["done"]
+    assert rack("command", running, "upper", "resume").returncode == 0
+
+
+def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
+    running: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A level that never completes it.
+    monkeypatch.setattr(Replies, "look", lambda replies: replace(replies.reply, fate="taken", taken_up=0))
+    still = f", not done; in force until: rack command {running} upper resume$"
+    with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
+        LiveDesk(LocalRack(running)).give({"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0)
+    assert rack("command", running, "upper", "resume").returncode == 0
+
+
+def test_a_command_that_stays_in_force_says_how_to_end_it(running: str) -> None:
+    held = rack("command", running, "upper", "hold").stdout.splitlines()
+    assert held[1:] == [f"in force until: rack command {running} upper resume"]
+    assert len(rack("command", running, "upper", "resume").stdout.splitlines()) == 1
+
+
+def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
+    done = rack("command", running, "upper", "goto", "home")
+    assert done.returncode == 1
+    assert done.stdout.rstrip().endswith(": the way home is closed")
+
+
+def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
+    rows = {row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)}
+    assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
+    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off"
+
+
+REFUSED = {
+    "no level": (
+        ("uper", "hold"),
+        'level = "uper": no level of this name takes commands; levels that do: upper, lower',
+    ),
+    "no wait to bound": (
+        ("upper", "hold", "--timeout", "1"),
+        "--timeout needs --wait; give both, or neither",
+    ),
+    "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
+    "nothing that is said": (("upper", "halt"), "'setpoint', 'goto', 'modify', 'table' or 'do'"),
+    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
+    "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
+    "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),
+    "no number": (
+        ("upper", "goto", "joints=1,x"),
+        "'joints=1,x': 'x' is not a number; permitted: numbers separated by commas",
+    ),
+    "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
+    "a tick that has passed": (("upper", "hold", "--tick", "0"), "tick = 0: has passed; the rack is at tick "),
+}
+
+
+@pytest.mark.parametrize(("words", "reason"), REFUSED.values(), ids=REFUSED)
+def test_bad_usage_is_one_line_and_status_2(running: str, words: tuple[str, ...], reason: str) -> None:
+    done = rack("command", running, *words)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert reason in done.stderr
+
+
+def test_a_rack_that_is_not_there_is_one_line() -> None:
+    done = rack("command", "no-such-rack", "upper", "hold")
+    assert done.returncode == 1
+    assert done.stderr.startswith("rack 'no-such-rack' does not exist")
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str, end: signal.Signals) -> None:
+    table = OperatorTable(Segment.attach(running))
+    command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    wait_until(table.waiting)
+    process.send_signal(end)
+    process.communicate(timeout=BOUND_S)
+    assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
+    assert table.waiting() == []
+
+
+def test_the_end_of_the_run_ends_a_wait(tmp_path: Path) -> None:
+    name = f"test-command-end-{os.getpid()}"
+    process = start(tmp_path / "told.toml", name, "clock.mode=realtime")
+    try:
+        table = OperatorTable(Segment.attach(name))
+        command = [*RACK, "command", name, "upper", "hold", "--tick", str(10**9)]
+        waiting = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        wait_until(table.waiting)
+        rack("stop", name)
+        _, printed = waiting.communicate(timeout=BOUND_S)
+        assert waiting.returncode == 1
+        assert printed.splitlines()[-1] == "'upper', hold: the run ended before it was given"
+    finally:
+        end(process, name)
+
+
+def test_a_clock_without_ticks_is_not_waited_for(
+    rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(desk, "SILENT_S", 0.05)
+    path = tmp_path / "told.toml"
+    path.write_text(COMMANDED)
+    # Launched and not started: there is a rack, and no clock yet.
+    with Rack(load(path, [f"name={rack_name}"])):
+        with pytest.raises(Failure, match="has not ticked for"):
+            LiveDesk(LocalRack(rack_name)).give({"level": "upper", "what": "hold"}, wait=False)
+        assert OperatorTable(Segment.attach(rack_name)).waiting() == []
+
+
+def test_goals_are_numbers_with_commas() -> None:
+    assert goal_of("goto", ["position=1,-2.5,3e-1", "direction=0,0,-1"]) == {
+        "position": [1.0, -2.5, 0.3],
+        "direction": [0.0, 0.0, -1.0],
+    }
+
+
+def test_a_setting_is_a_name_and_on_or_off() -> None:
+    assert goal_of("modify", ["friction", "off"]) == {"name": "friction", "on": False}
+    for words in ([], ["friction"], ["friction", "maybe"], ["friction", "on", "off"]):
+        with pytest.raises(Failure, match="permitted: modify NAME on, modify NAME off"):
+            goal_of("modify", words)

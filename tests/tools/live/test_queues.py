@@ -1,0 +1,50 @@
+"""Queues as users see them: in `rack status`, in the report of a run, in `rack check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rack.boards import Rack
+from rack.boards.config import load, wire
+from rack.tools.commands.check import inventory, inventory_lines
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.live.queues import Queues
+from rack.tools.timing.analysis.report import write_report
+from tests.boards.test_queues import QUEUES
+
+FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
+
+
+def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(tmp_path: Path, rack_name: str) -> None:
+    path = tmp_path / "queues.toml"
+    path.write_text(QUEUES)
+    config = load(path, [f"name={rack_name}", *FULL])
+    result = run_rack(config, 2.0, tmp_path / "run", Display())
+    report, text = write_report(tmp_path / "run")
+    (queue,) = report["queues"]
+    # Three requests every 40 ticks; two are taken every 100, first when six are visible.
+    assert queue["sent"] + queue["refused"] == 3 * 20
+    assert (queue["taken"], queue["waiting"], queue["capacity"]) == (2 * 7, 6, 7)
+    assert result.refused == {"upper.requests": queue["refused"]}
+    assert f"at most 6 waiting, room for 7, {queue['refused']} refused" in text
+
+
+def test_a_running_rack_shows_its_queues(tmp_path: Path, rack_name: str) -> None:
+    path = tmp_path / "queues.toml"
+    path.write_text(QUEUES)
+    with Rack(load(path, [f"name={rack_name}", *FULL])) as rack:
+        queues = Queues(rack.segment)
+        (empty,) = queues.look()
+        assert empty.line == "queue upper.requests: 0 of 7 unread"
+        rack.run(1.0)
+        (full,) = queues.look()
+    assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
+
+
+def test_check_shows_the_depth_of_a_queue(tmp_path: Path) -> None:
+    path = tmp_path / "queues.toml"
+    path.write_text(QUEUES)
+    config = load(path, list(FULL))
+    (line,) = (line for line in inventory_lines(inventory(config, wire(config), [])) if "upper.requests " in line)
+    assert "queue of 7" in line

@@ -1,0 +1,236 @@
+"""Commands on HOST/RACK: a real rack on loopback, looked at, commanded and stopped by its address."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from rack.backplane.operator_table import OperatorTable
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.tools.viewer.window import free_port
+from tests.boards.commanded_racks import COMMANDED
+from tests.processes import BOUND_S, RACK, wait_until
+from tests.tools.command_line import ROOT, rack
+
+OF_LAN = """
+[adapter.lan]
+slot = 5
+rate_hz = 100
+listen = ["tcp/127.0.0.1:{port}"]
+peers = ["elsewhere"]
+
+[adapter.lan.permit]
+operator = ["watch", "command", "stop"]
+watcher = ["watch"]
+"""
+LATE = str(10**9)
+"""A tick that no test reaches."""
+NOT_PERMITTED = "rack '{}' does not permit '{}' to {}; its config: adapter.lan.permit"
+
+
+class Far(NamedTuple):
+    """A rack that runs: its name here, its address from afar, and the events that its launcher has printed."""
+
+    name: str
+    address: str
+    log: Path
+
+    @property
+    def port(self) -> str:
+        """HOST:PORT of the address."""
+        return self.address.partition("/")[0]
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    status: int
+    out: str
+    err: str
+
+
+def afar(*commands: str, certificates: str = "") -> list[Ended]:
+    """Run commands, each as one text, in a client's process."""
+    words = [json.dumps(command.split()) for command in commands]
+    environment = {**os.environ, "RACK_CERTIFICATES": certificates}
+    client = subprocess.run(
+        [sys.executable, "-m", "tests.tools.network.client", *words],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S * 2,
+    )
+    assert client.returncode == 0, client.stderr
+    return [Ended(*ended) for ended in json.loads(client.stdout)]
+
+
+def started(folder: Path, mode: str, *settings: str) -> Iterator[Far]:
+    """Start a rack that runs until it is stopped, and stop it at the end."""
+    name, port = f"test-afar-{mode}-{os.getpid()}", free_port()
+    config, log = folder / "far.toml", folder / "log"
+    config.write_text(COMMANDED + OF_LAN.format(port=port))
+    given = [word for setting in (f"name={name}", f"clock.mode={mode}", *settings) for word in ("--set", setting)]
+    with log.open("w") as out:
+        process = subprocess.Popen([*RACK, "run", str(config), "--no-record", *given], cwd=ROOT, stdout=out, stderr=out)
+    try:
+        wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
+        assert process.poll() is None, log.read_text()
+        yield Far(name, f"127.0.0.1:{port}/{name}", log)
+    finally:
+        rack("stop", name)
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def client(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a command in a process of its own, which is killed at the end, should it still run."""
+    process = subprocess.Popen([*RACK, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+REALTIME = pytest.mark.parametrize("far", ["realtime"], indirect=True)
+IN_BOTH = pytest.mark.parametrize("far", ["realtime", "lockstep"], indirect=True)
+
+
+@pytest.fixture(scope="module")
+def far(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
+    """A rack on this machine, to be reached by its address."""
+    # In lockstep it would wait for its peer.
+    settings = ("adapter.lan.peers=[]",) if request.param == "lockstep" else ()
+    yield from started(tmp_path_factory.mktemp("far"), request.param, *settings)
+
+
+def shape(document: Any) -> Any:
+    """Return what is not a number in a document: its keys, its texts, its lists' lengths."""
+    if isinstance(document, Mapping):
+        return {key: shape(value) for key, value in document.items()}
+    if isinstance(document, list):
+        return [shape(item) for item in document]
+    return "number" if isinstance(document, float | int) and not isinstance(document, bool) else document
+
+
+@IN_BOTH
+def test_a_status_from_afar_has_the_fields_of_the_local_one(far: Far) -> None:
+    near = json.loads(rack("status", far.name, "--json").stdout)
+    (seen,) = afar(f"status {far.address} --json")
+    assert seen.status == 0, seen.err
+    document = json.loads(seen.out)
+    assert shape(document) == shape(near)
+    assert document["tick"] > near["tick"]
+    assert all(row["cycles"] > before["cycles"] for row, before in zip(document["tasks"], near["tasks"], strict=True))
+
+
+@IN_BOTH
+def test_a_command_is_given_taken_up_and_resumed(far: Far) -> None:
+    held, listed, resumed, wrong = afar(
+        f"command {far.address} upper hold --wait --json",
+        f"command {far.address} --list",
+        f"command {far.address} upper resume",
+        f"command {far.address} upper jump",
+    )
+    answer = json.loads(held.out)
+    assert (held.status, answer["level"], answer["fate"]) == (0, "upper", "done")
+    assert answer["given"] < answer["taken_up"] < answer["done"]
+    assert "upper  hold " in listed.out
+    assert (resumed.status, "taken up at tick" in resumed.out) == (0, True)
+    assert wrong.status == 2
+    assert wrong.err.startswith('what = "jump": ')
+
+
+@REALTIME
+def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
+    ended = afar(
+        f"command {far.address} upper hold --as watcher",
+        f"estop {far.address} --as watcher",
+        f"status {far.address} --as nobody",
+        f"status {far.port}/other",
+        f"estop {far.address} --reset",
+        f"stop {far.address}",
+    )
+    assert [one.err.strip() for one in ended] == [
+        NOT_PERMITTED.format(far.name, "watcher", "command"),
+        NOT_PERMITTED.format(far.name, "watcher", "stop"),
+        NOT_PERMITTED.format(far.name, "nobody", "watch"),
+        f"no rack 'other' at {far.port}; racks there: {far.name}",
+        f"rack '{far.name}' resets an emergency stop on its own machine alone: rack estop {far.name} --reset",
+        f"RACK = {far.address}: this command works on the rack's own machine alone; permitted from afar: list --lan, "
+        "status, top, command, estop",
+    ]
+    assert [one.status for one in ended] == [1, 1, 1, 1, 1, 2]
+
+
+@REALTIME
+def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far) -> None:
+    shown, closed = afar(f"list --lan {far.port} --json", f"list --lan {far.port} --as nobody --json")
+    found = next(row for row in json.loads(shown.out) if row["host"] == far.port)
+    assert (found["rack"], found["state"], found["peers"]) == (far.name, "running", [["elsewhere", "awaited"]])
+    assert found["age_s"] > 0
+    hidden = next(row for row in json.loads(closed.out) if row["host"] == far.port)
+    assert (hidden["state"], hidden["detail"]) == ("closed", NOT_PERMITTED.format(far.name, "nobody", "watch"))
+
+
+@REALTIME
+def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> None:
+    segment = Segment.attach(far.name)
+    stopped, seen = afar(f"estop {far.address} --json", f"status {far.address}")
+    assert stopped.status == 0, stopped.err
+    assert json.loads(stopped.out)["emergency_stop"] is True
+    assert segment.words[System.EMERGENCY_STOP] == 1
+    assert f"to release: rack estop {far.name} --reset, on its own machine" in " ".join(seen.out.split())
+    wait_until(lambda: "'operator' has set the emergency stop from another machine" in far.log.read_text())
+    assert rack("estop", far.name, "--reset").returncode == 0
+    assert segment.words[System.EMERGENCY_STOP] == 0
+    segment.close()
+
+
+@REALTIME
+def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
+    segment = Segment.attach(far.name)
+    table = OperatorTable(segment)
+    with client("top", far.address) as top, client("command", far.address, "upper", "hold", "--tick", LATE) as command:
+        assert top.stdout is not None
+        assert top.stdout.readline().startswith(far.name)
+        wait_until(table.waiting)
+        for process in (top, command):
+            process.send_signal(signal.SIGINT)
+        assert [process.wait(BOUND_S) for process in (top, command)] == [128 + signal.SIGINT] * 2
+        # At once, or, if it did not know its ticket yet, when it has not been heard of for a while.
+        wait_until(lambda: not table.waiting())
+    segment.close()
+
+
+@REALTIME
+def test_who_watches_sees_the_run_stop(far: Far) -> None:
+    with client("top", far.address) as top:
+        assert top.stdout is not None
+        assert "running" not in top.stdout.readline()
+        assert rack("stop", far.name).returncode == 0
+        assert top.wait(BOUND_S) == 0
+        assert "gone" not in top.stdout.read()
+
+
+def test_a_host_that_cannot_be_reached_is_one_line() -> None:
+    port = free_port()
+    ended = afar(f"status 127.0.0.1:{port}/x", "status 127.0.0.1:99999/x", "status 127.0.0.1/X!", "list localhost")
+    assert [one.err.strip() for one in ended] == [
+        f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
+        'HOST = "127.0.0.1:99999": not a host; permitted: a name or address, as in 10.0.0.5 or cell:7447',
+        'RACK = "127.0.0.1/X!": not a rack; permitted: RACK, or HOST/RACK, as in 10.0.0.5/cell',
+        "HOST = localhost: needs --lan, as in: rack list --lan localhost",
+    ]

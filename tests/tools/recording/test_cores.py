@@ -1,0 +1,131 @@
+"""What the machine did to its cores: time that the hypervisor took, misses meanwhile, and the processor's frequency."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.trace import Flag
+from rack.boards.config import load
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording import cores
+from rack.tools.recording.cores import UNMEASURED, CoreMeter, CoreRecord, Stolen
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.report import report_of
+from rack.tools.timing.analysis.report_markdown import markdown
+from tests.shared_runs import small_run
+from tests.tools.recordings import MS, Cycle, recorded
+
+HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"
+S = 1_000_000_000
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine of two cores, as its files in a folder; it shows no frequencies yet."""
+    monkeypatch.setattr(cores, "STAT", tmp_path / "stat")
+    monkeypatch.setattr(cores, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(cores, "CPUFREQ", tmp_path)
+    monkeypatch.setattr(cores, "FREQUENCY_S", 0.0)
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t: fpu\n\nprocessor\t: 1\nflags\t: fpu\n")
+    steal(tmp_path, 3, 7)
+    return tmp_path
+
+
+def steal(machine: Path, first: int, second: int) -> None:
+    """Set the counters of both cores."""
+    text = f"{HEAD}cpu0 1 1 1 1 1 1 1 {first} 0 0\ncpu1 1 1 1 1 1 1 1 {second} 0 0\nintr 5\n"
+    (machine / "stat").write_text(text)
+
+
+def test_a_rise_is_found_with_its_core_and_the_looks_around_it(machine: Path) -> None:
+    found = CoreMeter()
+    found.look()
+    assert found.record().stolen == ()
+    steal(machine, 3, 9)
+    found.look()
+    record = found.record()
+    assert record.stolen is not None
+    (stolen,) = record.stolen
+    assert (stolen.core, stolen.ms) == (1, 20)
+    assert stolen.from_ns < stolen.to_ns
+    assert record.lasted_ns > 0
+    assert CoreRecord.of(record.text()) == record
+
+
+def test_a_kernel_that_counts_no_steal_is_not_measured(machine: Path) -> None:
+    (machine / "stat").write_text("cpu  9 9 9 9\ncpu0 1 1 1 1\n")
+    found = CoreMeter()
+    found.look()
+    assert found.record().stolen is None
+    assert found.record().mhz == ()
+
+
+def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None:
+    found = CoreMeter()
+    for mhz in ("2600.000", "1200.5"):
+        (machine / "cpuinfo").write_text(f"processor\t: 0\ncpu MHz\t\t: {mhz}\n\nprocessor\t: 1\ncpu MHz\t\t: 900\n")
+        found.look()
+    assert found.record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
+    # A core of its own file; another is switched off.
+    for core, text in ((0, "3100000\n"), (1, "")):
+        path = machine / f"cpu{core}" / "cpufreq" / "scaling_cur_freq"
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+    found.look()
+    assert found.record().mhz == ((0, 1200.5, 3100.0), (1, 900.0, 900.0))
+
+
+def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
+    """Return a recording in real time with three misses, and what the machine did to its cores meanwhile."""
+    late = [Cycle(tick, (0.1, 0.1, 2.6, 0.1), flags=int(Flag.MISSED)) for tick in (10, 20, 30)]
+    found = recorded(folder, load(config, ["clock.mode=realtime", "board.lower.core=1"]), {"lower": late})
+    found.cores = record
+    return found
+
+
+def test_misses_are_told_apart_by_core_and_time(small: Path, tmp_path: Path) -> None:
+    empty = run(tmp_path / "run", small, UNMEASURED)
+    period_ns, core = empty.layout.clock_ns, empty.layout.task("lower").core
+    during = Stolen(20 * period_ns - MS, 20 * period_ns + MS, core, 10)
+    elsewhere = Stolen(30 * period_ns - MS, 30 * period_ns + MS, core + 1, 30)
+    record = CoreRecord(5 * S, (during, elsewhere))
+    report = report_of(run(tmp_path / "run", small, record))
+    first, second = str(core), str(core + 1)
+    assert report["steal"] == {
+        "measured": True,
+        "ms": {first: 10, second: 30},
+        "percent": {first: 0.2, second: 0.6},
+    }
+    assert (report["stalls"]["lost"], report["stalls"]["during_steal"]) == (3, 1)
+    taken = f"core {core} for 0.20 %, core {core + 1} for 0.60 % of the run"
+    assert f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due meanwhile" in markdown(report)
+
+
+def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> None:
+    quiet = report_of(run(tmp_path / "run", small, CoreRecord(S, (), ((0, 2600.0, 2600.0), (1, 2600.0, 2650.0)))))
+    assert quiet["steal"]["measured"]
+    assert quiet["frequency_mhz"]["1"] == {"min": 2600.0, "max": 2650.0}
+    assert not [line for line in markdown(quiet).splitlines() if "hypervisor" in line or "frequency" in line]
+    slow = report_of(run(tmp_path / "run", small, CoreRecord(S, (), ((0, 800.0, 2600.0), (1, 2600.0, 2600.0)))))
+    assert "- the processor changed its frequency: core 0 800 to 2600 MHz\n" in markdown(slow)
+    unknown = report_of(run(tmp_path / "run", small, UNMEASURED))
+    assert not unknown["steal"]["measured"]
+    assert unknown["frequency_mhz"] is None
+
+
+def test_a_recording_keeps_what_the_machine_did(small: Path, tmp_path: Path, rack_name: str) -> None:
+    config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
+    run_rack(config, 0.3, tmp_path / "run", Display())
+    record = Recording(tmp_path / "run").cores
+    assert record.lasted_ns >= 0.3 * S
+    assert record.stolen is not None
+    assert report_of(Recording(tmp_path / "run"))["steal"]["measured"]
+
+
+def test_lockstep_has_no_deadlines_that_the_machine_could_break(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    assert Recording(small_run(tmp_path_factory)).cores == UNMEASURED

@@ -1,0 +1,107 @@
+"""Folders of runs that are damaged: one line names the file and what is wrong; what can be read is read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from rack.boards.config import loads
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.analysis import Analysis
+from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.charts.gantt import subject_of
+from tests.shared_runs import small_run
+
+READERS: tuple[Callable[[Path], object], ...] = (
+    write_report,
+    lambda folder: Analysis.of(Recording(folder), 100.0, lambda done: None),
+    lambda folder: subject_of(str(folder), [], None),
+)
+PARQUET = ("cycles.parquet", "signals.parquet")
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda data: b"",
+    "cut": lambda data: data[: len(data) // 2],
+    "binary": lambda data: bytes(range(256)) * 4,
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_run(tmp_path_factory)
+
+
+@pytest.fixture
+def damaged(run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(run, tmp_path / "run"))
+
+
+def refused(folder: Path, name: str) -> None:
+    """Have every reader refuse the folder with one line that names the file."""
+    for reader in READERS:
+        with pytest.raises(Failure, match=name.replace(".", r"\.")) as caught:
+            reader(folder)
+        assert caught.value.status == 2
+        assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("name", ["config.toml", *PARQUET])
+def test_a_damaged_file_is_named(damaged: Path, name: str, damage: str) -> None:
+    path = damaged / name
+    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    refused(damaged, name)
+
+
+def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
+    path = damaged / "config.toml"
+    whole = path.read_text()
+    path.write_text(whole[: whole.rindex("\n[") + 1])
+    # It is a valid config still.
+    loads(path.read_text())
+    refused(damaged, path.name)
+
+
+@pytest.mark.parametrize("name", ["config.toml", *PARQUET])
+def test_a_file_that_is_not_there_is_named(damaged: Path, name: str) -> None:
+    (damaged / name).unlink()
+    refused(damaged, name)
+
+
+@pytest.mark.parametrize("name", PARQUET)
+def test_a_parquet_file_of_something_else_is_named(damaged: Path, name: str) -> None:
+    pq.write_table(pa.table({"a": [1, 2]}), damaged / name)
+    refused(damaged, name)
+
+
+def test_signals_without_their_layout_are_named(damaged: Path) -> None:
+    path = damaged / "signals.parquet"
+    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
+    refused(damaged, path.name)
+
+
+@pytest.mark.parametrize("text", [bytes(range(256)), b'{"kind": 3}\n', b"[]\n", b'{"kind": "outcome", "outcome": 1}\n'])
+def test_events_of_something_else_are_named_with_their_line(damaged: Path, text: bytes) -> None:
+    (damaged / "events.jsonl").write_bytes(text)
+    with pytest.raises(Failure, match=r"events\.jsonl: (line 1: not an event|not text: byte 128)"):
+        write_report(damaged)
+
+
+def test_a_last_line_that_is_cut_is_left_out_and_said(damaged: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = damaged / "events.jsonl"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, lines[0][:20]]))
+    assert Recording(damaged).events == [json.loads(line) for line in lines]
+    assert f"{path}: line {len(lines) + 1} is cut off, and left out" in capsys.readouterr().err
+
+
+def test_a_run_without_events_has_a_report_all_the_same(damaged: Path) -> None:
+    (damaged / "events.jsonl").unlink()
+    report, _ = write_report(damaged)
+    assert report["recording"] == "without the end of the run"

@@ -1,0 +1,278 @@
+"""What took the cycles of a run: steal, a core that was away without it, a quota. None of it enters a budget."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.segment import Segment
+from rack.backplane.trace import SKIPPED_SHIFT, Flag
+from rack.backplane.words import Block, System
+from rack.boards.config import RackConfig, load
+from rack.boards.config.layout import obtained_core
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.live.snapshot import Snapshot
+from rack.tools.recording.cores import CoreRecord, Stolen
+from rack.tools.recording.cycles import cycles_of, measured_budgets
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.stalls import CLUSTERED, LEAST_STALLS, WINDOW, Absence, Quota, Stalls, stalls_of
+from rack.tools.timing.analysis.analysis import Analysis
+from rack.tools.timing.analysis.document import document
+from rack.tools.timing.analysis.report import report_of
+from rack.tools.timing.analysis.report_markdown import markdown
+from rack.tools.timing.analysis.tables import text
+from tests.machine import needs_fifo
+from tests.tools.recordings import MS, Cycle, recorded
+
+MISSED, PLANNED = int(Flag.MISSED), int(Flag.PLANNED)
+TICK_MS = 2.5
+PLAIN = (0.0, 0.1, 1.0, 0.1)
+SETTLED = 40
+FIRST = obtained_core(0)
+"""The clock's core."""
+OTHER = FIRST + 1
+"""The core of the lower level and its planner, whatever this machine has."""
+
+
+@pytest.fixture
+def config(small: Path) -> RackConfig:
+    """Two levels in real time: the upper every 20 ms, the lower every 2.5 ms."""
+    return load(small, ["clock.mode=realtime", "clock.priority=90"])
+
+
+def skipping(count: int) -> int:
+    """Return the flags of a cycle before which so many releases were skipped."""
+    return count << SKIPPED_SHIFT | int(Flag.SKIPPED)
+
+
+def resumed_at(end_ms: float, skips: int = 2) -> Cycle:
+    """Return the first cycle after a stall that ended then, and cost so many releases."""
+    return Cycle(int(end_ms // TICK_MS), PLAIN, late=end_ms % TICK_MS, flags=skipping(skips))
+
+
+def plain(first: int, last: int) -> list[Cycle]:
+    return [Cycle(tick, PLAIN) for tick in range(first, last)]
+
+
+def late_clock(tick: int, since: int, late_ms: float) -> dict[str, Any]:
+    """Return the event of the clock's board that was due at tick `since`, and woke that much later."""
+    about = {"kind": "miss", "board": "clock", "code": "clock_late", "text": "", "time_ns": 0}
+    return about | {"tick": tick, "since": since, "value": late_ms * MS}
+
+
+def run(
+    folder: Path, config: RackConfig, traces: dict[str, list[Cycle]], *events: dict[str, Any], priority: int = 80
+) -> Recording:
+    """Return a recording whose lower level had a core of its own."""
+    lost = {"missed": 0, "skipped": 0}
+    places = {"upper": lost | {"core": FIRST, "priority": priority - 10 if priority else 0}}
+    places |= {name: lost | {"core": OTHER, "priority": priority} for name in ("lower", "lower.planner")}
+    outcome = {"kind": "outcome", "outcome": {}, "tasks": places}
+    return recorded(folder, config, traces, [*events, outcome])
+
+
+def found_in(recording: Recording) -> Stalls:
+    return stalls_of(recording)[0]
+
+
+def test_skipped_cycles_are_lost_while_the_hypervisor_had_the_core(config: RackConfig, tmp_path: Path) -> None:
+    skipped = Cycle(20, PLAIN, flags=skipping(5))
+    recording = run(tmp_path / "run", config, {"lower": [*plain(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]})
+    # Releases 15 to 19 were skipped; the record after them begins at tick 20.
+    for first, last, during in ((14.0, 14.8, 0), (15.2, 16.0, 5), (19.2, 19.8, 5), (20.2, 20.9, 0)):
+        span = Stolen(int(first * TICK_MS * MS), int(last * TICK_MS * MS), OTHER, 10)
+        recording.cores = CoreRecord(100 * MS, (span,))
+        found = found_in(recording)
+        assert (found.lost, found.during_steal) == (7, during)
+    recording.cores = CoreRecord(100 * MS, (Stolen(0, 50 * MS, OTHER, 10),))
+    line = f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due meanwhile"
+    assert line in markdown(report_of(recording))
+
+
+def test_stalls_that_end_at_one_phase_of_100_ms_are_named(config: RackConfig, tmp_path: Path) -> None:
+    jitter = np.random.default_rng(3).uniform(0, 1.5, 11)
+    ends = [*(100.0 * k + 31.2 + jitter[k] for k in range(11)), 1260.0, 1388.0]
+    recording = run(tmp_path / "run", config, {"lower": [resumed_at(end) for end in ends]})
+    assert found_in(recording).quota == Quota(together=11, stalls=13, levels=[])
+    report = report_of(recording)
+    assert report["stalls"]["quota"] == {"together": 11, "stalls": 13, "levels": []}
+    assert "- 11 of 13 stalls end at one phase of 100 ms: a quota of the host\n" in markdown(report)
+
+
+def test_a_phase_at_the_turn_of_the_period_is_one_phase(config: RackConfig, tmp_path: Path) -> None:
+    ends = [100.0 * k + (0.5 if k % 2 else -0.5) for k in range(1, 9)]
+    found = found_in(run(tmp_path / "run", config, {"lower": [resumed_at(end) for end in ends]}))
+    assert found.quota == Quota(together=8, stalls=8, levels=[])
+
+
+def test_what_may_be_chance_is_not_named(config: RackConfig, tmp_path: Path) -> None:
+    few = [resumed_at(100.0 * k + 31.2) for k in range(LEAST_STALLS - 1)]
+    assert found_in(run(tmp_path / "run", config, {"lower": few})).quota is None
+    for seed in range(40):
+        # Far enough apart to be stalls of their own.
+        ends = np.cumsum(np.random.default_rng(seed).uniform(50, 350, 5 + seed))
+        found = found_in(run(tmp_path / "run", config, {"lower": [resumed_at(float(end)) for end in ends]}))
+        assert (found.lost, found.quota) == (2 * len(ends), None)
+
+
+def test_the_least_that_is_named_is_rarer_than_once_in_a_thousand() -> None:
+    def probability(count: int) -> float:
+        """Return a bound on the probability that some window begins with so many of uniform phases."""
+        least = math.ceil(CLUSTERED * count) - 1
+        more = range(least, count)
+        return count * sum(math.comb(count - 1, k) * WINDOW**k * (1 - WINDOW) ** (count - 1 - k) for k in more)
+
+    assert max(probability(count) for count in range(LEAST_STALLS, 200)) < 1e-3
+
+
+def test_losses_of_several_tasks_and_cycles_by_one_stall_count_once(config: RackConfig, tmp_path: Path) -> None:
+    ends = [100.0 * k + 31.2 for k in range(1, 7)]
+    upper = [Cycle(int((end - 15) // TICK_MS), PLAIN, late=15.4, flags=MISSED) for end in ends]
+    # The stall begins within a cycle, which is late; those after it are skipped.
+    struck = [Cycle(int(end // TICK_MS) - 3, (0.0, 0.1, 7.2, 0.1), flags=MISSED) for end in ends]
+    both = [cycle for pair in zip(struck, map(resumed_at, ends), strict=True) for cycle in pair]
+    found = found_in(run(tmp_path / "run", config, {"upper": upper, "lower": both}))
+    assert found.lost == 6 * 4
+    assert found.quota == Quota(together=6, stalls=6, levels=[])
+
+
+def test_a_level_whose_cycle_agrees_with_the_stalls_is_named_too(small: Path, tmp_path: Path) -> None:
+    config = load(small, ["clock.mode=realtime", "board.upper.rate_hz=5"])
+    beyond = [resumed_at(200.0 * k + 31.2) for k in range(6)]
+    recording = run(tmp_path / "run", config, {"lower": beyond})
+    assert found_in(recording).quota == Quota(together=6, stalls=6, levels=["upper"])
+    line = "- 6 of 6 stalls end at one phase of 100 ms: the cycle of upper or a quota of the host\n"
+    assert line in markdown(report_of(recording))
+    # At another release of the quota, as many ends lie at two phases of that level.
+    either = [resumed_at(100.0 * k + 31.2) for k in range(6)]
+    assert found_in(run(tmp_path / "run", config, {"lower": either})).quota == Quota(6, 6, [])
+
+
+def away() -> dict[str, list[Cycle]]:
+    """Return traces in which the other core was away from tick 50, its release, until 1 ms after tick 52."""
+    return {"lower": [*plain(SETTLED, 50), Cycle(52, PLAIN, late=1.0, flags=skipping(2)), *plain(53, 60)]}
+
+
+def test_a_core_that_vanished_without_steal_is_named(config: RackConfig, tmp_path: Path) -> None:
+    recording = run(tmp_path / "run", config, away())
+    assert found_in(recording).absences == [Absence(OTHER, times=1, longest_ms=6.0, lost=2)]
+    report = report_of(recording)
+    assert report["stalls"]["absences"] == [{"core": OTHER, "times": 1, "longest_ms": 6.0, "lost": 2}]
+    line = f"- core {OTHER} ran nothing of the rack though it was due, without steal (stalls: 1, longest 6 ms); 2 of 2 "
+    assert line in markdown(report)
+
+
+def test_a_core_that_ran_another_task_was_there(config: RackConfig, tmp_path: Path) -> None:
+    # The planner ends its plan, at a higher priority, 0.2 ms before the executor gets the core.
+    plan = Cycle(48, (0.0, 0.1, 10.6, 0.1), flags=PLANNED)
+    assert not found_in(run(tmp_path / "run", config, away() | {"lower.planner": [plan]})).absences
+
+
+def test_a_task_without_real_time_priority_shows_no_absence(config: RackConfig, tmp_path: Path) -> None:
+    # The launch was refused all of them; then only that of a planner, which waited for some program.
+    long = {"upper": [Cycle(48, (0.0, 0.1, 15.0, 0.1)), Cycle(88, PLAIN)]}
+    refused = run(tmp_path / "refused", config, away() | long, late_clock(52, since=50, late_ms=5.9), priority=0)
+    assert not found_in(refused).absences
+    assert [cycles.stalled for cycles in cycles_of(refused).values()] == [0, 0]
+    waits = {"lower.planner": [Cycle(44, PLAIN, late=6.0, flags=PLANNED), Cycle(60, PLAIN, late=6.0, flags=PLANNED)]}
+    recording = run(tmp_path / "ordinary", config, {"lower": plain(SETTLED, 42)} | waits)
+    assert [(absence.core, absence.times) for absence in found_in(recording).absences] == [(OTHER, 2)]
+    recording.ended["tasks"]["lower.planner"]["priority"] = 0
+    assert not found_in(recording).absences
+
+
+def test_what_was_counted_as_steal_is_not_counted_again(config: RackConfig, tmp_path: Path) -> None:
+    recording = run(tmp_path / "run", config, away())
+    recording.cores = CoreRecord(200 * MS, (Stolen(120 * MS, 130 * MS, OTHER, 10),))
+    assert (found_in(recording).during_steal, found_in(recording).absences) == (2, [])
+
+
+def test_cycles_that_no_clock_released_are_lost_to_the_clocks_core(config: RackConfig, tmp_path: Path) -> None:
+    recording = run(tmp_path / "run", config, away(), late_clock(52, since=50, late_ms=5.9))
+    assert found_in(recording).absences == [Absence(FIRST, times=1, longest_ms=5.9, lost=2)]
+
+
+def test_a_clock_whose_core_was_stolen_leaves_the_other_cores_alone(config: RackConfig, tmp_path: Path) -> None:
+    recording = run(tmp_path / "run", config, away(), late_clock(52, since=50, late_ms=5.9))
+    recording.cores = CoreRecord(200 * MS, (Stolen(120 * MS, 130 * MS, FIRST, 10),))
+    assert found_in(recording).absences == []
+
+
+def test_lockstep_has_no_stalls(small: Path, tmp_path: Path) -> None:
+    long = {"lower.planner": [Cycle(SETTLED, (0.0, 0.1, 60.0, 0.1), flags=PLANNED)]}
+    recording = run(tmp_path / "run", load(small), away() | long)
+    assert found_in(recording) == Stalls(2, 0, [], None)
+    assert [cycles.stalled for cycles in cycles_of(recording).values()] == [0, 0]
+
+
+def test_a_run_without_cycles_has_no_stalls(config: RackConfig, tmp_path: Path) -> None:
+    assert found_in(run(tmp_path / "run", config, {})) == Stalls(0, 0, [], None)
+
+
+def test_a_cycle_with_a_stall_in_it_enters_no_budget(config: RackConfig, tmp_path: Path) -> None:
+    long = Cycle(50, (0.0, 0.1, 6.3, 0.1))
+    trace = {"lower": [*plain(SETTLED, 50), long, Cycle(53, PLAIN, flags=skipping(2)), *plain(54, 60)]}
+    computed = run(tmp_path / "computed", config, trace)
+    assert measured_budgets(computed)["lower"].process_ns == round(6.3 * MS)
+    assert cycles_of(computed)["lower"].stalled == 0
+    stolen = run(tmp_path / "stolen", config, trace)
+    stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
+    # The clock's board was away meanwhile, so the whole machine may have been.
+    for recording in (stolen, run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0))):
+        assert measured_budgets(recording)["lower"].process_ns == MS
+        analysis = Analysis.of(recording)
+        assert "cycles with a stall in them are not judged: lower 1\n" in text(analysis)
+        task = document(analysis)["tasks"]["lower"]
+        assert (task["cycles"], task["start_up"], task["stalled"]) == (len(trace["lower"]) - 1, 0, 1)
+        assert [breach.tick for breach in analysis.breaches if not breach.is_judged] == [50]
+        # The report's own times are of all cycles.
+        assert report_of(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3
+
+
+class Stop(Display):
+    """Stops the clock's board and the lower level, once, until three more ticks have passed."""
+
+    period_s = 0.05
+    struck = False
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Look at the tick."""
+        if snapshot.tick < 20 or self.struck:
+            return
+        self.struck = True
+        segment = Segment.attach(snapshot.rack)
+        pids = segment.words[System.CLOCK_PID], segment.block("lower")[Block.PID]
+        clock = SystemClock(segment)
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        until_ns = clock.time_of(segment.words[System.TICK] + 4)
+        while (left_ns := until_ns - time.monotonic_ns()) > 0:
+            time.sleep(left_ns * 1e-9)
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
+
+
+@needs_fifo
+def test_a_stop_of_the_clocks_board_is_a_stall_of_its_core(small: Path, rack_name: str, tmp_path: Path) -> None:
+    slow = ["clock.period_ms=40", "board.upper.rate_hz=5", "board.lower.rate_hz=25"]
+    urgent = ["clock.mode=realtime", "clock.priority=10", "board.lower.priority=9"]
+    display = Stop()
+    run_rack(load(small, [f"name={rack_name}", *urgent, *slow]), 2.4, tmp_path / "run", display)
+    assert display.struck
+    recording = Recording(tmp_path / "run")
+    (absence,) = [each for each in found_in(recording).absences if each.core == FIRST]
+    # Ticks 2 and 3 after the stop cannot have been made.
+    assert absence.lost >= 2
+    assert absence.longest_ms >= 80
+    assert f"- core {FIRST} ran nothing of the rack though it was due, without steal (stalls: " in markdown(
+        report_of(recording)
+    )

@@ -1,0 +1,230 @@
+"""Reports: the numbers of a run, from its recording alone."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import RECORD
+from rack.boards.config import load
+from rack.levels.timing.equations import response_ticks
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.report import report_of, task_times, write_report
+from rack.tools.timing.analysis.report_markdown import markdown, show
+from rack.tools.timing.measured_response import system_response
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.shared_runs import slow_run
+
+TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
+MS = 1_000_000
+PARTS = ("min", "p50", "p99", "p99_9", "max")
+
+
+class Watchful(Display):
+    """Looks often: a run in lockstep is soon over."""
+
+    period_s = 0.02
+
+
+def cycle(tick: int, late: float, read: float, process: float, write: float) -> tuple[int, ...]:
+    """Return a trace record of a cycle of a 10 ms task, of times in ms."""
+    release = tick * 10 * MS
+    times = np.cumsum([release, late * MS, 0, read * MS, process * MS, write * MS]).astype(int)
+    return (tick, *times.tolist(), 0, 0, round((read + process + write) * MS), 0)
+
+
+def test_times_of_a_task_are_those_of_equation_3_5() -> None:
+    cycles = np.array([cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD)
+    times = task_times(TASK, cycles, 10 * MS)
+    assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
+    assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
+    assert times["communication_ms"]["max"] == 2.0
+    # 10 ms less lateness, execution and communication: the worst cycle is the second.
+    assert times["residual_ms"]["min"] == 2.0
+    assert times["largest_gap_ms"] == 11.0
+    assert times["alpha_ms"] == 4.0
+
+
+def test_a_task_that_never_ran_has_no_times() -> None:
+    times = task_times(TASK, np.empty(0, RECORD), 10 * MS)
+    assert times["execution_ms"] is None
+    assert times["alpha_ms"] is None
+
+
+@pytest.mark.parametrize(
+    ("cycles", "ticks"),
+    [
+        ([8], 8),
+        ([400, 100, 8, 1], 509 + 4),  # 100 and 8 meet every 4 ticks only
+        ([1, 8, 100, 400], 509 + 7 + 96 + 300),
+    ],
+)
+def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(cycles: list[int], ticks: int) -> None:
+    assert response_ticks(cycles) == ticks
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in lockstep of two levels, of 40 and 5 ticks."""
+    return slow_run(tmp_path_factory)
+
+
+def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
+    report, text = write_report(folder)
+    response = report["system_response"]
+    assert response["levels"] == ["upper", "lower"]
+    # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
+    assert response["command"]["bound_ms"] == 45 * 2.5
+    assert response["command"]["measured_ms"]["max"] == 45 * 2.5
+    assert response["status"]["bound_ms"] == 80 * 2.5
+    assert response["status"]["measured_ms"]["max"] == 80 * 2.5
+    assert [response[way]["holds"] for way in ("command", "status")] == [True, True]
+    assert report["digest"] in text
+    assert report["tasks"]["lower"]["cycles"] == 400
+    assert json.loads((folder / "report.json").read_text()) == report
+
+
+class Cut(Recording):
+    """A recording without ten of the commands; `lost` says whether it is known to lack them."""
+
+    lost: ClassVar[dict[str, int]] = {"upper.command": 10}
+
+    def signal(self, mailbox: str, field: str) -> np.ndarray:
+        values = super().signal(mailbox, field)
+        return np.delete(values, slice(20, 30), axis=0) if mailbox == "upper.command" else values
+
+
+class Silent(Cut):
+    """A run in which those commands were never written."""
+
+    lost: ClassVar[dict[str, int]] = {}
+
+
+def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(folder: Path) -> None:
+    way = report_of(Cut(folder))["system_response"]["command"]
+    assert (way["holds"], way["beyond"], way["unseen"]) == (True, [], 1)
+    assert way["measured_ms"]["max"] == way["bound_ms"]
+
+
+def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
+    recording = Silent(folder)
+    recording.ended["faults"] = [{"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}]
+    response = system_response(recording)
+    assert response is not None
+    (beyond,) = response["command"]["beyond"]
+    assert response["command"]["holds"] is False
+    assert beyond == {"tick": 19 * 40, "ms": (45 + 10 * 40) * 2.5, "delayed_by": ["fault: mute of upper"]}
+    text = markdown(write_report(folder)[0] | {"system_response": response})
+    assert "FAILS" in next(line for line in text.splitlines() if line.startswith("| command, down"))
+    assert "- 1112.5 ms from tick 760: fault: mute of upper" in text.splitlines()
+
+
+def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -> None:
+    report, text = write_report(folder)
+    for task in report["tasks"].values():
+        times = ("lateness_ms", "residual_ms", "alpha_ms", "deviation_ms", "largest_gap_ms")
+        assert {task[name] for name in times} == {None}
+        assert task["execution_ms"]["max"] > 0
+    assert "there are no deadlines" in text
+    assert not {"late", "alpha", "residual min"} & set(text.replace("|", " ").split())
+    realtime = markdown({**report, "mode": "realtime"})
+    assert "| residual min |" in realtime
+
+
+def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folder: Path) -> None:
+    late = {"task": "lower", "tick": 5, "what": "late", "count": 1, "started_ms": 0.1, "took_ms": 3.0}
+    skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
+    report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
+    lines = markdown(report).splitlines()
+    assert "## Missed and skipped cycles: 1 and 3" in lines
+    assert "The tasks counted" not in markdown(report)
+    fewer = markdown({**report, "missed": 2, "skipped": 7})
+    assert "The tasks counted 2 and 7; the recording does not hold all of it." in fewer
+    lossy = markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
+    assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
+    assert "- the recorder lost rows: lower 4" in lossy.splitlines()
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: int) -> None:
+    report = {**write_report(folder)[0], "mode": "realtime"}
+    task = {**report["tasks"]["lower"], **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567))}
+    report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
+    terminal = Console(width=width, record=True, file=io.StringIO())
+    show(report, terminal)
+    lines = terminal.export_text().splitlines()
+    assert max(map(len, lines)) <= width
+    rows = [line.split() for line in lines if line.startswith("elemental_move.planner")]
+    head = next(line for line in lines if line.startswith("task ") and "missed" in line)
+    assert len(rows) == 1
+    assert "residual min" in head
+    assert lines[-1] == f"all columns: {folder}/report.md; all data: report.json" or width == 80
+    assert max(map(len, markdown(report).splitlines())) > 120
+
+
+def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
+    (tmp_path / "commanded.toml").write_text(COMMANDED)
+    given = commands(
+        "level='upper', what='hold', tick=101",
+        "level='upper', what='resume', tick=203",
+        "level='lower', what='hold', tick=301",
+    )
+    run_rack(load(tmp_path / "commanded.toml", [f"name={rack_name}", given]), 12.0, tmp_path / "run", Watchful())
+    report, text = write_report(tmp_path / "run")
+    assert report["holds"] == [
+        {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
+        {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 11.2425},
+    ]
+    assert "## Holds: 2" in text.splitlines()
+    assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
+    (standstill,) = standstills(tmp_path / "run")
+    assert standstill.startswith("nothing has moved for ")
+    assert standstill.endswith(
+        f": lower held by the operator (hold), since 0.75 s; to release: rack command {rack_name} lower resume"
+    )
+
+
+def standstills(folder: Path) -> list[str]:
+    """Return what the events say of a rack that is held and stands still."""
+    return [event["text"] for event in Recording(folder).events if event.get("code") == "standstill"]
+
+
+HELD = "nothing has moved for 30 s: elemental_move holds"
+TOUCHED = "level 'servo': unintended contact: 'post' touches 'link4' at 3.125 s"
+
+
+@pytest.mark.parametrize(
+    ("outcome", "headline"),
+    [
+        ({"cause": "task failed", "reason": HELD, "faults": []}, f"task failed: {HELD}"),
+        ({"cause": "task done", "reason": "", "faults": [TOUCHED]}, f"task done: {TOUCHED}"),
+    ],
+)
+def test_what_ended_a_run_or_is_latched_is_its_headline(
+    folder: Path, outcome: dict[str, object], headline: str
+) -> None:
+    text = markdown(write_report(folder)[0] | {"outcome": outcome})
+    assert text.splitlines()[0].endswith(f": {headline}")
+
+
+def test_limits_that_a_push_broke_stand_beside_those_that_the_arm_broke(folder: Path) -> None:
+    motion = {"tracking_rms_mrad": 0.1, "tracking_peak_mrad": 0.5, "touches": 4, "clipped_cycles": 0}
+    text = markdown(write_report(folder)[0] | {"motion": motion | {"violations": 0, "pushed": 7}})
+    assert "limits exceeded in 0 substeps, by a push from outside in 7." in text
+
+
+def test_contacts_stand_with_the_arms_limits_and_the_forces_wanted(folder: Path) -> None:
+    force = {"largest_force_n": 23.14, "largest_torque_nm": 0.4, "exceeded_cycles": 2, "force_rms_n": None}
+    text = markdown(write_report(folder)[0] | {"force": force})
+    assert "Contact: at most 23.1 N and 0.40 N m, beyond the arm's limits in 2 cycles." in text
+    text = markdown(write_report(folder)[0] | {"force": force | {"force_rms_n": 1.5}})
+    assert "in 2 cycles; axes of force 1.50 N RMS off." in text

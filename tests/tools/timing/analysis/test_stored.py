@@ -1,0 +1,90 @@
+"""The report in a run's folder: shown as it is while it is newer than the recording and the program."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from rack.tools.timing.analysis import stored
+from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.analysis.stored import RECORDED, stored_report
+from tests.shared_runs import small_run
+from tests.tools.command_line import rack
+
+
+@pytest.fixture
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with its report."""
+    run = small_run(tmp_path_factory)
+    write_report(run)
+    return run
+
+
+def make_newer(path: Path) -> None:
+    """Date a file after everything else."""
+    later_ns = time.time_ns() + 10**9
+    os.utime(path, ns=(later_ns, later_ns))
+
+
+def test_it_is_the_report_that_was_written(folder: Path) -> None:
+    assert stored_report(folder) == write_report(folder)
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_it_is_made_anew_once_the_recording_has_changed(folder: Path, name: str) -> None:
+    make_newer(folder / name)
+    assert stored_report(folder) is None
+
+
+def test_it_is_made_anew_once_the_program_has_changed(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stored, "PROGRAM", tmp_path)
+    (tmp_path / "levels").mkdir()
+    changed = tmp_path / "levels" / "level.py"
+    changed.touch()
+    os.utime(changed, ns=(0, 0))
+    assert stored_report(folder) is not None
+    make_newer(changed)
+    assert stored_report(folder) is None
+
+
+@pytest.mark.parametrize("name", ["report.json", "report.md", *RECORDED])
+def test_it_is_made_anew_if_a_file_is_missing(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    assert stored_report(folder) is None
+
+
+def test_it_is_made_anew_while_a_spool_is_left(folder: Path) -> None:
+    (folder / stored.SPOOL).touch()
+    assert stored_report(folder) is None
+
+
+def test_it_is_made_anew_if_it_is_damaged(folder: Path) -> None:
+    (folder / "report.json").write_text('{"rack": ')
+    (folder / "report.md").touch()
+    assert stored_report(folder) is None
+
+
+def test_it_is_made_anew_in_another_folder_and_after_a_comparison(folder: Path) -> None:
+    write_report(folder, folder)
+    assert stored_report(folder) is None
+    write_report(folder)
+    moved = folder.with_name(f"{folder.name}-moved")
+    folder.rename(moved)
+    assert stored_report(moved) is None
+
+
+def test_the_command_shows_it_and_writes_it_anew_only_when_it_must(folder: Path) -> None:
+    report = json.loads((folder / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps(report | {"digest": "as stored"}))
+    (folder / "report.md").write_text("as stored\n")
+    assert json.loads(rack("report", folder, "--json").stdout)["digest"] == "as stored"
+    assert rack("report", folder).stdout == "as stored\n\n"
+    make_newer(folder / "events.jsonl")
+    assert json.loads(rack("report", folder, "--json").stdout) == report
+    assert json.loads((folder / "report.json").read_text()) == report

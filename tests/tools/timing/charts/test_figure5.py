@@ -1,0 +1,59 @@
+"""Figure 5: levels among the regions of implementation, by their cycle."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.boards.config import load
+from rack.tools.timing.charts.figure5 import document, lines, placed, region_of
+
+
+@pytest.mark.parametrize(
+    ("cycle_s", "region"),
+    [
+        (0.000999, "fine-grained"),
+        (0.001, "asynchronous"),
+        (0.25, "asynchronous"),
+        (0.2501, "multitasking"),
+        (60.0, "multitasking"),
+        (61.0, "distributed"),
+        (86_400.0, "distributed"),
+    ],
+)
+def test_a_cycle_falls_into_the_region_of_the_figure(cycle_s: float, region: str) -> None:
+    assert region_of(cycle_s).name == region
+
+
+def test_the_levels_of_nasrem_fall_where_the_paper_has_them() -> None:
+    found = {level.level: level for level in placed(load("nasrem"))}
+    assert list(found) == ["servo", "primitive", "world", "elemental_move", "task"]
+    assert {name: level.region for name, level in found.items()} == {
+        **dict.fromkeys(("servo", "primitive", "world", "elemental_move"), "asynchronous multiprocessing"),
+        "task": "multitasking",
+    }
+    assert "coupled loosely, as in the figure" in found["elemental_move"].remark
+    assert "coupled tightly, as in the figure" in found["task"].remark
+    assert "a processor of its own; here it is coupled tightly" in found["servo"].remark
+    assert "no planner" in found["world"].remark
+
+
+def test_a_rack_that_runs_faster_than_real_time_asks_for_more() -> None:
+    servo = placed(load("nasrem", ["clock.speed=4"]))[0]
+    assert (servo.cycle_s, servo.region) == (0.000625, "fine-grained multiprocessing or dedicated hardware")
+
+
+def test_every_level_stands_in_its_region_on_the_axis() -> None:
+    text = list(lines(load("nasrem")))
+    names = next(line for line in text if "fine-grained" in line)
+    starts = [names.index(name) for name in ("fine-grained", "asynchronous", "multitasking", "distributed")]
+    for level, region in (("servo", 1), ("primitive", 1), ("elemental_move", 1), ("task", 2)):
+        row = next(line for line in text if line.startswith(level))
+        assert starts[region] <= row.rindex("o") < starts[region + 1]
+
+
+def test_the_figure_as_data_has_every_level_and_region() -> None:
+    found = document(load("fig2"))
+    assert [region["to_s"] for region in found["regions"]] == [0.001, 0.25, 60.0, None]
+    assert [(level["level"], level["cycle_s"], level["coupling"]) for level in found["levels"]] == [
+        ("level", pytest.approx(0.008), "tight")
+    ]

@@ -1,0 +1,160 @@
+"""The chart of a run: spans cut where a higher priority had the core, jobs, and what was skipped."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from rack.boards.config import load
+from rack.levels.timing.schedule import Chart
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.charts.measured import TracedRun
+from rack.tools.timing.charts.panel import union, without
+from tests.tools.recordings import EPOCH_NS, cycle, recorded
+
+TICK_US = 2000
+"""A tick of the figures' clock; a cycle of fig2 has four."""
+
+
+def executor(number: int, *moments_us: int, **more: int) -> tuple[int, ...]:
+    return cycle(4 * number, TICK_US, *moments_us, **more)
+
+
+def plan(number: int, start: int, process: int, end: int) -> tuple[int, ...]:
+    return cycle(4 * number, TICK_US, start, start, start, process, end, planned=True)
+
+
+def spans(chart: Chart) -> list[tuple[str, int, int]]:
+    """Return unit function, start and end, us, of every span."""
+    return [(span.unit.value, span.start_ns // 1000, span.end_ns // 1000) for span in chart.spans]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "run"
+
+
+def fig2(folder: Path, executor_rows: list[tuple[int, ...]], plans: list[tuple[int, ...]], *settings: str) -> TracedRun:
+    return TracedRun(recorded(folder, load("fig2", settings), {"level": executor_rows, "level.planner": plans}))
+
+
+def test_a_cycle_becomes_its_unit_functions_at_their_times_on_the_grid(folder: Path) -> None:
+    run = fig2(folder, [executor(1, 8100, 8200, 9200, 11_200, 12_200)], [])
+    chart = run.chart(0, run.end_ns)
+    assert spans(chart) == [("C", 8100, 8200), ("R", 8200, 9200), ("X", 9200, 11_200), ("W", 11_200, 12_200)]
+    assert [(job.release_ns, job.deadline_ns, job.end_ns) for job in chart.jobs] == [
+        (8_000_000, 16_000_000, 12_200_000)
+    ]
+    assert run.end_ns == 16_000_000
+
+
+def test_a_planner_has_the_core_only_while_its_executor_has_not(folder: Path) -> None:
+    cycles = [executor(0, 100, 100, 200, 300, 400), executor(1, 8100, 8100, 8200, 8300, 8400)]
+    run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
+    planner = [found for found in spans(run.chart(0, run.end_ns)) if found[0] in "PU"]
+    assert planner == [("P", 500, 8100), ("P", 8400, 9000), ("U", 9000, 9500)]
+
+
+def test_what_an_executor_needs_to_wake_up_is_not_its_planners(folder: Path) -> None:
+    # 150 us of processor time more than between start and end; released at 8000.
+    cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=350)]
+    run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
+    planner = [found for found in spans(run.chart(0, run.end_ns)) if found[0] == "P"]
+    assert planner == [("P", 500, 8050), ("P", 8400, 9000)]
+    # It cannot have woken up before its release.
+    cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=5000)]
+    run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
+    assert next(found for found in spans(run.chart(0, run.end_ns)) if found[0] == "P") == ("P", 500, 8000)
+
+
+def test_a_planner_on_another_core_is_preempted_by_nobody(folder: Path) -> None:
+    loose = ("board.level.coupling=loose", "board.level.planner_slot=3", "board.level.planner_core=0")
+    run = fig2(folder, [executor(1, 8100, 8100, 8200, 8300, 8400)], [plan(0, 500, 9000, 9500)], *loose)
+    assert ("P", 500, 9000) in spans(run.chart(0, run.end_ns))
+
+
+def test_releases_that_were_skipped_are_jobs_that_were_never_done(folder: Path) -> None:
+    run = fig2(
+        folder, [executor(0, 0, 0, 0, 0, 21_000), executor(3, 24_000, 24_000, 24_000, 24_000, 25_000, skipped=2)], []
+    )
+    chart = run.chart(0, run.end_ns)
+    assert [(job.release_ns, job.end_ns) for job in chart.jobs if job.end_ns is None] == [
+        (8_000_000, None),
+        (16_000_000, None),
+    ]
+    assert [job.release_ns for job in chart.late("level")] == [0, 8_000_000, 16_000_000]
+    counted = run.panel(0, run.end_ns, lambda part: None).counts["level"]
+    assert (counted.jobs, counted.late, counted.skipped) == (4, 3, 2)
+
+
+def test_what_a_planner_was_only_asked_is_no_plan(folder: Path) -> None:
+    asked = cycle(4, TICK_US, 8500, 8500, 8550, 8600, 8700, skipped=1)
+    run = fig2(folder, [], [plan(0, 500, 6000, 7000), asked])
+    chart = run.chart(0, 100_000_000)
+    assert [job.release_ns for job in chart.jobs] == [0]
+    assert spans(chart) == [("P", 500, 6000), ("U", 6000, 7000)]
+
+
+def test_a_window_shows_what_began_long_before_it(folder: Path) -> None:
+    rows = [executor(n, *[n * 8000 + 100] * 4, n * 8000 + 200) for n in range(50)]
+    run = fig2(folder, rows, [plan(0, 500, 300_000, 301_000)])
+    assert [(found, start) for found, start, _ in spans(run.chart(200_000_000, 204_000_000))] == [
+        ("P", 200_000),
+        ("W", 200_100),
+        ("P", 200_200),
+    ]
+
+
+def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [executor(n, *(n * 8000 + at for at in (0, 10, 1000, 3000, 4000))) for n in range(60)]
+    plans = [plan(n, n * 8000 + 4000, n * 8000 + 14_000, n * 8000 + 15_000) for n in range(0, 60, 2)]
+    run = fig2(folder, rows, plans)
+    at_once = run.panel(0, 1, lambda part: None)
+    parts: list[float] = []
+    monkeypatch.setattr("rack.tools.timing.charts.measured.BLOCK_NS", 1)
+    in_blocks = run.panel(0, 1, parts.append)
+    assert len(parts) > 10
+    assert parts[-1] == 1.0
+    assert (in_blocks.patterns, in_blocks.counts) == (at_once.patterns, at_once.counts)
+    assert dict(at_once.patterns["level"].plans) == {"R X W P | R X W P U -": 30}
+
+
+def test_a_trace_without_the_newer_columns_is_refused(folder: Path) -> None:
+    fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
+    table = pq.read_table(folder / "cycles.parquet").drop_columns(["plan_ns"])
+    pq.write_table(table.replace_schema_metadata({"lost": "{}"}), folder / "cycles.parquet")
+    with pytest.raises(Failure, match="no column plan_ns: it was recorded by an earlier version; run the rack again"):
+        TracedRun(Recording(folder))
+
+
+def test_times_count_from_tick_0_whatever_the_machines_clock_says(folder: Path) -> None:
+    assert EPOCH_NS % 1000
+    run = fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
+    assert run.chart(0, run.end_ns).jobs[0].end_ns == 100_000
+
+
+def test_a_union_is_in_order_and_has_no_overlaps() -> None:
+    assert union([(5, 8), (0, 2), (7, 9), (2, 3), (20, 21), (5, 6)]) == [(0, 3), (5, 9), (20, 21)]
+
+
+def test_what_is_left_of_a_stretch_lies_between_what_was_taken() -> None:
+    assert list(without((0, 10), [])) == [(0, 10)]
+    assert list(without((0, 10), [(2, 3), (5, 7)])) == [(0, 2), (3, 5), (7, 10)]
+    assert list(without((2, 6), [(0, 3), (5, 9)])) == [(3, 5)]
+    assert list(without((2, 6), [(0, 2), (6, 9)])) == [(2, 6)]
+    assert list(without((2, 6), [(1, 7)])) == []
+
+
+def test_every_moment_is_either_taken_or_left() -> None:
+    chance = random.Random(5)
+    for _ in range(200):
+        taken = union((a, a + chance.randint(1, 9)) for a in (chance.randint(0, 60) for _ in range(5)))
+        left = list(without((10, 50), taken))
+        moments = sorted(at for start, end in [*taken, *left] for at in range(start, end) if 10 <= at < 50)
+        assert moments == list(range(10, 50))

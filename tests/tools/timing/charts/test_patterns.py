@@ -1,0 +1,96 @@
+"""Patterns: the order of unit functions, by plan and by cycle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rack.levels.timing.schedule import Chart, Job, Span, simulate
+from rack.levels.timing.tasks import Part, TimedTask, Unit
+from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, lanes_of, patterns
+
+
+def task(name: str, text: str, every: int, cycles: int = 1, core: int = 1, priority: int = 80) -> TimedTask:
+    parts = tuple(Part(Unit(part[0]), int(part[1:])) for part in text.split())
+    role = "planner" if name.endswith("planner") else "executor"
+    return TimedTask(name, name.partition(".")[0], role, core, priority, every, parts, cycles)
+
+
+EXECUTOR = task("a", "R100 X200 W100", 800)
+PLANNER = task("a.planner", "P600 U100", 800, 2, priority=0)
+
+
+def counted(tasks: list[TimedTask], lane: str, end: int, detail: Detail | None = None) -> Patterns:
+    chart = simulate(tasks, 2 * end)
+    found = next(found for found in lanes_of(tasks) if found.name == lane)
+    return patterns(chart, found, (0, end), detail or Detail())
+
+
+def test_a_plan_has_one_pattern_over_all_its_cycles() -> None:
+    found = counted([EXECUTOR, PLANNER], "a", 16_000)
+    assert dict(found.plans) == {"R X W P | R X W P U -": 10}
+    assert not found.cycles
+
+
+def test_a_planner_on_its_own_core_has_no_cycles_and_its_executor_no_plans() -> None:
+    tasks = [EXECUTOR, replace(PLANNER, core=2)]
+    assert dict(counted(tasks, "a.planner", 16_000).plans) == {"P U -": 10}
+    alone = counted(tasks, "a", 16_000)
+    assert (dict(alone.plans), dict(alone.cycles)) == ({}, {"R X W -": 20})
+
+
+def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
+    chart = simulate([EXECUTOR, PLANNER], 8000)
+    # Of five plans the last three are taken away, jobs and spans.
+    kept = tuple(job for job in chart.jobs if job.task == "a" or job.release_ns < 3200)
+    spans = tuple(span for span in chart.spans if span.task == "a" or span.release_ns < 3200)
+    found = patterns(Chart(0, 8000, spans, kept), lanes_of([EXECUTOR, PLANNER])[0], (0, 6400), Detail())
+    assert dict(found.plans) == {"R X W P | R X W P U -": 2}
+    assert dict(found.cycles) == {"R X W -": 4}
+
+
+def test_a_core_that_another_board_has_is_not_idle() -> None:
+    other = task("b", "X400", 800, priority=70)
+    assert dict(counted([EXECUTOR, other], "a", 8000).cycles) == {"R X W": 10}
+    assert dict(counted([EXECUTOR, other], "b", 8000).cycles) == {"X": 10}
+
+
+def test_what_another_board_cuts_in_pieces_is_told_once() -> None:
+    cutting = task("b", "X10", 100, priority=90)
+    assert dict(counted([EXECUTOR, cutting], "a", 8000).cycles) == {"R X W -": 10}
+
+
+LANE = Lane(1, "a", "a", None, 80, 1000, 1000)
+
+
+def order(*stretches: tuple[str, int, int], detail: Detail) -> str:
+    spans = tuple(Span("a", 1, Unit(unit), start, end, 0) for unit, start, end in stretches)
+    found = patterns(Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, (0, 1000), detail)
+    (pattern,) = found.cycles
+    return pattern
+
+
+def test_remnants_and_short_gaps_are_not_told_of_what_was_measured() -> None:
+    detail = Detail.measured(LANE, {Unit.PLAN: 300, Unit.READ: 20})
+    measured = (("P", 0, 15), ("R", 60, 75), ("X", 75, 400), ("P", 420, 990))
+    assert order(*measured, detail=detail) == "R X P"
+    assert order(*measured, detail=Detail()) == "P - R X - P -"
+
+
+def test_what_is_always_short_is_told_all_the_same() -> None:
+    detail = Detail.measured(LANE, {Unit.READ: 12, Unit.PROCESS: 500})
+    assert order(("R", 0, 10), ("X", 10, 950), detail=detail) == "R X"
+
+
+def test_a_plan_in_its_executors_own_memory_is_read_without_communication() -> None:
+    times = {Unit.EXCHANGE: 10}
+    tight = replace(LANE, planner="a.planner")
+    assert Detail.measured(LANE, times).short_ns[Unit.EXCHANGE] < 10
+    assert Detail.measured(tight, times).short_ns[Unit.EXCHANGE] > 10
+
+
+@pytest.mark.parametrize("start", [0, 1, 799, 800])
+def test_patterns_begin_on_the_grid_and_in_the_stretch(start: int) -> None:
+    chart, lane = simulate([EXECUTOR], 8000), lanes_of([EXECUTOR])[0]
+    assert patterns(chart, lane, (start, 4000), Detail()).cycles.total() == (5 if start == 0 else 4)

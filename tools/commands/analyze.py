@@ -1,0 +1,76 @@
+"""`rack analyze`: a run compared with the timing model."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rack.tools.console.answer import print_json
+from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.progress import reading_progress
+from rack.tools.console.tables import print_wrapped, terminal_width
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.analysis import Analysis
+from rack.tools.timing.analysis.document import document
+from rack.tools.timing.analysis.tables import text
+from rack.tools.timing.operator_response import show
+
+Percentile = Annotated[
+    float,
+    typer.Option(
+        metavar="P",
+        min=1.0,
+        max=100.0,
+        help="judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6",
+    ),
+]
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the results; default: the run's own")]
+OnlyResponse = Annotated[
+    bool, typer.Option("--response", help="instead: the response to an operator's commands, with its bounds")
+]
+
+
+def analyze(
+    run: RunFolder,
+    percentile: Percentile = 100.0,
+    response: OnlyResponse = False,
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a run with the timing model: every equation that `rack check` predicts, with its measurement.
+
+    Times of levels are processor time, without waiting and preemption. A virtual machine stalled by its host counts the
+    stall as processor time: cycles in which one is seen are not judged. Not every one is seen; --percentile 99 leaves
+    out whatever happens less than once in 100 cycles.
+
+    It lists the cycles that broke an equation, and the tasks that had their core meanwhile. It writes analysis.json,
+    residuals.png and residuals.svg.
+
+    Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
+
+    \b
+    Examples:
+      rack analyze runs/nasrem-20250101-120000
+      rack analyze runs/nasrem-20250101-120000 --percentile 99.9
+    """
+    from rack.tools.timing.analysis.residuals import plot  # matplotlib takes a second to import
+
+    folder = run if out is None else out
+    if response:
+        sys.exit(0 if show(Recording(run), folder, as_json) else 1)
+    progress = reading_progress(silent=as_json)
+    analysis = Analysis.of(Recording(run), percentile, progress)
+    found = document(analysis)
+    progress(0.9)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "analysis.json").write_text(json.dumps(found, indent=2) + "\n")
+    plot(analysis, folder / "residuals")
+    if as_json:
+        print_json(found)
+    else:
+        print_wrapped(f"{text(analysis, terminal_width())}\n\n{folder}/analysis.json, residuals.png, residuals.svg")
+    sys.exit(0 if analysis.holds else 1)

@@ -1,0 +1,113 @@
+"""Answers of `rack list`, `rack status` and `rack report`, apart from their options: parsing those takes longer."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rack.tools.console.answer import Failure, print_answer, print_json
+
+if TYPE_CHECKING:
+    from rack.backplane.segment import Segment
+    from rack.tools.console.address import Asker
+    from rack.tools.live.snapshot import Snapshot
+
+
+def list_racks(as_json: bool) -> None:
+    """Print the racks on this machine."""
+    from rack.backplane.segment import racks
+    from rack.tools.console.tables import table, terminal_width
+
+    found = [describe(name) for name in racks()]
+    rows = [[str(rack[key]) for key in ("rack", "state", "detail")] for rack in found]
+    print_answer(found, table(("rack", "state", ""), rows, terminal_width()) if rows else "no racks", as_json)
+
+
+def describe(name: str) -> dict[str, str | int | float]:
+    """Return the name, as "rack", the state and details of a rack; its age is in seconds."""
+    from rack.backplane.errors import SegmentError
+    from rack.backplane.segment import Segment
+    from rack.backplane.words import Head, Run, System
+
+    try:
+        segment = Segment.attach(name)
+    except SegmentError as error:
+        return {"rack": name, "state": "foreign", "detail": str(error)}
+    words = segment.words
+    age_s = time.time() - words[Head.CREATED_NS] * 1e-9
+    launcher = words[Head.LAUNCHER_PID]
+    alive = segment.launcher_is_alive
+    state = Run(words[System.STATE]).name.lower() if alive else "dead"
+    gone = "its launcher is gone: 'rack clean' removes it"
+    by = f"launched {age_s:.0f} s ago by process {launcher}" if alive else gone
+    boards, hosts = len({task.board for task in segment.layout.tasks}), len(segment.layout.hosts)
+    side = f" and {hosts} on the host side" if hosts else ""
+    detail = f"{boards} boards{side}, tick {words[System.TICK]}, {by}"
+    segment.close()
+    return {"rack": name, "state": state, "detail": detail, "launcher": launcher, "age_s": round(age_s, 3)}
+
+
+def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
+    """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly one."""
+    from rack.backplane.segment import Segment
+
+    if rack is not None and "/" in rack:
+        from rack.tools.live.watched import watched
+
+        with watched(rack, asker) as far:
+            found = _looked_at(far.segment)
+    else:
+        found = _looked_at(Segment.attach(rack or _only_rack()))
+    if as_json:
+        print_json(asdict(found))
+        return
+    from rack.tools.console.tables import console
+    from rack.tools.live.display import RackView
+
+    console().print(RackView(found))
+
+
+def _looked_at(segment: Segment) -> Snapshot:
+    from rack.tools.live.snapshot import RackMonitor
+
+    return RackMonitor(segment).look()
+
+
+def _only_rack() -> str:
+    from rack.backplane.segment import racks
+
+    running = racks()
+    if len(running) != 1:
+        names = ", ".join(running)
+        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
+    return running[0]
+
+
+def show_report(run: str | Path, as_json: bool) -> None:
+    """Print the report of a run: the one in its folder if that is still right, otherwise a new one."""
+    from rack.tools.timing.analysis.stored import stored_report
+
+    report = stored_report(Path(run))
+    if report is None:
+        from rack.tools.timing.analysis.report import write_report
+
+        report = write_report(Path(run))
+    print_report(*report, as_json)
+
+
+def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no recording, `text`."""
+    if as_json:
+        print_json(data)
+        return
+    from rack.tools.console.tables import console
+
+    terminal = console()
+    if terminal.is_terminal and data["folder"] is not None:
+        from rack.tools.timing.analysis.report_markdown import show
+
+        show(data, terminal)
+    else:
+        print(text)

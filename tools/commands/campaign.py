@@ -1,0 +1,138 @@
+"""`rack campaign`: inject random faults of all kinds, and report detection, reaction and recovery."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.parameters import ConfigName, Json, Settings
+
+if TYPE_CHECKING:
+    from rack.tools.faults.campaigns.campaign import Campaign
+    from rack.tools.faults.campaigns.results import Results
+
+INJECTIONS = 3
+SIZES = 10
+FAULTLESS_S = 60.0
+MOST = 100_000
+"""Faults of a kind, kills or sizes of one campaign."""
+
+Injections = Annotated[int, typer.Option("--injections", metavar="N", min=0, max=MOST, help="strikes of each kind")]
+Seed = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans")]
+Kinds = Annotated[str | None, typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have")]
+Kills = Annotated[int | None, typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside")]
+LockstepOnly = Annotated[bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")]
+RealtimeOnly = Annotated[bool, typer.Option("--realtime", help="trials in real time only; default: both")]
+Faultless = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S",
+        min=0.0,
+        max=1e6,
+        help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
+    ),
+]
+Load = Annotated[bool, typer.Option("--load", help="without faults: only under load, by stress-ng where installed")]
+Sizes = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=0, max=MOST, help=f"sizes on each curve of size against delay; default {SIZES}"),
+]
+Seconds = Annotated[
+    float | None,
+    typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of a run, for a rack that no task ends"),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="folder, also to continue a campaign in; default: runs/campaign-<time>"),
+]
+
+
+def campaign(
+    config: ConfigName,
+    injections: Injections = INJECTIONS,
+    seed: Seed = 0,
+    kinds: Kinds = None,
+    kills: Kills = None,
+    lockstep: LockstepOnly = False,
+    realtime: RealtimeOnly = False,
+    faultless: Faultless = None,
+    load: Load = False,
+    sizes: Sizes = None,
+    seconds: Seconds = None,
+    settings: Settings = [],  # noqa: B006  typer copies it
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Inject random faults of all kinds into runs of a rack, and judge each of them.
+
+    Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one after the other. There
+    are also runs without faults, in real time, alone and under load. The same --out continues an interrupted campaign.
+
+    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not found, reacted to and recovered from in
+    time; a limit was violated; something was left behind; a task was neither done nor safely stopped; or a detection
+    had no fault; 2 usage or config error.
+
+    \b
+    Examples:
+      rack campaign nasrem
+      rack campaign nasrem --kinds kill,mute --injections 20 --lockstep
+      rack campaign nasrem --kills 100 --out runs/kills
+    """
+    from rack.boards.config import load as load_config
+    from rack.tools.console.interrupt import INTERRUPT
+    from rack.tools.console.progress import progress_for
+    from rack.tools.faults.campaigns.campaign import ORDER, Campaign, Order
+    from rack.tools.faults.campaigns.workers import INTERRUPT_S
+    from rack.tools.live.folder import folder_of
+
+    if lockstep and realtime:
+        raise Failure("--lockstep and --realtime: they exclude each other; give one, or neither for both", 2)
+    if kills is not None and kinds is not None:
+        raise Failure(f"--kills {kills} and --kinds {kinds}: kills from outside are a kind of their own; give one", 2)
+    found = load_config(config, settings)
+    if seconds is None and not any(board.ends_run for board in found.board.values()):
+        raise Failure(f"{config}: no board ends the run: give --seconds, the simulated time of a run", 2)
+    # No faultless time in real time where only lockstep, or only kills, were ordered.
+    default_s = 0.0 if lockstep or kills is not None else FAULTLESS_S
+    order = Order(
+        name=config,
+        config=found,
+        injections=0 if kills else injections,
+        seed=seed,
+        modes=(True,) if lockstep else (False,) if realtime else (True, False),
+        kinds=kinds,
+        kills=kills or 0,
+        sizes=(0 if kills or realtime else SIZES) if sizes is None else sizes,
+        faultless_s=default_s if faultless is None else faultless,
+        loads=(True,) if load else (False, True),
+        seconds=seconds,
+    )
+    goes_on, started = out is not None and (out / ORDER).is_file(), time.monotonic()
+    folder = out if out is not None and goes_on else folder_of(out, "campaign")
+    with INTERRUPT.orderly(bound_s=INTERRUPT_S):
+        with progress_for(silent=as_json) as progress:
+            work = Campaign(order, folder, progress)
+            results = work.run()
+        report, text = _write(work, results, time.monotonic() - started)
+    print_json(report) if as_json else print(f"{text}\n{folder}/")
+    sys.exit(1 if report["shortfalls"] or report["interrupted"] else 0)
+
+
+def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
+    """Write campaign.json, campaign.md and campaign.png; return the first two."""
+    from rack.tools.faults.campaigns.plot import plot
+    from rack.tools.faults.campaigns.report import document, markdown
+
+    work.folder.mkdir(parents=True, exist_ok=True)
+    report = document(work, results, wall_s)
+    text = markdown(report)
+    (work.folder / "campaign.json").write_text(json.dumps(report, indent=2) + "\n")
+    (work.folder / "campaign.md").write_text(text)
+    plot(report, work.folder / "campaign.png")
+    return report, text

@@ -1,0 +1,310 @@
+"""`rack check`: validate a config, show its inventory, and predict whether its levels meet their cycles."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rack.backplane.address_map import AddressMap
+from rack.backplane.layout import Layout
+from rack.boards.config import load, shared_out
+from rack.boards.config.cell import built_cell
+from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
+from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
+from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.rack import spanned
+from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
+from rack.tools.console.tables import print_wrapped, table, terminal_width
+from rack.tools.timing.judged_config import JudgedConfig
+from rack.tools.timing.repair import Repair, repair
+from rack.tools.timing.tables import forecast_lines
+
+From = Annotated[
+    Path | None, typer.Option("--from", metavar="RUN", help="use the budgets measured in this run, not the config's")
+]
+Percentile = Annotated[
+    float,
+    typer.Option(
+        metavar="P",
+        min=0.0,
+        max=100.0,
+        help="with --from: the longest of P in 100 cycles, to leave out cycles stalled by the host",
+    ),
+]
+Fix = Annotated[bool, typer.Option("--fix", help="print only the config, with the cheapest changes that make it fit")]
+
+Verbose = Annotated[bool, typer.Option("--verbose", help="add what the arm does while it waits for a new torque")]
+PATIENCE = (
+    "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted: {permitted_ms} ms). "
+    "Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors at full torque put in {energy_j} J"
+)
+
+
+def check(
+    config: ConfigName,
+    settings: Settings = [],  # noqa: B006  typer copies it
+    faults: Faults = None,
+    run: From = None,
+    percentile: Percentile = 100.0,
+    fix: Fix = False,
+    verbose: Verbose = False,
+    as_json: Json = False,
+) -> None:
+    """Validate a config, show its inventory, and predict its timing.
+
+    It prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per line. On a terminal
+    the tables show as many columns as fit; --json has all.
+
+    The timing rests on budgets: the longest processor time of each part of a level's cycle. They are in the config, in
+    [board.<name>.budget], or measured, with --from RUN. [timing] has the context switch, the clock's own time, the
+    limit of eq. 3.10, and a goal for the system's response. `rack schema board.budget` and `rack schema timing` show
+    the keys.
+
+    Equations 3.1 to 3.10 of the paper are applied to every level with a budget: both sides, the margin, and ok or
+    FAILS. Beyond the paper, it computes the worst-case response time of every task, and the load of every core.
+
+    If something fails, it lists changes that help, cheapest first, each tried on the whole rack: another priority or
+    core, a board for the planner, older plans, or a longer cycle, of that board or of one that shares its core. Changes
+    that need a core that this machine lacks come last. --fix prints the config with the first of them.
+
+    Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change helps; 2 a bad config.
+
+    \b
+    Examples:
+      rack check fig3
+      rack check fig3 --fix > fits.toml
+      rack check nasrem --from runs/nasrem-20250101-120000
+    """
+    found = load(config, settings, faults)
+    if run is not None:
+        found = _measured(found, run, percentile)
+    judged = JudgedConfig.of(found)
+    if judged.failing and sys.stderr.isatty():
+        print("the timing does not fit; looking for changes that help", file=sys.stderr)
+    fitting = repair(judged)
+    if fix:
+        _print_fixed(fitting, as_json)
+        sys.exit(1 if fitting.left else 0)
+    lacking = shared_out(found)
+    stock, forecast = inventory(found, judged.layout, lacking), Forecast.of(judged.timing, not lacking)
+    if as_json:
+        print_json(stock | {"timing": forecast.document() | {"repair": fitting.document()}})
+    else:
+        width = terminal_width()
+        patience = [PATIENCE.format(**found) for found in stock["patience"]] if verbose else []
+        lines = [*inventory_lines(stock, width), *patience, *forecast_lines(forecast, width), "", *fitting.lines()]
+        print_wrapped("\n".join(lines))
+    sys.exit(0 if forecast.holds else 1)
+
+
+def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
+    """Return a config with the budgets measured in a run. Raises `Failure` for a run of another rack."""
+    # Only --from needs them, and they take long to load.
+    from rack.tools.recording.cycles import measured_budgets
+    from rack.tools.recording.recording import Recording
+
+    recording = Recording(run)
+    ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)
+    if ran != asked:
+        raise Failure(f"{run}: a run of other boards: {', '.join(ran)}; '{config.name}' has {', '.join(asked)}", 2)
+    ran_as = rack_timing(recording.rack_config, recording.layout)
+    return with_budgets(config, without_interrupts(ran_as, measured_budgets(recording, percentile)))
+
+
+def _print_fixed(fitting: Repair, as_json: bool) -> None:
+    """Print the config that fits on stdout, its changes on stderr."""
+    document = fitting.document()
+    if as_json:
+        print_json(document | {"config": None if fitting.left else fitting.end.config.text()})
+        return
+    print(*(fitting.lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
+    if not fitting.left:
+        print(fitting.end.config.text(), end="")
+
+
+def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:
+    """Return the inventory of a config as plain data; addresses and sizes in bytes.
+
+    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox `delay_ms` the same;
+    `depth` is the number of a mailbox's slots, `size` the bytes of one message, `capacity` the most unread ones in a
+    queue (0: no queue).
+    """
+    places, tick_ms = AddressMap(layout), layout.clock_ns * 1e-6
+    tasks = [
+        {
+            "slot": task.slot,
+            "task": task.name,
+            "core": task.core,
+            "priority": task.priority,
+            "rate_hz": 1e9 / (task.every * layout.clock_ns),
+            "every_ticks": task.every,
+            "phase_ticks": task.phase,
+            "slice_ms": task.every * task.within_cycles * tick_ms,
+            "trace_address": places.traces[task.name],
+        }
+        for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
+    ]
+    mailboxes = [
+        {
+            "address": places.mailboxes[mailbox.name],
+            "mailbox": mailbox.name,
+            "message": f"{mailbox.message} {mailbox.version}",
+            "size": mailbox.size,
+            "depth": mailbox.depth,
+            "protocol": mailbox.protocol,
+            "capacity": mailbox.capacity,
+            "writer": mailbox.writer,
+            "readers": mailbox.readers,
+            "delay_ms": mailbox.delay * tick_ms,
+        }
+        for mailbox in layout.mailboxes
+    ]
+    return {
+        "rack": config.name,
+        "mode": config.clock.mode,
+        "clock_ms": tick_ms,
+        "clock_core": config.clock.core,
+        "clock_priority": config.clock.priority,
+        "segment_bytes": places.size,
+        "windows": {window.board: window.address for window in places.windows},
+        "tasks": tasks,
+        "hosts": [_host(name, host, layout) for name, host in config.host.items()],
+        "network": _network(config),
+        "patience": list(_patience(config, layout)),
+        "mailboxes": mailboxes,
+        "notes": notes,
+    }
+
+
+def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
+    """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile, joint by joint."""
+    for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
+        assert config.robot is not None, "it drives one"
+        cell = built_cell(config.robot, config.scene, config.clock_ns)
+        every, tick_ms = config.every(board), layout.clock_ns * 1e-6
+        ticks = cell.patience.ticks(every, tick_ms * 1e-3)
+        angle_mrad = ticks * tick_ms * cell.bounds.velocity
+        yield {
+            "board": board,
+            "ms": ticks * tick_ms,
+            "cycles": ticks // every,
+            "permitted_ms": round(cell.patience.seconds * 1e3, 3),
+            "angle_mrad": angle_mrad.round(1).tolist(),
+            "energy_j": round(float((angle_mrad * cell.bounds.torque).sum()) * 1e-3, 3),
+        }
+
+
+def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
+    return {
+        "board": name,
+        "program": host.program,
+        "external": host.external,
+        "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
+        "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
+    }
+
+
+def _network(config: RackConfig) -> dict[str, Any] | None:
+    """Return with whom a rack exchanges what; None: with nobody."""
+    table = config.adapter.lan
+    if table is None:
+        return None
+    entries = [
+        *(
+            {"entry": f"{LAN}.{port}", "way": "out", "mailbox": e.source, "rate_hz": e.rate_hz}
+            for port, e in table.exports.items()
+        ),
+        *(
+            {
+                "entry": f"{LAN}.{port}",
+                "way": "in",
+                "mailbox": e.source,
+                "rate_hz": e.rate_hz,
+                "max_age_ms": e.max_age_ms,
+            }
+            for port, e in table.imports.items()
+        ),
+    ]
+    keys = ("listen", "connect", "lease_ms", "on_peer_loss")
+    return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
+
+
+def _network_lines(network: dict[str, Any] | None, width: int | None) -> Iterator[str]:
+    """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
+    if network is None:
+        return
+    peers = ", ".join(network["peers"]) or "no rack in particular"
+    ends = [f"{key} {', '.join(network[key])}" for key in ("listen", "connect") if network[key]]
+    rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
+    yield from ("", f"network: {'; '.join([*ends, f'works with {peers}', rule])}")
+    rows = [
+        [e["entry"], e["way"], e["mailbox"], f"{e['rate_hz']:g}", f"{e['max_age_ms']:g}" if "max_age_ms" in e else ""]
+        for e in network["entries"]
+    ]
+    yield from table(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows, width)
+
+
+def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
+    """Yield the boards of the host side: they have no rate, and the timing model leaves them out."""
+    if hosts:
+        rows = [
+            [
+                h["board"],
+                "rack prompt" if h["external"] else h["program"],
+                ", ".join(h["writes"]),
+                ", ".join(h["reads"]),
+            ]
+            for h in hosts
+        ]
+        yield ""
+        yield from table(["host side", "program", "writes", "reads"], rows, width, ("program",))
+
+
+def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
+    """Yield an inventory as text for people, the tables fitted to `width`."""
+    boards = len({task["slot"] for task in found["tasks"]})
+    crate = f"{boards} board{'s' * (boards > 1)} and the clock"
+    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
+    yield from found["notes"]
+    phase = {"phase": "phase_ticks"} if any(task["phase_ticks"] for task in found["tasks"]) else {}
+    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-"))]
+    rows = [
+        [
+            *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
+            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), *(str(t[key]) for key in phase.values())),
+            *(f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+        ]
+        for t in found["tasks"]
+    ]
+    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", *phase, "slice, ms", "trace at"]
+    yield ""
+    yield from table(head, [[*clock, *[""] * (len(head) - len(clock))], *rows], width, ("trace at", "slice, ms"))
+    rows = [
+        [
+            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), _protocol(m)),
+            *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
+        ]
+        for m in found["mailboxes"]
+    ]
+    yield from _host_lines(found["hosts"], width)
+    yield from _network_lines(found["network"], width)
+    head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
+    yield ""
+    yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield ""
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
+    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def _protocol(mailbox: dict[str, Any]) -> str:
+    """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
+    return f"{mailbox['protocol']} of {mailbox['capacity']}" if mailbox["capacity"] else str(mailbox["protocol"])
+
+
+def _hex(address: int) -> str:
+    return f"0x{address:06x}"

@@ -1,0 +1,137 @@
+"""`rack command`: command one level of a running rack, as its operator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from rack.tools.console.address import OPERATOR, Asker
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json, Timeout, check_timeout
+
+GOAL_KEYS = ("joints", "position", "quaternion", "direction")
+DONE_AT_ONCE = ("resume", "modify", "table")
+"""Commands that leave none in force."""
+
+Level = Annotated[
+    str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own")
+]
+What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, modify, table or do")]
+Goals = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="GOAL",
+        help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify: NAME on|off; for "
+        "table: NAME; for do: the level's command",
+    ),
+]
+Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
+At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")]
+Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")]
+List = Annotated[bool, typer.Option("--list", help="list the levels, the commands each takes, and the one in force")]
+
+
+def command(
+    rack: AnyRackName,
+    level: Level = None,
+    what: What = None,
+    goal: Goals = None,
+    tick: Tick = None,
+    at: At = None,
+    wait: Wait = False,
+    timeout: Timeout = None,
+    is_list: List = False,
+    certificates: Certificates = "",
+    name: AskAs = OPERATOR,
+    as_json: Json = False,
+) -> None:
+    """Command one level of a running rack, overriding the level above it.
+
+    \b
+    hold      bring the arm to rest on its path, and keep it there
+    goto      move the arm to a goal, and keep it there
+    setpoint  the same, at the servo level: a straight line in joint space,
+              without checking for collisions
+    resume    let the level continue its own work
+    modify    put a control modification of the servo level in, or take it out,
+              between two samples and without a step in the torque
+    table     decide by another state table from now on
+    do        do one of the level's own commands, in place of the level above
+
+    All but `modify` and `table` stay in force until `resume`. They survive a restart of the level's board. An emergency
+    stop takes precedence.
+
+    Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did not answer in time;
+    2 usage.
+
+    \b
+    Examples:
+      rack command nasrem --list
+      rack command nasrem task hold
+      rack command nasrem task resume
+      rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
+      rack command nasrem task goto position=0.45,0.1,0.95
+      rack command nasrem task goto home --tick 4000 --wait --timeout 60
+      rack command brown joints modify friction on --at 2.5
+      rack command nist-state-table task table careful
+      rack command nist-state-table elemental_move do pick block1 --wait
+      rack command 192.168.1.5/cell task hold --certificates ~/cell
+    """
+    from rack.tools.console.tables import terminal_width
+    from rack.tools.live.desk import LiveDesk
+    from rack.tools.live.holds import resume_command
+    from rack.tools.live.watched import watched
+
+    check_timeout(timeout, wait)
+    # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
+    with INTERRUPT.raising(), watched(rack, Asker.of(name, certificates)) as one:
+        desk = LiveDesk(one)
+        if is_list:
+            print_answer(desk.levels(), desk.text(terminal_width()), as_json)
+            return
+        if level is None or what is None:
+            raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
+        given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
+        reply = desk.give(given, wait, timeout)
+    print_answer(reply.document(), reply.line, as_json)
+    if not reply.worked:
+        raise typer.Exit(1)
+    if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
+        print(f"in force until: {resume_command(rack, level)}")
+
+
+def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return what follows the verb, as in a `[[command]]` table.
+
+    Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
+    """
+    if what == "modify":
+        if len(words) != 2 or words[1] not in ("on", "off"):
+            raise Failure(f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2)
+        return {"name": words[0], "on": words[1] == "on"}
+    if what in ("table", "do"):
+        return {"name": " ".join(words)}
+    goal: dict[str, Any] = {}
+    for word in words:
+        key, is_given, values = word.partition("=")
+        if word == "home":
+            goal["home"] = True
+        elif not is_given or key not in GOAL_KEYS:
+            permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
+            raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
+        elif key in goal:
+            raise Failure(f"'{word}': {key} is given twice", 2)
+        else:
+            goal[key] = [_number(value, word) for value in values.split(",")]
+    return goal
+
+
+def _number(text: str, word: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        why = f"'{text}' is not a number; permitted: numbers separated by commas, as in joints=0,0.5,1"
+        raise Failure(f"'{word}': {why}", 2) from None

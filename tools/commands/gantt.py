@@ -1,0 +1,102 @@
+"""`rack gantt`: the schedule of a config, or the trace of a run, as a Gantt chart."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json, Settings
+from rack.tools.console.progress import reading_progress
+from rack.tools.timing.charts import figure5
+from rack.tools.timing.charts.gantt import Subject, gantt_of, subject_of
+from rack.tools.timing.charts.window import times_of, window_options
+
+LATEST_MS = 1e10
+MANY_SPANS = 10_000
+"""Spans from which on drawing takes a second or two."""
+
+SubjectName = Annotated[
+    str,
+    typer.Argument(metavar="CONFIG|RUN", help="config by name or path, or the folder of a run, as in runs/fig2-..."),
+]
+From = Annotated[float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="start of the window, ms")]
+To = Annotated[float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms")]
+Cycles = Annotated[
+    str | None, typer.Option(metavar="A-B", help="instead: the cycles to show, counted from 0, as in 10-12")
+]
+Level = Annotated[
+    str | None,
+    typer.Option(metavar="LEVEL", help="level whose cycles count; default: the slowest with a tight planner"),
+]
+Process = Annotated[
+    list[str],
+    typer.Option(metavar="LEVEL=MS,MS", help="times of X in the schedule of a level, one a cycle, in turn; repeatable"),
+]
+Figure = Annotated[
+    int | None, typer.Option(metavar="5", help="instead: the paper's figure 5 with the levels of this rack")
+]
+Out = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="folder for the pictures; default: the run's, or runs/<rack>-gantt")
+]
+
+
+def gantt(
+    subject: SubjectName,
+    from_ms: From = None,
+    to_ms: To = None,
+    cycles: Cycles = None,
+    level: Level = None,
+    process: Process = [],  # noqa: B006  typer copies it
+    figure: Figure = None,
+    settings: Settings = [],  # noqa: B006
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a run.
+
+    The letters are unit functions: C reads the plan, R reads command and status, X executes, W writes, P plans, U
+    updates the plan. "-" is an idle core, "." a core that another board has. A run is drawn above the schedule of its
+    config. The chart is printed as text, and drawn as PNG and SVG.
+
+    Figures 2 to 4 of the paper are racks of that name.
+
+    \b
+    Examples:
+      rack gantt fig2
+      rack gantt fig4-overload --cycles 10-12
+      rack gantt runs/nasrem-20250101-120000 --level servo
+    """
+    found = subject_of(subject, settings, out)
+    if figure is not None:
+        _figure_5(found, figure, as_json)
+        return
+    window = window_options(from_ms, to_ms, cycles, level)
+    chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
+    if chart.spans > MANY_SPANS and not as_json:
+        print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)
+    _answer(chart.text(), chart.document(), chart.save(_made(found.folder)), as_json)
+
+
+def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
+    if figure != 5:
+        raise Failure(f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2)
+    paths = figure5.save(found.config, _made(found.folder) / "figure5")
+    _answer("\n".join(figure5.lines(found.config)), figure5.document(found.config), paths, as_json)
+
+
+def _made(folder: Path) -> Path:
+    """Return the folder for the pictures, made if missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Failure(f"--out {folder}: no folder for pictures: {error.strerror}", 2) from error
+    return folder
+
+
+def _answer(text: str, document: dict[str, Any], pictures: list[Path], as_json: bool) -> None:
+    paths = [str(path) for path in pictures]
+    print_answer({**document, "pictures": paths}, f"{text}\n\npictures: {', '.join(paths)}", as_json)

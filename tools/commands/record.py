@@ -1,0 +1,131 @@
+"""`rack record`: attach a recorder to a running rack, or to several that work together."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rack.tools.commands.replay import merge
+from rack.tools.console.address import OPERATOR, Asker
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, View
+from rack.tools.live.folder import folder_of
+from rack.tools.live.watched import WatchedRack, watched
+from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.recorder.recorder import Recorder, SafeSink
+from rack.tools.viewer.sink import FILE, ViewSink
+from rack.tools.viewer.window import ViewerWindow, free_port, url
+
+MERGE_S = 60.0
+"""Time to put recordings on one time line after Ctrl-C; a second one ends it at once."""
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
+With = Annotated[
+    list[str],
+    typer.Option(
+        "--with",
+        metavar="RACK",
+        help="record this rack as well, on this machine or, by HOST[:PORT]/RACK, on another one; repeatable",
+    ),
+]
+
+
+def record(
+    rack: RackName,
+    others: With = [],  # noqa: B006  typer copies it
+    out: Out = None,
+    view: View = False,
+    certificates: Certificates = "",
+    name: AskAs = OPERATOR,
+    as_json: Json = False,
+) -> None:
+    """Record a running rack until its run is over, or until Ctrl-C.
+
+    The recording begins with the two seconds that the rack's rings still hold. `rack report`, `rack analyze` and `rack
+    replay` read it. Recording costs the rack no deadline, and ending it does not end the run.
+
+    With others that it works with, each is recorded into its own folder DIR/<rack>. When the runs of all are over,
+    DIR/run.rrd shows them on one time line, that of the first. A rack on another machine has to permit `watch`.
+
+    \b
+    Examples:
+      rack record nasrem
+      rack record nasrem --view --out runs/look
+      rack record cell-puma --with 192.168.1.5/cell-k1607 --with 192.168.1.6/cell
+    """
+    racks = [rack, *others]
+    if others and view:
+        raise Failure("--view, --with: give one of them: the racks have a common time line only in the end", 2)
+    asker = Asker.of(name, certificates)
+    with ExitStack() as stack:
+        found = [stack.enter_context(watched(each, asker)) for each in racks]
+        folder = folder_of(out, rack)
+        notes = _record_together(found, folder) if others else _record(found[0], folder, view)
+    for text in notes:
+        print(text, file=sys.stderr)
+    print_answer({"rack": rack, "folder": str(folder), "notes": notes}, f"recorded into {folder}", as_json)
+
+
+def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None = None) -> Recorder:
+    segment = rack.segment
+    for mailbox in segment.layout.mailboxes:
+        rack.follow(mailbox.name)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIG).write_text(segment.config)
+    view = SafeSink(lambda: ViewSink(segment, folder, port), notes.append)
+    return Recorder(segment, folder, view, rack.refresh if segment.is_mirror else None)
+
+
+def _record(rack: WatchedRack, folder: Path, view: bool) -> list[str]:
+    notes: list[str] = []
+    port = free_port() if view else None
+    # Ctrl-C ends the recording, not the run; leaving the context finishes the files.
+    with INTERRUPT.orderly(), _begin(rack, folder, notes, port) as recorder, INTERRUPT.orderly(recorder.stop):
+        if port is not None:
+            ViewerWindow(url(port))
+        recorder.follow()
+    return notes
+
+
+def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:
+    """Record each rack into its folder, then all of them into one file; return messages for the user."""
+    notes: list[str] = []
+    names = [rack.segment.layout.rack for rack in racks]
+    if twice := [name for at, name in enumerate(names) if name in names[:at]]:
+        raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)
+    folders = [folder / name for name in names]
+    unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' makes it"
+    with INTERRUPT.orderly(unfinished=unfinished, bound_s=MERGE_S):
+        with ExitStack() as stack:
+            begun = (_begin(rack, into, notes) for rack, into in zip(racks, folders, strict=True))
+            recorders = [stack.enter_context(recorder) for recorder in begun]
+            _follow(recorders, unfinished)
+        try:
+            return [*notes, *merge(folders, folder / FILE)]
+        except Failure as failure:
+            raise Failure(f"recorded into {', '.join(map(str, folders))}; not on one time line: {failure}") from None
+
+
+def _follow(recorders: Sequence[Recorder], unfinished: str) -> None:
+    """Record until the runs of all are over; Ctrl-C, or an error of one, ends all recordings."""
+
+    def stop() -> None:
+        for recorder in recorders:
+            recorder.stop()
+
+    def follow(recorder: Recorder) -> None:
+        try:
+            recorder.follow()
+        except BaseException:
+            stop()
+            raise
+
+    # A thread each: a rack on another machine, slow to answer, keeps none of the others waiting.
+    with INTERRUPT.orderly(stop, unfinished, MERGE_S), ThreadPoolExecutor(len(recorders)) as pool:
+        list(pool.map(follow, recorders))

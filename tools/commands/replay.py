@@ -1,0 +1,104 @@
+"""`rack replay`: open recordings in the viewer; those of several racks on one time line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.progress import reading_progress
+from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.time_line import on_one_time_line
+from rack.tools.viewer.window import ViewerWindow, has_screen
+
+Runs = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN...", help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack"),
+]
+Out = Annotated[
+    Path | None, typer.Option(metavar="FILE.rrd", help="make the viewer's file from what is recorded, and open nothing")
+]
+
+
+def replay(runs: Runs, out: Out = None) -> None:
+    """Open the recording of a run in the viewer; return when it is closed.
+
+    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd.
+
+    Of several racks that ran together, give the folder of each: they are shown at once, each under its name, on the
+    time line of the first. Their clocks are compared by what the racks recorded of each other; how uncertain that is
+    stands in the log. Recordings that did not run together are refused.
+
+    \b
+    Examples:
+      rack replay runs/nasrem-20250101-120000
+      rack replay runs/cell-puma-20250101-120000 runs/cell-k1607-20250101-120001
+      rack replay runs/cell-puma-* runs/cell-k1607-* --out both.rrd
+    """
+    if out is None and len(runs) == 1 and (recordings := _own(runs[0])):
+        _show(*recordings)
+        return
+    parts = [part for run in runs for part in _parts(run)]
+    if out is not None:
+        _make(parts, out)
+    elif len(parts) == 1:
+        raise Failure(f"{parts[0]}: nothing to replay: it has no run.rrd", 2)
+    elif has_screen():
+        with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-replay-") as folder:
+            _make(parts, Path(folder, "run.rrd"))
+            _show(Path(folder, "run.rrd"))
+    else:
+        raise Failure("no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd saves it for one")
+
+
+def _own(run: Path) -> list[Path]:
+    """Return the viewer's files of a run: a restarted recorder leaves several."""
+    found = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
+    return [path for path in found if path.is_file()]
+
+
+def _parts(run: Path) -> list[Path]:
+    """Return the runs in a folder that `rack record --with` has made; of any other, itself."""
+    parts = [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
+    return parts or [run]
+
+
+def _show(*recordings: Path) -> None:
+    if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
+        raise Failure(problem)
+
+
+def _make(runs: Sequence[Path], out: Path) -> None:
+    if out.suffix != ".rrd":
+        raise Failure(f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2)
+    if out.exists():
+        raise Failure(f"--out {out}: exists already", 2)
+    for note in merge(runs, out):
+        print(note, file=sys.stderr)
+
+
+def merge(runs: Sequence[Path], out: Path) -> list[str]:
+    """Write the viewer's file of runs that were recorded together; return what a user should know of their times.
+
+    Raises `Failure` if they cannot be read, or did not run together.
+    """
+    for run in runs:
+        if not run.is_dir():
+            raise Failure(f"{run}: no such folder" if not run.exists() else f"{run}: not the folder of a run", 2)
+    placed = on_one_time_line([Recording(run) for run in runs])
+    notes = [place.note for place in placed[1:]]
+    # It takes half a second to import.
+    from rack.tools.viewer.merged import write_merged
+
+    try:
+        write_merged(placed, out, reading_progress(False, "merging the recordings"))
+    except RuntimeError as error:
+        raise Failure(f"{out}: {' '.join(str(error).split())}") from None
+    return notes

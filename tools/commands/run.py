@@ -1,0 +1,136 @@
+"""`rack run`: launch a rack, watch it, record it, report."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rack.boards.config.files import assembled, named_classes
+from rack.boards.crate.requests import Preload
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, View
+
+if TYPE_CHECKING:
+    from rack.boards.config.schema import RackConfig
+    from rack.boards.config.toml import Tables
+    from rack.boards.crate.line import CrateLine
+    from rack.tools.live.launch import RunResult
+
+Lockstep = Annotated[
+    bool, typer.Option("--lockstep", help="start a tick only when every due task has finished: exact and repeatable")
+]
+Seconds = Annotated[
+    float | None,
+    typer.Option(metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"),
+]
+Speed = Annotated[float | None, typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5")]
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
+Share = Annotated[
+    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: both will be late")
+]
+Step = Annotated[
+    bool, typer.Option("--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on")
+]
+FromRun = Annotated[
+    Path | None,
+    typer.Option(
+        "--entries",
+        metavar="RUN",
+        help="start no host boards: what they sent in this recorded run enters again, at the same ticks; for runs in "
+        "real time, or with a prompt: other runs repeat in lockstep by themselves",
+    ),
+]
+NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
+
+
+def run(
+    context: typer.Context,
+    config: ConfigName,
+    lockstep: Lockstep = False,
+    step: Step = False,
+    seconds: Seconds = None,
+    speed: Speed = None,
+    settings: Settings = [],  # noqa: B006  typer copies it
+    faults: Faults = None,
+    entries: FromRun = None,
+    out: Out = None,
+    no_record: NoRecord = False,
+    view: View = False,
+    share: Share = False,
+    as_json: Json = False,
+) -> None:
+    """Run a rack until its task ends, and report on the run.
+
+    On a terminal a live table shows every task and what holds the rack; elsewhere one line a second is printed. --json
+    prints the report as one document. With --no-record it has the same keys; those that need a recording are null.
+
+    Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no fault is latched,
+    and the recording is complete. 1 otherwise, also if brakes or a level held the rack for over 5 s, or brakes for half
+    of the run, without a cause in sight. 2 usage or config error. A full disk ends the run. Ctrl-C ends it in order,
+    with a report and exit status 130.
+
+    \b
+    Examples:
+      rack run nasrem
+      rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
+      rack run nasrem --faults bad-sensors --out runs/sensors
+      rack run nasrem --set clock.speed=2 --view
+      rack run nist-state-table --lockstep --step
+      rack run ibm --lockstep --entries runs/ibm-20250101-120000
+    """
+    if view and no_record:
+        raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
+    overrides = list(settings)
+    overrides += ["clock.mode=lockstep"] if lockstep else []
+    overrides += [f"clock.speed={speed}"] if speed is not None else []
+    tables = assembled(config, overrides, faults)
+    crate = _informed(context.obj, tables)
+    from rack.boards.config.resolved import validated
+    from rack.tools.live.display import display_for
+    from rack.tools.live.folder import folder_of
+    from rack.tools.live.launch import NO_TIME, run_rack
+
+    if entries is not None:
+        from rack.tools.recording.entries import recorded_entries
+
+    found = validated(tables)
+    if step and found.clock.mode != "lockstep":
+        raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
+    folder = None if no_record else folder_of(out, found.name)
+    # From the start of the run to the end of its report; during the launch a signal ends the command at once.
+    with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
+        with display_for(silent=as_json) as display:
+            again = None if entries is None else recorded_entries(found, entries)
+            result = run_rack(
+                found, seconds, folder, display, view=view, share=share, crate=crate, step=step, entries=again
+            )
+        _report(found, folder, result, as_json)
+    if not result.worked:
+        # On stderr and last, where it is seen in any case.
+        print(result.failure(), file=sys.stderr)
+    sys.exit(0 if result.worked else 1)
+
+
+def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
+    """Let the crate load the levels that a config names, while this process imports what checks the config."""
+    if crate is not None:
+        own = tables.get("python_path")
+        crate.send(Preload(named_classes(tables), (*sys.path, *map(str, own if isinstance(own, list) else []))))
+    return crate
+
+
+def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> None:
+    """Make the report and print it; a recording that cannot be read does not fail the run."""
+    from rack.tools.commands.answers import print_report
+    from rack.tools.timing.analysis.report import unrecorded, write_report
+
+    report: tuple[dict[str, Any], str] | None = None
+    try:
+        report = write_report(folder) if folder is not None else None
+    except (Failure, OSError) as error:
+        print(f"no report: {error}", file=sys.stderr)
+    print_report(*(report or (unrecorded(config, result.document()), result.text())), as_json)

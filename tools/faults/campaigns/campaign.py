@@ -1,0 +1,206 @@
+"""A campaign: a faultless run, trials with faults, kills and sizes, and faultless time; each run leaves a file."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rack.backplane.layout import Layout
+from rack.boards.config import wire
+from rack.boards.config.schema import RackConfig
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.progress import Progress
+from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
+from rack.tools.faults.campaigns.environment import examine, load
+from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
+from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult, kept
+from rack.tools.faults.campaigns.trial import restart_s
+from rack.tools.faults.campaigns.workers import TrialJob, Workers
+
+LAUNCH_S = 2.0
+"""About the time of a launch and an end, for the progress bar."""
+SHORTEST_S = 1.0
+"""Shortest run of faultless time."""
+ROUNDS = 8
+"""Draws of a fault that does not strike, each at another instant; then it is missing."""
+ORDER, TRIALS = "order.json", "trials"
+"""In a campaign's folder: the file with its order, and the folder of its trials."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """An order for a campaign. `injections` of each kind; `modes` are True for lockstep, in their order.
+
+    `seconds`: simulated time of a rack that no task ends. `loads`: for each stretch of faultless time, whether the
+    machine is loaded.
+    """
+
+    name: str
+    config: RackConfig
+    injections: int
+    seed: int
+    modes: tuple[bool, ...]
+    kinds: str | None = None
+    kills: int = 0
+    sizes: int = 0
+    faultless_s: float = 0.0
+    loads: tuple[bool, ...] = (False, True)
+    seconds: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """Return the order as plain data: equal for campaigns that are the same."""
+        return {**vars(self), "config": self.config.text()}
+
+
+class Campaign:
+    """One campaign. Raises `ConfigError`, and `Failure` for a task that is not done even without faults."""
+
+    def __init__(self, order: Order, folder: Path, progress: Progress) -> None:
+        self.order, self.folder = order, folder
+        self._progress = progress
+        # Only the campaign's faults: the config's own would strike every trial.
+        self._config = order.config.model_copy(update={"fault": ()})
+        self.layout: Layout = wire(self._config)
+        self._second = 1e9 / self._config.clock_ns
+        self._targets = Targets(self._config, self.layout)
+        self.kinds = kinds_for(order.kinds, self._targets, False in order.modes)
+        self._ticks = 0
+        self._number = 0
+
+    def run(self) -> Results:
+        """Do everything that is not done yet, or as much as there is time for until Ctrl-C."""
+        order = self.order
+        self._open()
+        examine(self._config)
+        with Workers(self._config) as self._workers:
+            self._progress.begin("without faults, in lockstep")
+            made = self._made([Plan(0, "nominal", lockstep=True)])
+            if not made:
+                raise Failure(f"{order.name}: interrupted before the first run was done")
+            nominal = made[0]
+            if nominal.shortfalls or nominal.ended != "task done":
+                why = "; ".join(nominal.shortfalls)
+                raise Failure(f"{order.name}: the task is not done even without faults: {why}")
+            results, self._ticks = Results(nominal), nominal.ticks
+            self._inject(results)
+            rack = self._under_test(True)
+            results.sizes += self._made(size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1))
+            self._run_faultless(results)
+        results.is_interrupted = INTERRUPT.number != 0
+        return results
+
+    def _open(self) -> None:
+        """Make the folder, or continue in it. Raises `Failure` where it is another campaign's."""
+        path, wanted = self.folder / ORDER, json.loads(json.dumps(self.order.document()))
+        if path.exists():
+            there = json.loads(path.read_text())
+            if other := [key for key in wanted if wanted[key] != there.get(key)]:
+                differing = ", ".join(key.replace("_", " ") for key in other)
+                raise Failure(f"--out {self.folder}: holds another campaign; it differs in {differing}", 2)
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(wanted, indent=2) + "\n")
+
+    def _under_test(self, lockstep: bool) -> RackUnderTest:
+        return RackUnderTest(self._targets, self._ticks, self._second, restart_s(self._config, lockstep))
+
+    def _inject(self, results: Results) -> None:
+        """Make trials until every kind has struck as often as ordered; in real time those that lockstep cannot have."""
+        order, both = self.order, len(self.order.modes) > 1
+        for lockstep in order.modes:
+            kinds = [k for k in self.kinds if needs_real_time(k) != lockstep] if both or lockstep else self.kinds
+            lacking = dict.fromkeys(kinds if order.injections else (), order.injections)
+            for turn in range(ROUNDS):
+                rack, seed = self._under_test(lockstep), f"{order.seed} {turn}"
+                found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
+                results.trials += found
+                struck = Counter(f.kind for run in found for f in run.faults if f.is_judged and f.seen != "not struck")
+                lacking = {kind: left for kind, count in lacking.items() if (left := count - struck[kind]) > 0}
+                if not lacking or INTERRUPT.number:
+                    break
+            wanted = order.injections
+            results.lacking += [
+                f"{k}: struck {wanted - n} of {wanted} times, in {ROUNDS} draws" for k, n in lacking.items()
+            ]
+        # Runs of kills alternate between the modes.
+        rack = self._under_test(False not in order.modes)
+        kills = kill_plans(rack, order.kills, order.seed, order.modes, self._number + 1)
+        results.trials += self._made(list(kills))
+
+    def _made(self, plans: Sequence[Plan]) -> list[TrialResult]:
+        """Return the results of these plans, in their order: made now, or kept from before."""
+        self._number = max([self._number, *(plan.number for plan in plans)])
+        if plans:
+            self._progress.total(self._guess_s(plans))
+        for lockstep in (True, False):
+            jobs = [self._job(plan) for plan in plans if plan.lockstep is lockstep]
+            jobs = [job for job in jobs if self._kept(job) is None]
+            if jobs:
+                self._progress.begin(f"{len(jobs)} in {'lockstep' if lockstep else 'real time'}")
+            for job in self._workers.run(jobs, alone=not lockstep):
+                self._show(job)
+        return [found for plan in plans if (found := self._kept(self._job(plan))) is not None]
+
+    def _job(self, plan: Plan, seconds: float | None = None) -> TrialJob:
+        name = f"{plan.number:04}" if plan.number else plan.purpose
+        seconds = self.order.seconds if seconds is None else seconds
+        return TrialJob(plan, self.folder / TRIALS / f"{name}.json", self._ticks, seconds)
+
+    def _kept(self, job: TrialJob) -> TrialResult | None:
+        """Return the result that is kept of a trial; None for one of another plan, drawn by another version."""
+        found = kept(job.path)
+        return found if found is not None and found.plan == job.plan else None
+
+    def _show(self, job: TrialJob) -> None:
+        """Show how a trial ended; where it falls short, leave a plan that repeats it."""
+        if (found := self._kept(job)) is None:
+            return
+        if found.shortfalls and job.plan.number:
+            (self.folder / f"trial-{job.plan.number:04}.toml").write_text(job.plan.toml(self.order.name))
+        self._progress.end(self._guess_s([job.plan]), f"{_text(job.plan)}: {found.ended}", found.shortfalls)
+
+    def _run_faultless(self, results: Results) -> None:
+        """Run without faults, alone or under load, for as long as ordered."""
+        for place, is_loaded in enumerate(self.order.loads if self.order.faultless_s else ()):
+            with ExitStack() as stack:
+                under = stack.enter_context(load()) if is_loaded else ""
+                runs = list(self._calm(place, under))
+            results.faultless.append(Faultless(under, sum(run.ticks for run in runs) / self._second, tuple(runs)))
+
+    def _calm(self, place: int, under: str) -> Iterator[TrialResult]:
+        """Yield faultless runs in real time."""
+        left, nth = self.order.faultless_s, 0
+        while left >= SHORTEST_S and not INTERRUPT.number:
+            self._progress.begin(f"faultless{f' under {under}' if under else ''}, {left:.0f} s left")
+            seconds = left if left < self._ticks / self._second else self.order.seconds
+            plan = Plan(0, "faultless", lockstep=False)
+            job = self._job(plan, seconds)
+            job = TrialJob(plan, job.path.with_stem(f"faultless-{place}-{nth:03}"), job.ticks, seconds)
+            if self._kept(job) is None:
+                list(self._workers.run([job], alone=True))
+            if (found := self._kept(job)) is None:
+                return
+            yield found
+            # A run that has not ended would not end the next time either.
+            ran_s = found.ticks / self._second or left
+            left, nth = left - ran_s, nth + 1
+            self._progress.end(ran_s, found.ended, found.shortfalls)
+
+    def _guess_s(self, plans: Sequence[Plan]) -> float:
+        """Estimate the time that runs take: in lockstep a core simulates the default rack in a third of real time."""
+        real_s, cores = self._ticks / self._second, len(os.sched_getaffinity(0))
+        return sum(LAUNCH_S + (real_s / 3.0 / cores if plan.lockstep else real_s) for plan in plans)
+
+
+def _text(plan: Plan) -> str:
+    """Return a plan in a few words."""
+    kinds = Counter([*(table["kind"] for table in plan.faults), *(["external kill"] * len(plan.kills))])
+    found = ", ".join(f"{count} {kind}" if count > 1 else kind for kind, count in kinds.items())
+    return f"trial {plan.number}, {found}" if plan.number else plan.purpose

@@ -1,0 +1,150 @@
+"""The surroundings of trials: a load on the machine, leftovers of racks, and a check of the violation counter.
+
+As a program, `python -m rack.tools.faults.campaigns.environment PARENT WHAT`: one process of the load, or stress-ng; it
+ends with its parent.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rack.backplane.process import die_with_parent, is_alive, name_process, readable
+from rack.backplane.segment import SHM_FOLDER
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import descendants
+
+if TYPE_CHECKING:
+    from rack.boards.config.schema import RackConfig
+
+BOUND_S = 2.0
+"""Time that killed processes get to end."""
+COMM_LENGTH = 15
+"""Characters that the kernel keeps of a process's name."""
+FACTOR = 2.0
+"""Velocity that the violation counter must count, as a multiple of the limit."""
+DISKS = "disks"
+
+
+def children() -> set[int]:
+    """Return the living processes that descend from this one."""
+    return {pid for pid in descendants(os.getpid()) if is_alive(pid)}
+
+
+def left_behind(rack: str, before: set[int]) -> list[str]:
+    """Return everything left of a rack, segments and semaphores by name, processes by pid, each as one readable text.
+
+    `before`: descendants of this process that were there before the rack.
+    """
+    _await_end({*_named(rack), *(children() - before)})
+    files = [f"/dev/shm/{path.name}" for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
+    processes = sorted({*_named(rack), *(children() - before)})
+    return files + [f"process {pid} ({_name(pid)})" for pid in processes]
+
+
+def _named(rack: str) -> set[int]:
+    """Return the processes with names of a rack's boards, whatever their parent is."""
+    start = f"{rack}:"[:COMM_LENGTH]
+    pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
+    return {pid for pid in pids if _name(pid).startswith(start) and is_alive(pid)}
+
+
+def _name(pid: int) -> str:
+    with suppress(FileNotFoundError, ProcessLookupError):
+        return Path(f"/proc/{pid}/comm").read_text().rstrip("\n")
+    return ""
+
+
+def _await_end(pids: set[int]) -> None:
+    deadline = time.monotonic() + BOUND_S
+    for pid in pids:
+        try:
+            descriptor = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        try:
+            readable(descriptor, deadline - time.monotonic())
+        finally:
+            os.close(descriptor)
+
+
+def examine(config: RackConfig) -> None:
+    """Check the violation counter: move every joint at twice its limit for one tick.
+
+    A campaign that says "no limit violated" must be able to see a violation. Raises `Failure` where it is not counted.
+    """
+    # Only here: a process of the load needs none of them.
+    import mujoco
+    from numpy import isfinite
+
+    from rack.backplane.message import Message
+    from rack.levels.arm import SimulatedArm
+    from rack.levels.messages import ARM_STATE
+    from rack.levels.robot.cell import STATE, build_cell, sizes
+
+    if config.robot is None:
+        return
+    cell = build_cell(config.robot, config.scene, config.clock_ns)
+    for joint, (dof, limit) in enumerate(zip(cell.dof, cell.bounds.velocity, strict=True)):
+        if not isfinite(limit):
+            continue
+        arm = SimulatedArm(cell, config.scene, config.clock_ns)
+        data, state = cell.start(), Message(ARM_STATE.dtype(sizes(cell)))
+        arm.save(state)
+        data.qvel[dof] = FACTOR * limit
+        mujoco.mj_getState(cell.model, data, state.state, STATE)
+        arm.restore(state)
+        arm.step(1)
+        if not arm.violations:
+            name, speed = config.robot.joints[joint], f"{FACTOR * limit:g} rad/s"
+            raise Failure(f"violation counter: joint '{name}' at {speed}, twice its limit, is not counted")
+
+
+@contextmanager
+def load() -> Iterator[str]:
+    """Keep every core that this process may use busy, and the disks; yields the load in words.
+
+    Uses `stress-ng` where it is installed.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    stress = ["stress-ng", "--cpu", str(len(cores)), "--io", "1"]
+    has_stress = shutil.which(stress[0]) is not None
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", "rack.tools.faults.campaigns.environment", str(os.getpid())]
+    parts = [stress] if has_stress else [*([str(core)] for core in cores), [DISKS]]
+    busy = [
+        subprocess.Popen([*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for part in parts
+    ]
+    try:
+        yield " ".join(stress) if has_stress else f"{len(cores)} busy processes and one that writes"
+    finally:
+        for process in busy:
+            # Terminated, not killed: stress-ng then ends its own processes.
+            process.terminate()
+            process.wait()
+
+
+def main() -> None:
+    """Run a part of the load until the parent ends."""
+    parent, what = int(sys.argv[1]), sys.argv[2]
+    die_with_parent(parent)
+    if what == "stress-ng":
+        os.execvp(what, sys.argv[2:])
+    name_process("campaign load")
+    if what != DISKS:
+        os.sched_setaffinity(0, {int(what)})
+    while True:
+        if what == DISKS:
+            os.sync()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""Worker processes make the trials, as many at once as there are cores; each trial has its own rack and leaves a file.
+
+As a program, `python -m rack.tools.faults.campaigns.workers FD PARENT`: one such process; it ends with its parent.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe, wait
+from pathlib import Path
+from typing import Any
+
+from rack.backplane.process import die_with_parent
+from rack.boards.config.schema import RackConfig
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.faults.campaigns.results import Judged, keep
+from rack.tools.faults.campaigns.trial import run_trial
+
+LOOK_S = 0.2
+"""Longest time until a campaign that waits for its trials notices an interrupt."""
+INTERRUPT_S = 30.0
+"""Time to finish after Ctrl-C: a report of hours of trials is worth more than 2 s. A second signal ends it at once."""
+
+
+@dataclass(frozen=True)
+class TrialJob:
+    """A trial to be made: `ticks` of a faultless run, `seconds` of simulated time where no task ends the run."""
+
+    plan: Plan
+    path: Path
+    ticks: int
+    seconds: float | None
+
+
+class Workers:
+    """Processes that make trials. Use it as a context; they end with it, and with the process that made it."""
+
+    def __init__(self, config: RackConfig) -> None:
+        self._config = config
+        self._cores = sorted(os.sched_getaffinity(0))
+        self._lines: list[Connection] = []
+        self._is_stopped = False
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if error[0] is not None:
+            self._stop()
+        for line in self._lines:
+            line.close()
+        for process in self._processes:
+            process.wait()
+
+    def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
+        """Make trials and yield each that is done and has its file; trials that Ctrl-C cuts short leave none.
+
+        Trials that are `alone` have the machine for themselves. Others get one core each: boards that share a core hand
+        messages to each other sooner.
+        """
+        waiting, busy = list(jobs), dict[Any, TrialJob]()
+        most = 1 if alone else len(self._cores)
+        while waiting or busy:
+            for place, line in enumerate(self._some(min(most, len(waiting) + len(busy)))):
+                if line not in busy and waiting and not INTERRUPT.number:
+                    busy[line] = waiting.pop(0)
+                    line.send((busy[line], set(self._cores) if alone else {self._cores[place]}))
+            if not busy:
+                return
+            ready: list[Any] = wait(list(busy), LOOK_S)
+            for line in ready:
+                yield self._done(line, busy.pop(line))
+            if INTERRUPT.number:
+                waiting.clear()
+                self._stop()
+
+    def _done(self, line: Any, job: TrialJob) -> TrialJob:
+        try:
+            wrong = line.recv()
+        except (EOFError, ConnectionResetError):
+            wrong = "the process that made it ended"
+        if wrong:
+            raise Failure(f"trial {job.plan.number}: {wrong}")
+        return job
+
+    def _stop(self) -> None:
+        """Stop the trials that are being made, once: a worker that is asked twice would leave its rack as it is."""
+        if not self._is_stopped:
+            self._is_stopped = True
+            for process in self._processes:
+                process.terminate()
+
+    def _some(self, count: int) -> list[Connection]:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        while len(self._lines) < count:
+            here, there = Pipe()
+            command = [
+                sys.executable,
+                "-m",
+                "rack.tools.faults.campaigns.workers",
+                str(there.fileno()),
+                str(os.getpid()),
+            ]
+            # In a process group of its own: Ctrl-C on the terminal reaches only the campaign, which stops its workers.
+            self._processes.append(
+                subprocess.Popen(command, env=environment, pass_fds=[there.fileno()], process_group=0)
+            )
+            there.close()
+            here.send(self._config)
+            self._lines.append(here)
+        return self._lines[:count]
+
+
+def main() -> None:
+    """Make the trials that come over a line, one after the other."""
+    INTERRUPT.catch()
+    line, parent = Connection(int(sys.argv[1])), int(sys.argv[2])
+    die_with_parent(parent)
+    with INTERRUPT.orderly(bound_s=INTERRUPT_S), suppress(EOFError):
+        config = line.recv()
+        while True:
+            job, cores = line.recv()
+            os.sched_setaffinity(0, cores)
+            try:
+                trial = run_trial(config, job.plan, f"camp-{os.getpid()}x", job.ticks, job.seconds)
+                if not trial.is_interrupted:
+                    keep(Judged.of(trial), job.path)
+            except Exception as error:  # whatever it is, the campaign must hear of it
+                line.send(f"{type(error).__name__}: {error}")
+            else:
+                line.send("")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""The figures of chains of boards: what each costs, whether it holds, and the straight line through their costs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.tables import decimal, table
+from rack.tools.lab.benches.comparison import Absent
+from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond
+
+RATE_HZ = 400
+RACK, OTHER, PEER, SPREAD = "#4477aa", "#ee6677", "#222222", "#bbccdd"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A straight line through costs by number of boards: us a tick; `r2` is 1 where it explains all of them."""
+
+    base_us: float
+    board_us: float
+    r2: float
+
+    @classmethod
+    def of(cls, counts: Sequence[int], costs_us: Sequence[float]) -> Fit | None:
+        """Return the line of least squares; None for fewer than three numbers of boards."""
+        if len(counts) < 3:
+            return None
+        slope, base = np.polyfit(counts, costs_us, 1)
+        residual = np.asarray(costs_us) - (base + slope * np.asarray(counts))
+        total = np.asarray(costs_us) - np.mean(costs_us)
+        return cls(float(base), float(slope), 1.0 - float((residual**2).sum() / (total**2).sum()))
+
+    @property
+    def words(self) -> str:
+        """The line in words."""
+        return f"{self.board_us:.1f} us a board plus {self.base_us:.1f} us (R2 {self.r2:.4f})"
+
+
+@dataclass(frozen=True)
+class ChainFigures(MissesBeyond):
+    """All runs of one chain. Costs are us a tick, of all boards; responses are counts of messages by cycles."""
+
+    boards: int
+    cycles: int
+    processor_us: float
+    missed: float  # share of all cycles missed or skipped
+    late: float | None  # share of cyclictest's wakes that were late by a cycle; None: it is absent
+    responses: dict[int, int]
+    lockstep_responses: dict[int, int]
+    lockstep_us: dict[str, float]  # by tree; median of the runs
+
+    @property
+    def exact(self) -> bool:
+        """Whether every message took one cycle a board: in lockstep always, in real time if no cycle was missed."""
+        took, least = {*self.responses}, self.boards
+        return {*self.lockstep_responses} == {least} and (min(took) >= least if self.missed else took == {least})
+
+
+@dataclass(frozen=True)
+class Boards:
+    """The figures of every chain, the shortest first; `trees` are those measured in lockstep, this one first."""
+
+    figures: tuple[ChainFigures, ...]
+    trees: tuple[str, ...]
+    cores: int
+    absent: Absent | None
+
+    @property
+    def counts(self) -> list[int]:
+        """Boards of each chain."""
+        return [one.boards for one in self.figures]
+
+    @property
+    def exact(self) -> bool:
+        """Whether every message of every chain took as many cycles as it should."""
+        return all(one.exact for one in self.figures)
+
+    @property
+    def fit(self) -> Fit | None:
+        """Processor time in real time, by number of boards."""
+        return Fit.of(self.counts, [one.processor_us for one in self.figures])
+
+    def lockstep_fit(self, tree: str) -> Fit | None:
+        """Return the time of a tick in lockstep, by number of boards."""
+        return Fit.of(self.counts, [one.lockstep_us[tree] for one in self.figures])
+
+    @property
+    def title(self) -> str:
+        """What was measured, in a line."""
+        return f"empty boards in a chain at {RATE_HZ} Hz on {self.cores} cores"
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        own = {"bench": "boards", "rate_hz": RATE_HZ, "cores": self.cores, "trees": self.trees}
+        extra = ("beyond", "held", "exact")
+        fits = {tree: self.lockstep_fit(tree) for tree in self.trees}
+        return {
+            **own,
+            "chains": [{**asdict(one), **{name: getattr(one, name) for name in extra}} for one in self.figures],
+            "fit": asdict(self.fit) if self.fit else None,
+            "lockstep_fit": {tree: asdict(fit) if fit else None for tree, fit in fits.items()},
+            "permitted_beyond": BEYOND,
+            "absent": [] if self.absent is None else [asdict(self.absent)],
+        }
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield the figures as a table for people, fitted to `width`, and the fits."""
+        yield f"{self.title}; costs in us a tick, missed and late in %"
+        head = ["boards", "processor", "a board", "missed", "cyclictest late", "beyond", "", "response, cycles"]
+        head += [f"lockstep, {tree}" for tree in self.trees]
+        head += ["ratio"] if len(self.trees) > 1 else []
+        yield from table(head, [self._row(one) for one in self.figures], width, ("a board", "beyond"))
+        if self.absent is not None:
+            yield f"{self.absent.line}; every miss counts against the rack"
+        if fit := self.fit:
+            yield f"processor time: {fit.words}"
+        for tree in self.trees:
+            if fit := self.lockstep_fit(tree):
+                yield f"lockstep, {tree}: {fit.words}"
+
+    def _row(self, one: ChainFigures) -> list[str]:
+        late = None if one.late is None else 100 * one.late
+        shares = [decimal(100 * one.missed), decimal(late), decimal(100 * one.beyond)]
+        cycles = ", ".join(map(str, sorted({*one.responses, *one.lockstep_responses})))
+        costs = [one.lockstep_us[tree] for tree in self.trees]
+        return [
+            str(one.boards),
+            decimal(one.processor_us, 1),
+            decimal(one.processor_us / one.boards, 1),
+            *shares,
+            "held" if one.held else "not held",
+            f"{cycles}{'' if one.exact else ' INEXACT'}",
+            *(decimal(cost, 1) for cost in costs),
+            *([decimal(costs[0] / costs[1], 2)] if len(costs) > 1 else []),
+        ]
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write costs and misses by number of boards as PNG and SVG into `folder`; return their paths."""
+        paths = paths_of(folder / "boards")
+        with picture(paths, 9.0, 4.0, layout="constrained") as drawn:
+            costs, shares = drawn.subplots(1, 2)
+            series = {"real time: processor time": ([one.processor_us for one in self.figures], self.fit, RACK, "o")}
+            for tree, colour in zip(self.trees, (PEER, OTHER), strict=False):
+                found = [one.lockstep_us[tree] for one in self.figures]
+                series[f"lockstep: time of a tick, {tree}"] = (found, self.lockstep_fit(tree), colour, "s")
+            for label, (found, fit, colour, mark) in series.items():
+                label += f"\n{fit.board_us:.1f} us a board, R² {fit.r2:.4f}" if fit else ""
+                costs.plot(self.counts, found, mark, color=colour, label=label)
+                if fit:
+                    ends = np.array([0, self.counts[-1]])
+                    costs.plot(ends, fit.base_us + fit.board_us * ends, color=colour, linewidth=0.8)
+            costs.set_ylim(0, None)
+            costs.set_ylabel("us a tick")
+            shares.plot(
+                self.counts, [100 * one.missed for one in self.figures], "o-", color=RACK, label="boards: missed"
+            )
+            if self.absent is None:
+                late = [100 * (one.late or 0.0) for one in self.figures]
+                shares.plot(self.counts, late, "s-", color=PEER, label="cyclictest: late by a cycle")
+            shares.set_ylim(0, max(0.5, 130 * max(max(one.missed, one.late or 0.0) for one in self.figures)))
+            shares.set_ylabel("% of the cycles")
+            for axes in (costs, shares):
+                axes.set_xlim(0, self.counts[-1] + 1)
+                axes.set_xlabel("boards")
+                axes.set_xticks(self.counts)
+                axes.grid(color=SPREAD, linewidth=0.4)
+                axes.spines[["top", "right"]].set_visible(False)
+                axes.legend(frameon=False, loc="upper left")
+            drawn.suptitle(self.title, fontsize="medium")
+        return paths

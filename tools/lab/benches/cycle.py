@@ -1,0 +1,298 @@
+"""The processor time of a board's cycle, by part: racks that run in real time and in lockstep, and their traces.
+
+Reading, processing and writing lie between stamps of the trace; what the processor time of a cycle exceeds them by is
+waking up before it, and the bookkeeping after it. An empty board shows the rack's own cost; the physics that are in a
+servo cycle are replayed alone. Another checkout of rack runs the same racks by turns.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rack.boards.config import load, wire
+from rack.levels.timing.trace_times import Occupation, unit_times
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.progress import Progress
+from rack.tools.console.tables import decimal, table
+from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.checkout import THIS, RackCommand, both_racks
+from rack.tools.lab.benches.comparison import Comparison, Sample, shown, turns
+from rack.tools.lab.benches.empty import write_empty_rack
+from rack.tools.lab.benches.physics import SERVO, ReplayPace, replay
+from rack.tools.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PARTS = ("wake", "read", "process", "write", "bookkeeping")
+"""Parts of a cycle, in the order of time; where a trace does not separate the last one, it is in the first."""
+COLOURS = ("#bbbbbb", "#88ccee", "#ddcc77", "#44aa99", "#aa4499")
+PHYSICS, HATCH = "#882255", "////"
+STEADY_TICKS = 40
+"""Ticks at the start that are not judged: a new process touches its memory for the first time."""
+EMPTY = "empty"
+LAUNCH_S = 5.0
+"""About how long launching a rack, and reporting on it, take in addition to its time."""
+BOUND_S = 120.0
+"""Longest time for a run, in addition to ten times its simulated time."""
+REPLAYED_TICKS = 1000
+"""Ticks of one replay of physics, at most."""
+ROW, PACED = "mj_step, tick after tick", "mj_step, at the servo's rate"
+SHARE = f"{EMPTY}, lockstep, wall-clock time of a tick, a board"
+
+
+class Trace(NamedTuple):
+    """Cycles of one task: records of the trace, shape (n,), and processor times of C, R, X, W, ns, shape (n, 4)."""
+
+    rows: np.ndarray
+    units: np.ndarray
+
+
+class RackKind(NamedTuple):
+    """A rack to run, "nasrem" or "empty", in one mode."""
+
+    config: str
+    lockstep: bool
+
+    @property
+    def mode(self) -> str:
+        """The mode, in words."""
+        return "lockstep" if self.lockstep else "real time"
+
+
+KINDS = tuple(RackKind(config, lockstep) for config in ("nasrem", EMPTY) for lockstep in (False, True))
+
+
+@dataclass(frozen=True)
+class BoardParts:
+    """The median of each part of one board's cycles, us; a part that a trace does not separate is 0."""
+
+    case: str
+    who: str
+    parts: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class CycleCosts:
+    """What the runs cost: a comparison of whole cycles, and the parts of each."""
+
+    comparison: Comparison
+    parts: tuple[BoardParts, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        parts = [{"case": one.case, "who": one.who, **one.parts} for one in self.parts]
+        return {**self.comparison.document(), "parts_unit": "us", "parts": parts}
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield both tables for people, fitted to `width`."""
+        yield "Parts of a board's cycle, processor time, us, median"
+        rows = [[one.case, one.who, *(shown(one.parts[part]) for part in PARTS)] for one in self.parts]
+        yield from table(["board", "who", *PARTS], rows, width)
+        if not all(one.parts["bookkeeping"] for one in self.parts):
+            yield "bookkeeping 0: the trace does not separate it; it is in wake"
+        yield ""
+        yield from self.comparison.lines(width)
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write cycle.png and cycle.svg, a panel a board, into `folder`; return their paths."""
+        from matplotlib.patches import Patch
+
+        cases = list(dict.fromkeys(one.case for one in self.parts))
+        columns = len(cases) // 2
+        paths = paths_of(folder / self.comparison.name)
+        with picture(paths, 1.4 + 2.1 * columns, 4.1, layout="constrained") as figure:
+            # A row of panels for real time, one for lockstep.
+            axes = figure.subplots(2, columns, squeeze=False, sharey=True).flatten()
+            for panel, case in zip(axes, cases, strict=True):
+                self._draw(panel, case)
+            bars = [Patch(color=colour, label=part) for part, colour in zip(PARTS, COLOURS, strict=True)]
+            bars.append(Patch(facecolor="white", edgecolor=PHYSICS, hatch=HATCH, label="bare mj_step in it"))
+            figure.legend(handles=bars, loc="outside upper center", ncols=len(bars), frameon=False)
+            figure.supxlabel(f"{self.comparison.title}, us: medians of its parts; (ratio)", fontsize="medium")
+        return paths
+
+    def _draw(self, axes: Axes, case: str) -> None:
+        """Draw a bar a contestant, made of the parts of its cycle; of the servo's also the physics in it."""
+        own = [one for one in self.parts if one.case == case]
+        physics = self.comparison.sample(_with_physics(case), _bare(case))
+        ends = [sum(one.parts.values()) for one in own]
+        for row, (one, end) in enumerate(zip(own, ends, strict=True)):
+            left = 0.0
+            for part, colour in zip(PARTS, COLOURS, strict=True):
+                axes.barh(row, one.parts[part], left=left, height=0.6, color=colour)
+                if part == "process" and physics is not None:
+                    axes.barh(
+                        row,
+                        physics.median,
+                        left=left,
+                        height=0.6,
+                        facecolor="none",
+                        edgecolor=PHYSICS,
+                        hatch=HATCH,
+                        linewidth=0.0,
+                    )
+                left += one.parts[part]
+            axes.annotate(self._words(one), (end, row), (3, 0), textcoords="offset points", va="center", fontsize=7)
+        axes.set_yticks(range(len(own)), [one.who for one in own])
+        axes.set_ylim(len(own) - 0.5, -0.5)
+        axes.set_xlim(0.0, 1.35 * max(ends))
+        axes.set_title(case, fontsize="small", loc="left")
+        axes.tick_params(axis="y", length=0)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+
+    def _words(self, one: BoardParts) -> str:
+        sample = self.comparison.sample(one.case, one.who)
+        assert sample is not None, "parts and samples are of the same traces"
+        ratio = self.comparison.ratio(sample)
+        return shown(sample.median) + ("" if ratio is None else f" ({decimal(ratio, 2)})")
+
+
+def _with_physics(case: str) -> str:
+    """Return the case that compares the servo of this case with its physics."""
+    return case.replace(f"{SERVO},", f"{SERVO} and its physics,")
+
+
+def _bare(case: str) -> str:
+    """Return the replay that runs as the boards of a case do."""
+    return ROW if case.endswith("lockstep") else PACED
+
+
+class Found(NamedTuple):
+    """Everything measured, by contestant: traces also by case, times in us, arrays of shape (n,)."""
+
+    traces: defaultdict[tuple[str, str], list[Trace]]
+    shares_us: defaultdict[str, list[np.ndarray]]
+    """Wall-clock time of a tick of the empty rack in lockstep, divided by its boards."""
+    physics_us: defaultdict[str, list[np.ndarray]]
+    """Processor time of a tick's bare physics, by the way of their replay."""
+
+
+def measure(against: Path | None, seconds: float, rounds: int, progress: Progress, share: bool = False) -> CycleCosts:
+    """Run every rack of this tree, and of another checkout, by turns, each for `seconds` of simulated time.
+
+    `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run fails.
+    """
+    with ExitStack() as stack:
+        commands = stack.enter_context(both_racks(against))
+        runs = CycleRuns(seconds, Path(stack.enter_context(TemporaryDirectory())), share)
+        progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
+        for turn, (kind, command) in turns([(kind, command) for kind in KINDS for command in commands], rounds):
+            progress.begin(f"{kind.config}, {kind.mode}, {command.name}: round {turn + 1} of {rounds}")
+            runs.run(kind, command)
+            progress.end(seconds + LAUNCH_S)
+        return costs(runs.found, commands[-1].name if len(commands) > 1 else None)
+
+
+class CycleRuns:
+    """Runs racks, and collects what is `found` in their traces."""
+
+    def __init__(self, seconds: float, folder: Path, share: bool) -> None:
+        self.found = Found(defaultdict(list), defaultdict(list), defaultdict(list))
+        self._seconds, self._folder, self._share = seconds, folder, share
+        self._runs = 0
+        config = load("nasrem")
+        servo = wire(config).task(SERVO)
+        self._pace = ReplayPace(config.clock_ns * servo.every, servo.core, servo.priority)
+
+    def run(self, kind: RackKind, command: RackCommand) -> None:
+        """Run one rack and take its traces; of this tree's arm in lockstep, replay the physics at once."""
+        self._runs += 1
+        folder = self._folder / str(self._runs)
+        folder.mkdir()
+        config: str | Path = kind.config if kind.config != EMPTY else write_empty_rack(folder, command.package)
+        options = ["--set", f"name=bench-{os.getpid()}", "--out", folder / "run", "--seconds", self._seconds]
+        options += ["--lockstep"] * kind.lockstep + ["--share"] * (self._share and bool(command.package))
+        command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
+        traces = traces_of(Recording(folder / "run"))
+        for board, trace in traces.items():
+            case = f"{EMPTY if kind.config == EMPTY else board}, {kind.mode}"
+            self.found.traces[case, command.name].append(trace)
+        if kind.lockstep and kind.config == EMPTY:
+            first = next(iter(traces.values()))
+            self.found.shares_us[command.name].append(np.diff(first.rows["start_ns"]) * 1e-3 / len(traces))
+        if kind.lockstep and kind.config != EMPTY and command.name == THIS:
+            for who, pace in ((ROW, ReplayPace()), (PACED, self._pace)):
+                times_us = apart(replay, folder / "run", pace, REPLAYED_TICKS)
+                self.found.physics_us[who].append(np.array(times_us))
+
+
+def traces_of(recording: Recording) -> dict[str, Trace]:
+    """Return the steady cycles of every executor of a run, by task.
+
+    Checkouts record the same columns; one that an earlier version did not record is 0.
+    """
+    tasks = [task for task in recording.layout.tasks if len(recording.trace(task.name))]
+    spans = {task: Occupation.of(recording.trace(task.name)) for task in tasks}
+    found: dict[str, Trace] = {}
+    for task in tasks:
+        above = [span for other, span in spans.items() if other.core == task.core and other.priority > task.priority]
+        rows = recording.trace(task.name)
+        times = unit_times(rows, Occupation.union(above))
+        steady = rows["tick"] >= STEADY_TICKS
+        if task.role == "executor" and steady.any():
+            found[task.name] = Trace(rows[steady], times[steady])
+    return found
+
+
+def costs(found: Found, baseline: str | None) -> CycleCosts:
+    """Return the costs of everything measured; `baseline` is the contestant that the others are compared with."""
+    order = _ordered(found.traces)
+    samples = [_sample(*one, (trace.rows["processor_ns"] * 1e-3 for trace in found.traces[one])) for one in order]
+    parts = [BoardParts(*one, _medians(found.traces[one])) for one in order]
+    shares = [_sample(SHARE, who, found.shares_us[who]) for who in sorted(found.shares_us, key=_is_other)]
+    baselines = {sample.case: baseline for sample in (*samples, *shares) if baseline is not None}
+    physics: list[Sample] = []
+    for case in dict.fromkeys(case for case, _ in order if case.startswith(f"{SERVO},")):
+        physics += [replace(sample, case=_with_physics(case)) for sample in samples if sample.case == case]
+        physics += [_sample(_with_physics(case), who, times) for who, times in found.physics_us.items()]
+        baselines[_with_physics(case)] = _bare(case)
+    title = "Processor time of a board's cycle"
+    return CycleCosts(Comparison("cycle", title, (*samples, *shares, *physics), baselines), tuple(parts))
+
+
+def _ordered(found: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return cases and contestants: real time first, in it the empty boards; in each case this tree first."""
+    cases = list(dict.fromkeys(case for case, _ in found))
+
+    def place(one: tuple[str, str]) -> tuple[bool, bool, int, bool]:
+        case, who = one
+        return case.endswith("lockstep"), not case.startswith(EMPTY), cases.index(case), _is_other(who)
+
+    return sorted(found, key=place)
+
+
+def _is_other(who: str) -> bool:
+    return who != THIS
+
+
+def _sample(case: str, who: str, times_us: Iterable[np.ndarray]) -> Sample:
+    return Sample(case, who, tuple(np.concatenate(list(times_us)).tolist()), "us")
+
+
+def _medians(traces: Iterable[Trace]) -> dict[str, float]:
+    found = [parts_of(trace) for trace in traces]
+    return {part: float(np.median(np.concatenate([one[part] for one in found]))) for part in PARTS}
+
+
+def parts_of(trace: Trace) -> dict[str, np.ndarray]:
+    """Return the processor time of each part of each cycle but the first, us, shape (n - 1,)."""
+    rows, units = trace.rows, trace.units[1:]
+    exchange, read, process, write = units.T
+    beyond = rows["processor_ns"][1:] - units.sum(axis=1)
+    # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it is written.
+    closing, gap = rows["closed_ns"][1:] - rows["end_ns"][:-1], rows["start_ns"][1:] - rows["closed_ns"][1:]
+    # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the next start is known.
+    closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
+    closing[rows["closed_ns"][1:] == 0] = 0
+    times = beyond - closing, exchange + read, process, write, closing
+    return {part: time * 1e-3 for part, time in zip(PARTS, times, strict=True)}

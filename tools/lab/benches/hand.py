@@ -1,0 +1,142 @@
+"""Table-driven buffers next to interrupt-driven messages: the racks hic and condor, with the same hand and task."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from rack.boards.config import load
+from rack.levels.systems.hand.messages import GraspKind
+from rack.levels.timing.rack import spanned
+from rack.levels.timing.trace_times import counts
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.exchange_times import ExchangeTimes, exchange_times
+from rack.tools.lab.benches.hand_figures import HandBench, HandFigures, LinkFigures
+from rack.tools.lab.benches.observed import Recorded, record
+from rack.tools.live.interrupts import interrupts
+from rack.tools.recording.cycles import cycles_of
+from rack.tools.recording.recording import Recording
+
+RACKS = ("hic", "condor")
+MODES = ("realtime", "lockstep")
+LAUNCH_S = 5.0
+"""About how long launching and recording a run take in addition to its time."""
+ABOUT_S = 13.0
+"""About how long a run takes in simulated time."""
+SETTLED_S = 0.3
+"""Simulated time after the end of a pull in which the object comes back."""
+
+
+def measure(rounds: int, share: bool, progress: Progress, racks: Sequence[str] = RACKS) -> HandBench:
+    """Run both racks by turns, in real time, then in lockstep; return their figures."""
+    progress.total(2 * len(racks) * rounds * (ABOUT_S + LAUNCH_S))
+    found: dict[tuple[str, str], list[Recorded]] = {(rack, mode): [] for rack in racks for mode in MODES}
+    with TemporaryDirectory(prefix="rack-bench-") as scratch:
+        for turn in range(rounds):
+            for rack in racks if turn % 2 == 0 else reversed(racks):
+                for mode in MODES:
+                    progress.begin(f"{rack}: {mode}, run {turn + 1} of {rounds}")
+                    ran = _run(rack, mode, Path(scratch) / f"{rack}-{turn}.{mode}", share)
+                    found[rack, mode].append(ran)
+                    progress.end(ABOUT_S + LAUNCH_S, "done" if ran.result.worked else ran.result.failure())
+        return HandBench(tuple(_figures(rack, mode, ran) for (rack, mode), ran in found.items()))
+
+
+def _run(rack: str, mode: str, folder: Path, share: bool) -> Recorded:
+    config = load(rack, [f"name=hand-{os.getpid()}", f"clock.mode={mode}", "clock.speed=1.0"])
+    return record(config, None, folder, share)
+
+
+def _figures(rack: str, mode: str, runs: Sequence[Recorded]) -> HandFigures:
+    shifts = [shift for ran in runs if (shift := shift_mm(ran.recording)) is not None]
+    misses = [counts(rows) for ran in runs for rows in ran.recording.cycles.values()]
+    costs = np.array([_costs_ms(ran.recording) for ran in runs]).max(axis=0)
+    return HandFigures(
+        rack=rack,
+        mode=mode,
+        rounds=len(runs),
+        links=tuple(_links([ran.recording for ran in runs])),
+        shift_mm=max((most for most, _ in shifts), default=None),
+        left_mm=max((left for _, left in shifts), default=None),
+        exchange_ms=float(costs[0]),
+        process_ms=float(costs[1]),
+        handler_ms=float(costs[2]),
+        missed=sum(map(sum, misses)),
+        cycles=sum(len(rows) for ran in runs for rows in ran.recording.cycles.values()),
+        digests=tuple(ran.result.outcome.digest for ran in runs),
+        failure="; ".join(ran.result.failure() for ran in runs if not ran.result.worked),
+    )
+
+
+def shift_mm(recording: Recording) -> tuple[float, float] | None:
+    """Return how far the pulls move the object, and how far it is from its place after the last one, mm.
+
+    None if it is not held in all that time.
+    """
+    config, clock_s = recording.rack_config, recording.layout.clock_ns * 1e-9
+    pulls, ending = config.scene.push, next(name for name, board in config.board.items() if board.ends_run)
+    begin, end = min(pull.at for pull in pulls), max(pull.at + pull.seconds for pull in pulls) + SETTLED_S
+    held = recording.signal(f"{ending}.status", "kind") == GraspKind.HOLD
+    times = recording.signal(f"{ending}.status", "tick") * clock_s
+    if not held[(times >= begin) & (times <= end)].all() or times[-1] < end:
+        return None
+    scene = next(box.name for box in recording.layout.mailboxes if box.message == "scene")
+    times, row = recording.signal(scene, "tick") * clock_s, config.scene.objects.index(pulls[0].body)
+    place = recording.signal(scene, "position")[:, row]
+    before = place[times < begin][-1]
+    away = 1e3 * np.sqrt(((place[(times >= begin) & (times <= end)] - before) ** 2).sum(axis=1))
+    return float(away.max()), float(away[-1])
+
+
+def _costs_ms(recording: Recording) -> tuple[float, float, float]:
+    """Return the processor times of all boards for messages, for the rest, and of interrupts by their cost model.
+
+    They are ms in a second of simulated time.
+    """
+    found, layout = cycles_of(recording), recording.layout
+    exchanged = sum(float(cycles.communication_ns.sum()) for cycles in found.values())
+    processed = sum(float(cycles.process_ns.sum()) for cycles in found.values())
+    service_ns = {box.name: box.interrupt.service_ns for box in layout.mailboxes if box.interrupt is not None}
+    served = (one for board in interrupts(recording) for one in board["mailboxes"])
+    handled = sum(one["served"] * service_ns[one["mailbox"]] for one in served)
+    ticks = max(int(cycles.rows["tick"][-1]) for cycles in found.values())
+    per_s = 1e-6 / (ticks * layout.clock_ns * 1e-9)
+    return exchanged * per_s, processed * per_s, handled * per_s
+
+
+def _links(runs: Sequence[Recording]) -> Iterator[LinkFigures]:
+    """Yield the links of a rack; mailboxes of one message type from or to several boards that do the same are one."""
+    groups: dict[tuple[str, str, str], list[ExchangeTimes]] = {}
+    periods = {box.name: box.every for run in runs for box in run.layout.mailboxes}
+    for run in runs:
+        doing = {name: board.executor for name, board in run.rack_config.board.items()}
+        types = {box.name: box.message for box in run.layout.mailboxes}
+        tick_ms = run.layout.clock_ns * 1e-6
+        for times in exchange_times(run):
+            if times.writer in doing and times.reader in doing and times.writer != times.reader:
+                key = types[times.mailbox], doing[times.writer], doing[times.reader]
+                groups.setdefault(key, []).append(times)
+    for (message, _, _), alike in groups.items():
+        yield LinkFigures(
+            message=message,
+            writers=spanned(list(dict.fromkeys(times.writer for times in alike))),
+            readers=spanned(list(dict.fromkeys(times.reader for times in alike))),
+            protocol=alike[0].protocol,
+            period_ms=periods[alike[0].mailbox] * tick_ms,
+            jitter_p50_ms=_most(alike, "jitter_ms", "p50"),
+            jitter_max_ms=_most(alike, "jitter_ms", "max"),
+            age_p50_ms=_most(alike, "age_ms", "p50"),
+            age_max_ms=_most(alike, "age_ms", "max"),
+            sent=sum(times.sent for times in alike),
+            lost=sum(times.lost for times in alike),
+            overtaken=sum(times.overtaken for times in alike),
+        )
+
+
+def _most(alike: Sequence[ExchangeTimes], what: str, key: str) -> float | None:
+    found = [getattr(times, what) for times in alike]
+    return max((one[key] for one in found if one is not None), default=None)

@@ -1,0 +1,175 @@
+"""All processes of one contestant of `rack bench lan`: started, measured in windows, disturbed."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from subprocess import PIPE
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import Any, Self
+
+from rack.backplane.process import readable
+from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.lan_ends import COORDINATOR, LanPlace, rack_name
+from rack.tools.lab.benches.lan_machine import ANSWER_S, FIND_S, TLS, LanFound, LanTask, LanWindow
+from rack.tools.lab.benches.network import Lab
+
+HEAD_START_NS = 300_000_000
+"""Time from the order to measure to the first cycle."""
+REACT_S = 15.0
+"""Longest wait for a death or a return to be seen."""
+
+
+class Group:
+    """The processes of one contestant, one on each machine of a lab. Raises `Failure` if one does not do its part.
+
+    `false_deaths`: machines that the coordinator saw lost while nobody disturbed them.
+    """
+
+    def __init__(self, lab: Lab, who: str, echoes: bool, priority: int) -> None:
+        self.lab, self.who, self.racks = lab, who, len(lab) - 1
+        addresses = tuple(lab.address(machine) for machine in range(len(lab)))
+        self._folder = TemporaryDirectory(prefix="rack-bench-")
+        certificates = self._certificates(addresses) if who == TLS else ""
+        places = [LanPlace(machine, addresses, certificates) for machine in range(len(lab))]
+        self._tasks = [LanTask(who, place, echoes, priority) for place in places]
+        self._members: list[_Member] = []
+        self.false_deaths = 0
+
+    def _certificates(self, addresses: Sequence[str]) -> str:
+        from rack.tools.network.certificates import make_credentials
+
+        names = {rack_name(machine): [address] for machine, address in enumerate(addresses)}
+        make_credentials(Path(self._folder.name), names, days=1)
+        return self._folder.name
+
+    def __enter__(self) -> Self:
+        try:
+            for task in self._tasks:
+                self._members.append(_Member(self.lab, task))
+            for member in self._members:
+                member.found(FIND_S + len(self.lab))
+        except BaseException:
+            self._end()
+            raise
+        self._coordinator.notices.clear()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        for member in self._members:
+            member.end()
+        self._folder.cleanup()
+
+    @property
+    def _coordinator(self) -> _Member:
+        return self._members[COORDINATOR]
+
+    def run(self, rate_hz: float, cycles: int) -> list[LanFound]:
+        """Measure on all machines at a rate; return what each has found."""
+        self.begin(rate_hz, cycles)
+        bound_s = HEAD_START_NS * 1e-9 + (cycles + 1) / rate_hz + ANSWER_S + FIND_S
+        found = [LanFound(**member.found(bound_s)) for member in self._members]
+        self._note_deaths()
+        return found
+
+    def begin(self, rate_hz: float, cycles: int) -> None:
+        """Let all machines exchange at a rate, without waiting for their end."""
+        window = LanWindow(time.monotonic_ns() + HEAD_START_NS, round(1e9 / rate_hz), cycles)
+        for member in self._members:
+            member.order(window)
+
+    def idle(self, seconds: float) -> None:
+        """Let so much time pass, in which nobody is to be lost."""
+        self._coordinator.await_notice(lambda notice: False, seconds)
+        self._note_deaths()
+
+    def _note_deaths(self) -> None:
+        self.false_deaths += sum(not notice["is_there"] for notice in self._coordinator.notices)
+        self._coordinator.notices.clear()
+
+    def pull_cable(self, machine: int) -> tuple[float, float]:
+        """Pull a machine's cable until it is lost, then plug it in; return the times to see either, ms."""
+        lost_ms = self._seen(machine, False, lambda: self.lab.unplug(machine))
+        return lost_ms, self._seen(machine, True, lambda: self.lab.plug(machine))
+
+    def kill(self, machine: int) -> float:
+        """Kill a machine's process; return the time to see it, ms."""
+        return self._seen(machine, False, self._members[machine].process.kill)
+
+    def _seen(self, machine: int, is_there: bool, act: Callable[[], None]) -> float:
+        start_ns = time.monotonic_ns()
+        act()
+        notice = self._coordinator.await_notice(
+            lambda notice: notice["machine"] == machine and notice["is_there"] == is_there, REACT_S
+        )
+        if notice is None:
+            what = "back" if is_there else "lost"
+            raise Failure(f"{self.who}: machine {machine} of {self.racks} is not seen {what} within {REACT_S:g} s")
+        return float(notice["ns"] - start_ns) * 1e-6
+
+
+class _Member:
+    """One process of a group."""
+
+    def __init__(self, lab: Lab, task: LanTask) -> None:
+        self._name = f"{task.who}, machine {task.place.machine}"
+        self._errors = TemporaryFile()  # noqa: SIM115  # closed when the process ends
+        argv = [sys.executable, "-m", "rack.tools.lab.benches.lan_machine", json.dumps(asdict(task))]
+        self.process = lab.popen(task.place.machine, argv, stdin=PIPE, stdout=PIPE, stderr=self._errors)
+        self._unread = b""
+        self.notices: list[dict[str, Any]] = []
+
+    def order(self, window: LanWindow) -> None:
+        """Let it measure a window."""
+        assert self.process.stdin is not None
+        self.process.stdin.write((json.dumps(asdict(window)) + "\n").encode())
+        self.process.stdin.flush()
+
+    def found(self, bound_s: float) -> Any:
+        """Return what it has found. Notices that come before that are kept."""
+        for document in self._documents(bound_s):
+            if "found" in document:
+                return document["found"]
+            self.notices.append(document)
+        raise Failure(f"{self._name}: no answer within {bound_s:g} s")
+
+    def await_notice(self, is_it: Callable[[dict[str, Any]], bool], bound_s: float) -> dict[str, Any] | None:
+        """Return the first notice that fits; None if there is none in time. Others are kept."""
+        for document in self._documents(bound_s):
+            if is_it(document):
+                return document
+            self.notices.append(document)
+        return None
+
+    def _documents(self, bound_s: float) -> Iterator[dict[str, Any]]:
+        assert self.process.stdout is not None
+        out, deadline = self.process.stdout.fileno(), time.monotonic() + bound_s
+        while True:
+            line, newline, rest = self._unread.partition(b"\n")
+            if newline:
+                self._unread = rest
+                yield json.loads(line)
+            elif not readable(out, deadline - time.monotonic()):
+                return
+            elif more := os.read(out, 65536):
+                self._unread += more
+            else:
+                self._errors.seek(0)
+                said = self._errors.read().decode(errors="replace").strip().splitlines() or ["it says nothing"]
+                raise Failure(f"{self._name}: ended: {said[-1]}")
+
+    def end(self) -> None:
+        """Kill it."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout, self._errors):
+            assert pipe is not None
+            pipe.close()

@@ -1,0 +1,172 @@
+"""How fast racks run in lockstep: next to the same levels in one process without a rack, and to another checkout.
+
+The limit is honest only if it is the same work: once, its last messages and their numbers are compared with those of a
+recorded run. It counts processor time, which nothing else on the machine prolongs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from rack.boards.config import load, resolve
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.console.tables import table
+from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.bare import BareRun, run_bare
+from rack.tools.lab.benches.checkout import RackCommand, both_racks, this_rack
+from rack.tools.lab.benches.comparison import Comparison, Sample, shown, turns
+from rack.tools.recording.recording import Recording
+
+RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
+"""The racks, and the simulated seconds of a run; None: until the task ends."""
+BARE = "no rack"
+EXPECTED_S = 10.0
+"""About how long a run takes."""
+BOUND_S = 600.0
+
+
+@dataclass(frozen=True)
+class LockstepSpeeds:
+    """The time that a simulated second takes, by rack and contestant."""
+
+    comparison: Comparison
+
+    @property
+    def speeds(self) -> Mapping[tuple[str, str], float]:
+        """Simulated seconds a second, by rack and contestant: of the median."""
+        return {(_rack(one.case), one.who): 1e3 / one.median for one in self.comparison.samples}
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        speeds = [{"rack": rack, "who": who, "value": value} for (rack, who), value in self.speeds.items()]
+        return {**self.comparison.document(), "simulated_seconds_a_second": speeds}
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield both tables for people, fitted to `width`."""
+        who = list(dict.fromkeys(who for _, who in self.speeds))
+        racks = list(dict.fromkeys(rack for rack, _ in self.speeds))
+        rows = [
+            [rack, *(shown(self.speeds[rack, one]) if (rack, one) in self.speeds else "-" for one in who)]
+            for rack in racks
+        ]
+        yield "Simulated seconds a second in lockstep"
+        yield from table(["rack", *who], rows, width)
+        yield ""
+        yield from self.comparison.lines(width)
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write lockstep.png and lockstep.svg into `folder`; return their paths."""
+        return self.comparison.plot(folder)
+
+
+def measure(against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress) -> LockstepSpeeds:
+    """Run every rack, its levels without a rack, and another checkout's, by turns; times in ms a simulated second.
+
+    Raises `Failure` if a run fails, or if the levels without a rack did other work.
+    """
+    with both_racks(against) as commands:
+        names = [command.name for command in commands]
+        progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
+        found: dict[tuple[str, str], list[float]] = {}
+        for rack, seconds in racks.items():
+            progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+            with TemporaryDirectory() as folder:
+                ticks = _check(rack, seconds, Path(folder) / "run")
+            progress.end(EXPECTED_S, "equal")
+            ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
+            ways[BARE] = partial(_run_bare, rack, ticks)
+            for turn, who in turns(list(ways), rounds):
+                progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
+                found.setdefault((rack, who), []).append(ways[who]())
+                progress.end(EXPECTED_S)
+    return speeds(found, names)
+
+
+def speeds(found: Mapping[tuple[str, str], list[float]], names: list[str]) -> LockstepSpeeds:
+    """Return the speeds from the times of runs, ms a simulated second; the last of two `names` is compared with."""
+    samples: list[Sample] = []
+    baselines: dict[str, str] = {}
+    for rack in dict.fromkeys(rack for rack, _ in found):
+        own = [Sample(rack, who, tuple(found[rack, who]), "ms") for who in (*names, BARE)]
+        if len(names) > 1:
+            samples += own[:-1]
+            baselines[rack] = names[-1]
+        samples += [replace(sample, case=_limit(rack)) for sample in own]
+        baselines[_limit(rack)] = BARE
+    title = "Time of a simulated second in lockstep"
+    return LockstepSpeeds(Comparison("lockstep", title, tuple(samples), baselines))
+
+
+def _limit(rack: str) -> str:
+    """Return the case in which a rack is compared with its levels alone."""
+    return f"{rack} and its limit"
+
+
+def _rack(case: str) -> str:
+    return case.removesuffix(_limit(""))
+
+
+def _run(command: RackCommand, rack: str, seconds: float | None) -> float:
+    document = json.loads(command.run(*_arguments(rack, seconds), "--no-record", "--json", bound_s=BOUND_S))
+    return _ms_a_second(rack, document["outcome"]["ticks"], document["wall_s"])
+
+
+def _arguments(rack: str, seconds: float | None) -> list[str]:
+    until = [] if seconds is None else ["--seconds", str(seconds)]
+    return ["run", rack, "--lockstep", "--set", f"name=bench-{os.getpid()}", *until]
+
+
+def _run_bare(rack: str, ticks: int) -> float:
+    return _ms_a_second(rack, ticks, _bare(rack, ticks).processor_s)
+
+
+def _ms_a_second(rack: str, ticks: int, took_s: float) -> float:
+    return took_s * 1e12 / (ticks * load(rack).clock_ns)
+
+
+def _bare(rack: str, ticks: int) -> BareRun:
+    resolved = resolve(load(rack, ["clock.mode=lockstep"]))
+    return apart(run_bare, resolved.layout, resolved.tasks, ticks)
+
+
+def _check(rack: str, seconds: float | None, folder: Path) -> int:
+    """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran for."""
+    this_rack().run(*_arguments(rack, seconds), "--out", str(folder), bound_s=BOUND_S)
+    recording = Recording(folder)
+    ticks = int(recording.ended["outcome"]["ticks"])
+    differing = list(differences(recording, _bare(rack, ticks)))
+    if differing:
+        raise Failure(f"{rack}: its levels without a rack did other work, first seen in {differing[0]}")
+    return ticks
+
+
+def differences(recording: Recording, bare: BareRun) -> Iterator[str]:
+    """Yield every mailbox, or field of a message, in which a recorded run and its levels alone differ.
+
+    The message of each mailbox is the newest that was visible before the end. A later one need not be recorded.
+    """
+    for name in sorted({*recording.mailboxes, *bare.serials}):
+        seen = np.flatnonzero(recording.signal(name, "visible_at") < bare.ticks)
+        serial = recording.signal(name, "serial")[seen[-1]] if len(seen) else None
+        if serial != bare.serials.get(name):
+            yield f"the number of messages in {name}"
+        elif serial is not None:
+            last = bare.last[name]
+            for field in sorted(recording.fields(name) & set(last.dtype.names or ())):
+                if not np.array_equal(_plain(recording.signal(name, field)[seen[-1]]), _plain(last[field])):
+                    yield f"{name}, field {field}"
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of a message; text as the recorder stores it."""
+    return value.decode("ascii", "replace") if isinstance(value, bytes) else value

@@ -1,0 +1,191 @@
+"""A message, written and read: every protocol of ours next to other ways of the same machine.
+
+Each turn numbers a message, sends it, and lets every reader receive it into fields of its own. Filling and taking the
+fields costs every contestant the same, and is left out. All happens in one process: what is compared is the work, not
+the wake-up of another process.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from rack.backplane import semaphores
+from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec, Protocol, TaskSpec
+from rack.backplane.mailbox.interrupt import open_inbox
+from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.protocols import open_reader, open_writer
+from rack.backplane.message import Field, Message, command
+from rack.backplane.segment import Segment, unlink
+from rack.boards.config.layout import field_specs
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.comparison import Absent, Comparison, Sample, absent_package, interleaved
+from rack.tools.lab.benches.transports import PEERS, REFERENCES, Peer, Transport
+
+SIZES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
+"""Bytes of a message: a serial, and three arrays of numbers."""
+READERS = (1, 4)
+BATCH_S = 0.001
+"""About how long one measurement takes: many exchanges, and their mean. Short: most end without an interruption."""
+CASE_S = 5.0
+"""About how long a case takes."""
+MESSAGE = command(
+    "bench",
+    1,
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("torque", "f8", "N m", "joint torques", ("rest",)),
+)
+
+
+class Case(NamedTuple):
+    """A message size and a number of readers."""
+
+    size: str
+    readers: int
+
+    @property
+    def name(self) -> str:
+        """The case, in words."""
+        return f"{self.size}, {self.readers} reader{'s' if self.readers > 1 else ''}"
+
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Lengths of the arrays that fill the message."""
+        numbers = SIZES[self.size] // 8 - 1
+        return {"joints": numbers // 3, "rest": numbers - 2 * (numbers // 3)}
+
+
+CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
+
+
+def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
+    """Measure every contestant that is installed in every case; the baseline of a case is its best peer."""
+    missing = {peer.name: absent_package(peer.name, peer.module) for peer in (*REFERENCES, *PEERS)}
+    present = [peer for peer in (*REFERENCES, *PEERS) if missing[peer.name] is None]
+    progress.total(CASE_S * len(cases))
+    samples: list[Sample] = []
+    for case in cases:
+        progress.begin(case.name)
+        samples += _measure_case(case, present, rounds)
+        progress.end(CASE_S)
+    absent = tuple(one for one in missing.values() if one is not None)
+    return compare(samples, absent)
+
+
+def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison:
+    """Return the comparison of these samples with the best peer of each case."""
+    peers = {peer.name for peer in PEERS}
+    best: dict[str, Sample] = {}
+    for sample in samples:
+        if sample.who in peers and (sample.case not in best or sample.median < best[sample.case].median):
+            best[sample.case] = sample
+    baselines = {case: sample.who for case, sample in best.items()}
+    title = "A message written and read; ratio to the best peer of the case"
+    return Comparison("mailbox", title, tuple(samples), baselines, absent)
+
+
+def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:
+    dtype = MESSAGE.dtype(case.lengths)
+    with ExitStack() as stack:
+        transports: dict[str, Transport] = {p: stack.enter_context(_mailbox(p, case)) for p in PROTOCOLS}
+        transports |= {peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers}
+        turns = {name: Exchange(name, transport, case.lengths).batch() for name, transport in transports.items()}
+        found = interleaved(turns, rounds)
+    return [Sample(case.name, name, tuple(values), "us") for name, values in found.items()]
+
+
+class Exchange:
+    """One message after another through a transport. Raises `Failure` if a reader receives another message."""
+
+    def __init__(self, name: str, transport: Transport, lengths: dict[str, int]) -> None:
+        self._name, self._transport, self._tick = name, transport, 0
+        message, _, _ = transport
+        for name, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
+            setattr(message, name, np.linspace(-9.0, 9.0, lengths[length]))
+
+    def batch(self) -> Callable[[], float]:
+        """Return a function that makes many exchanges, and returns the us that each took."""
+        self._measure(20)
+        self._check()
+        calls = max(10, int(BATCH_S * 1e6 / self._measure(20)))
+        return partial(self._measure, calls)
+
+    def _measure(self, calls: int) -> float:
+        message, send, readers = self._transport
+        start_ns = time.perf_counter_ns()
+        for tick in range(self._tick + 1, self._tick + calls + 1):
+            message.id = tick
+            send(tick)
+            for read in readers:
+                read(tick)
+        taken_ns = time.perf_counter_ns() - start_ns
+        self._tick += calls
+        return taken_ns / calls * 1e-3
+
+    def _check(self) -> None:
+        """Exchange one message more, and compare what every reader receives with what was sent."""
+        message, send, readers = self._transport
+        self._tick += 1
+        message.id = self._tick
+        message.torque[:] = self._tick
+        sent = bytes(message.raw)
+        send(self._tick)
+        if any(bytes(read(self._tick).raw) != sent for read in readers):
+            raise Failure(f"{self._name}: a reader received another message than the one sent")
+
+
+@contextmanager
+def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
+    """Give a mailbox of ours, in a segment of its own."""
+    rack = f"bench-{os.getpid()}-{protocol}"
+    layout = _layout(rack, protocol, case)
+    with ExitStack() as names:
+        # Before they exist: an interrupt may come at any time.
+        names.callback(unlink, rack)
+        names.callback(semaphores.unlink, layout)
+        segment = Segment.create(layout, "")
+        semaphores.create(layout)
+        (box,) = layout.mailboxes
+        writer = open_writer(segment, box.name)
+        readers = [_reading(open_reader(segment, box.name, inbox=open_inbox(segment, task))) for task in box.readers]
+    # Open, it needs no name: nothing is left even if this process is killed.
+    yield Transport(writer.message, writer.write, readers)
+
+
+def _reading(reader: Reader) -> Callable[[int], Message]:
+    read, delay = reader.read, reader.spec.delay
+
+    def take(tick: int) -> Message:
+        return read(tick + delay).value
+
+    return take
+
+
+def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
+    readers = tuple(f"reader{number}" for number in range(case.readers))
+    tasks = tuple(TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers)))
+    # Each reader is alone with its inbox: every message is served before the next one is sent.
+    interrupt = InterruptSpec(1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:]))
+    box = MailboxSpec(
+        name="writer.command",
+        writer="writer",
+        readers=readers,
+        protocol=protocol,
+        every=1,
+        delay=1,
+        depth=64,
+        message=MESSAGE.name,
+        version=MESSAGE.version,
+        size=MESSAGE.dtype(case.lengths).itemsize,
+        fields=field_specs(MESSAGE, case.lengths),
+        interrupt=interrupt if protocol == "interrupt" else None,
+    )
+    return Layout(rack, 2_500_000, tasks, (box,))

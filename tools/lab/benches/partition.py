@@ -1,0 +1,199 @@
+"""Compares partitions of levels over processors: the same rack, run in real time in each, rounds interleaved."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rack.backplane.layout import Layout, TaskSpec
+from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
+from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
+from rack.levels.timing.response_time import response_times
+from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.console.tables import figure, table
+from rack.tools.lab.benches.observed import record
+from rack.tools.recording.recording import Recording
+
+LAUNCH_S = 3.0
+"""About how long launching and recording a run take in addition to its time."""
+PLANNERS_DROPPED = ("plans", "residual p50", "age p50")
+"""Columns that a narrow terminal leaves out, in this order."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """One way of placing levels on processors. A board keeps its core, modulo `cores`."""
+
+    coupling: Coupling
+    cores: int
+
+    @property
+    def name(self) -> str:
+        """The partition, in words."""
+        return f"{self.coupling}, {self.cores} core{'s' if self.cores > 1 else ''}"
+
+    def of(self, config: RackConfig) -> RackConfig:
+        """Return the rack in this partition, in real time. Raises `ConfigError` if the rack does not permit it.
+
+        A loose planner gets its own board on the next core; with only one core, on the same one.
+        """
+        taken = {board.slot for board in config.board.values()}
+        free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
+        boards = {name: self._board(board, free) for name, board in config.board.items()}
+        clock = config.clock.model_copy(update={"mode": "realtime", "core": config.clock.core % self.cores})
+        changed = config.model_copy(update={"board": boards, "clock": clock})
+        # A copy is not validated: load and check it like a user's config.
+        return resolve(loads(changed.text())).config
+
+    def _board(self, board: BoardConfig, free: Iterator[int]) -> BoardConfig:
+        core = board.core % self.cores
+        changes: dict[str, object] = {"core": core, "planner_slot": None, "planner_core": None}
+        if board.planner is not None:
+            changes["coupling"] = self.coupling
+        if board.planner is not None and self.coupling == "loose":
+            slot = next(free, None)
+            if slot is None:
+                raise Failure(f"the crate has no slot left for every planner: slots go up to {LAST_SLOT}")
+            changes |= {"planner_slot": slot, "planner_core": (core + 1) % self.cores}
+        return board.model_copy(update=changes)
+
+
+PARTITIONS: tuple[Partition, ...] = tuple(Partition(c, n) for n in (1, 2) for c in ("tight", "loose"))
+
+
+@dataclass(frozen=True)
+class TaskFigures:
+    """One task over all runs of a partition: cycles (a planner's plans), misses, and the rest of its time slice.
+
+    `predicted_ms` is the worst-case response time by the config's budgets, None without a bound. `fits` says whether it
+    is within the time slice, None without a budget.
+    """
+
+    slice_ms: float
+    cycles: int
+    missed: int
+    skipped: int
+    residual_ms: Distribution | None
+    predicted_ms: float | None
+    fits: bool | None
+
+
+@dataclass(frozen=True)
+class LevelFigures:
+    """One level in one partition. `plan_age_ms` is the age of the plans that its executor could read."""
+
+    level: str
+    executor: TaskFigures
+    planner: TaskFigures | None
+    plan_age_ms: Distribution | None
+
+
+@dataclass(frozen=True)
+class PartitionFigures:
+    """The measurements of one partition."""
+
+    partition: str
+    levels: tuple[LevelFigures, ...]
+
+
+def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[PartitionFigures]:
+    """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return the figures."""
+    config = load(name, [f"name=bench-{os.getpid()}"])
+    racks = {partition: partition.of(config) for partition in PARTITIONS}
+    progress.total(len(racks) * rounds * (seconds + LAUNCH_S))
+    with tempfile.TemporaryDirectory() as folder:
+        runs: dict[Partition, list[Recording]] = {partition: [] for partition in racks}
+        for turn in range(rounds):
+            for number, (partition, rack) in enumerate(racks.items()):
+                progress.begin(f"{partition.name}, run {turn + 1} of {rounds}")
+                runs[partition].append(record(rack, seconds, Path(folder) / f"{number}-{turn}").recording)
+                progress.end(seconds + LAUNCH_S)
+        return [_figures(partition, racks[partition], found) for partition, found in runs.items()]
+
+
+def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]) -> PartitionFigures:
+    layout = wire(config)
+    rack = rack_timing(config, layout)
+    responses = response_times(rack.tasks, rack.context_switch_ns)
+    return PartitionFigures(partition.name, tuple(_level(name, layout, responses, runs) for name in config.board))
+
+
+def _level(board: str, layout: Layout, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> LevelFigures:
+    tasks = {task.name: task for task in layout.tasks}
+    planner, plan = tasks.get(f"{board}.planner"), f"{board}.plan"
+    ages = [_ages_ms(board, plan, layout, run) for run in runs if plan in run.mailboxes]
+    return LevelFigures(
+        level=board,
+        executor=_task(tasks[board], layout.clock_ns, responses, runs),
+        planner=None if planner is None else _task(planner, layout.clock_ns, responses, runs),
+        plan_age_ms=distribution(np.concatenate(ages)) if ages else None,
+    )
+
+
+def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarray:
+    made, visible_at = run.signal(plan, "tick"), run.signal(plan, "visible_at")
+    return plan_ages(run.cycles[board]["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
+
+
+def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> TaskFigures:
+    cycles = np.concatenate([run.trace(task.name) for run in runs])
+    # Releases without a plan are traced only if they were late; of them only the skipped releases count.
+    _, skipped = counts(cycles)
+    cycles = plans(cycles) if task.role == "planner" else cycles
+    missed, _ = counts(cycles)
+    slice_ns = task.every * task.within_cycles * tick_ns
+    predicted_ns = responses.get(task.name)
+    return TaskFigures(
+        slice_ms=slice_ns * 1e-6,
+        cycles=len(cycles),
+        missed=missed,
+        skipped=skipped,
+        residual_ms=distribution(residual_ns(cycles, slice_ns) * 1e-6),
+        predicted_ms=None if predicted_ns is None else predicted_ns * 1e-6,
+        fits=predicted_ns is not None and predicted_ns <= slice_ns if task.name in responses else None,
+    )
+
+
+def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Iterator[str]:
+    """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages; times in ms."""
+    levels = [(one.partition, level) for one in found for level in one.levels]
+    planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
+    yield "executors: predicted worst-case response, and residual, ms"
+    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "residual p50", "residual min"]
+    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50"))
+    yield ""
+    yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
+    head = ["partition", "level", "slice", "predicted", "plans", "late", "residual p50", "residual min"]
+    yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
+
+
+def _executor_row(partition: str, level: LevelFigures) -> list[str]:
+    executor = level.executor
+    counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
+    return [partition, level.level, *_prediction(executor), *counts, *_cells(executor.residual_ms, "p50", "min")]
+
+
+def _planner_row(partition: str, level: LevelFigures) -> list[str]:
+    planner = level.planner
+    assert planner is not None, "levels without a planner have no such row"
+    row = [partition, level.level, *_prediction(planner), str(planner.cycles), str(planner.missed)]
+    return [*row, *_cells(planner.residual_ms, "p50", "min"), *_cells(level.plan_age_ms, "p50", "max")]
+
+
+def _prediction(task: TaskFigures) -> list[str]:
+    """Return the time slice, and the predicted response."""
+    if task.fits is None:
+        return [f"{task.slice_ms:g}", "-"]
+    response = "no bound" if task.predicted_ms is None else f"{task.predicted_ms:.2f}"
+    return [f"{task.slice_ms:g}", response if task.fits else f"{response} FAILS"]
+
+
+def _cells(found: Distribution | None, *names: str) -> list[str]:
+    return [figure(found, name, 2) for name in names]

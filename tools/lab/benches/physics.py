@@ -1,0 +1,141 @@
+"""The physics of a recorded run alone: bare `mj_step` calls with the torques that the servo level gave.
+
+They are the part of a servo cycle that no controller can leave out, so the cycle is compared with them. The replay must
+end in the recorded state, bit for bit: otherwise it was other work.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from rack.backplane.process import pin, set_priority
+from rack.levels.robot.cell import STATE, Cell, build_cell
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recording import Recording
+
+SERVO = "servo"
+
+
+class ReplayPace(NamedTuple):
+    """How a replay runs: a tick every `period_ns` on `core` at a real-time `priority`; all 0: tick after tick."""
+
+    period_ns: int = 0
+    core: int = 0
+    priority: int = 0
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The longest stretch of a recorded run in which motors, not brakes, moved the arm.
+
+    `start` and `end` are MuJoCo's states before and after it; `controls` are the actuators' inputs by tick, shape
+    (ticks, nu).
+    """
+
+    cell: Cell
+    substeps: int
+    clock_ns: int
+    first_tick: int
+    start: np.ndarray
+    end: np.ndarray
+    controls: np.ndarray
+
+    @classmethod
+    def of(cls, recording: Recording) -> Replay:
+        """Take it from a recording without missed cycles. Raises `Failure` if the arm never moved in it."""
+        config = recording.rack_config
+        assert config.robot is not None, "the rack has an arm"
+        cell = build_cell(config.robot, config.scene, config.clock_ns)
+        first, last = _stretch(recording)
+        status, state = f"{SERVO}.status", f"{SERVO}.state"
+        ticks = recording.signal(status, "tick")
+        given = (ticks >= first) & (ticks < last)
+        controls = np.zeros((last - first, cell.model.nu))
+        controls[:, cell.actuators] = recording.signal(status, "torque")[given]
+        if cell.gripper_actuator is not None:
+            controls[:, cell.gripper_actuator] = recording.signal(status, "grip_force")[given]
+        states = dict(zip(recording.signal(state, "tick").tolist(), recording.signal(state, "state"), strict=True))
+        substeps = round(config.clock_ns * 1e-9 / cell.model.opt.timestep)
+        return cls(cell, substeps, config.clock_ns, first, states[first], states[last], controls)
+
+    def run(self, pace: ReplayPace, ticks: int) -> list[float]:
+        """Replay at most so many ticks; return the processor time of each, us.
+
+        Raises `Failure` if the whole stretch is replayed and does not end as recorded.
+        """
+        model, data = self.cell.model, mujoco.MjData(self.cell.model)
+        mujoco.mj_setState(model, data, self.start, STATE)
+        found: list[float] = []
+        with _scheduled(pace):
+            due_ns = time.monotonic_ns()
+            for number, control in enumerate(self.controls[:ticks], self.first_tick + 1):
+                due_ns += pace.period_ns
+                if pace.period_ns:
+                    time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+                data.ctrl[:] = control
+                start_ns = time.thread_time_ns()
+                for _ in range(self.substeps):
+                    mujoco.mj_step(model, data)
+                found.append((time.thread_time_ns() - start_ns) * 1e-3)
+                data.time = number * self.clock_ns * 1e-9
+        if len(found) == len(self.controls):
+            self._check(data)
+        return found
+
+    def _check(self, data: mujoco.MjData) -> None:
+        recorded = mujoco.MjData(self.cell.model)
+        mujoco.mj_setState(self.cell.model, recorded, self.end, STATE)
+        if not (np.array_equal(data.qpos, recorded.qpos) and np.array_equal(data.qvel, recorded.qvel)):
+            raise Failure("the replayed physics do not end in the recorded state: they are not what the servo ran")
+
+
+def replay(folder: Path, pace: ReplayPace, ticks: int) -> list[float]:
+    """Replay at most so many ticks of a recorded run; return the processor time of each, us.
+
+    To be called by `apart`: only in the environment of boards are the physics theirs. Raises `Failure` as `Replay`.
+    """
+    return Replay.of(Recording(folder)).run(pace, ticks)
+
+
+def _stretch(recording: Recording) -> tuple[int, int]:
+    """Return first and last tick of the longest stretch without brakes; states are recorded at both."""
+    status = f"{SERVO}.status"
+    ticks, braked = recording.signal(status, "tick"), recording.signal(status, "braked")
+    known = set(recording.signal(f"{SERVO}.state", "tick").tolist())
+    best, begun, ended = (0, 0), -1, -1
+    for tick, is_braked in zip(ticks.tolist(), braked.tolist(), strict=True):
+        if is_braked or (begun >= 0 and tick != ended + 1 and tick != begun):
+            begun = -1
+        if is_braked:
+            continue
+        if begun < 0 and tick in known:
+            begun = ended = tick
+        ended = tick
+        if begun >= 0 and tick in known and tick - begun > best[1] - best[0]:
+            best = begun, tick
+    if best[0] == best[1]:
+        raise Failure("the arm did not move in the recorded run: no physics to replay; run it for longer")
+    return best
+
+
+@contextmanager
+def _scheduled(pace: ReplayPace) -> Iterator[None]:
+    """Run as a board does: pinned, at its priority if that is permitted."""
+    cores = os.sched_getaffinity(0)
+    try:
+        if pace.priority:
+            pin(pace.core)
+            set_priority(pace.priority)
+        yield
+    finally:
+        set_priority(0)
+        os.sched_setaffinity(0, cores)

@@ -1,0 +1,212 @@
+"""The highest servo rate that a rack holds on this machine, by the deadlines that `cyclictest` keeps there.
+
+Only the servo level changes: the clock follows its rate, and every other board gets the cycle that is closest to its
+own. A machine that takes the core away for a cycle breaks deadlines that no program could keep: what `cyclictest` shows
+late by a cycle, at that rate on that core in the same minutes, does not count against the rack.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rack.boards.config import RackConfig, load
+from rack.boards.config.layout import obtained_core
+from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
+from rack.tools.console.answer import Failure
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.progress import Progress
+from rack.tools.console.tables import decimal, figure, table
+from rack.tools.lab.benches.comparison import Absent, turns
+from rack.tools.lab.benches.cyclictest import (
+    BEYOND,
+    CYCLICTEST,
+    MissesBeyond,
+    WakeGrid,
+    absent_cyclictest,
+    cyclictest,
+    overdue,
+)
+from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
+
+RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
+STEP_MS = 0.5
+"""Longest time step of the simulated arm, that of the bundled racks."""
+LAUNCH_S = 3.0
+RACK, PEER = "#4477aa", "#222222"
+Late = np.ndarray | None
+
+
+def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
+    """Return a rack whose fastest board cycles at `rate_hz`, at every tick; the others keep their cycles, in ms.
+
+    A plan of that board still takes as long. Raises `Failure` for a rack that has no board at every tick.
+    """
+    fastest = [name for name in config.board if config.every(name) == 1]
+    if not fastest:
+        raise Failure(f"rack '{config.name}': no board cycles at every tick of its clock, so none has a rate to raise")
+    period_ms = 1e3 / rate_hz
+    scale = config.clock.period_ms / period_ms
+    boards = {}
+    for name, board in config.board.items():
+        changes: dict[str, Any] = {"rate_hz": None, "every": max(1, round(config.every(name) * scale))}
+        if name in fastest:
+            changes = {"rate_hz": None, "every": 1, "within_cycles": max(1, round(board.within_cycles * scale))}
+        boards[name] = board.model_copy(update={**changes, "ends_run": False})
+    robot = config.robot
+    if robot is not None:
+        # Rounded: 2.5 ms / 0.5 ms must be 5, whatever the last bit says.
+        robot = robot.model_copy(update={"substeps": math.ceil(round(period_ms / STEP_MS, 6))})
+    clock = config.clock.model_copy(update={"period_ms": period_ms, "mode": "realtime", "speed": 1.0})
+    return config.model_copy(update={"clock": clock, "board": boards, "robot": robot})
+
+
+@dataclass(frozen=True)
+class RateFigures(MissesBeyond):
+    """All runs at one rate. Shares are of the fastest board's cycles; `late` is that of `cyclictest`'s wakes."""
+
+    rate_hz: float
+    cycles: int
+    missed: float  # share missed or skipped
+    late: float | None  # share late by a cycle or more; None: cyclictest is absent
+    lateness_us: Distribution | None
+    processor_us: float  # median of a cycle
+    failure: str  # why a run ended early; empty: none did
+
+    @property
+    def held(self) -> bool:
+        """Whether the rack holds this rate."""
+        return not self.failure and super().held
+
+    @property
+    def verdict(self) -> str:
+        """The same in a word, or why a run failed."""
+        return self.failure or ("held" if self.held else "not held")
+
+
+@dataclass(frozen=True)
+class Rates:
+    """The figures of every rate, lowest first; `absent` is the peer that this machine lacks."""
+
+    config: str
+    board: str
+    core: int
+    figures: tuple[RateFigures, ...]
+    absent: Absent | None
+
+    @property
+    def highest_held_hz(self) -> float | None:
+        """The highest rate that is held; None if none is."""
+        return max((one.rate_hz for one in self.figures if one.held), default=None)
+
+    @property
+    def title(self) -> str:
+        """What was measured, in a line."""
+        return f"{self.config}: rate of board '{self.board}' on core {self.core}"
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        rates = [{**asdict(one), "beyond": one.beyond, "held": one.held} for one in self.figures]
+        found = {"bench": "rate", "config": self.config, "board": self.board, "core": self.core, "rates": rates}
+        return {
+            **found,
+            "permitted_beyond": BEYOND,
+            "highest_held_hz": self.highest_held_hz,
+            "absent": [] if self.absent is None else [asdict(self.absent)],
+        }
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield the figures as a table for people, fitted to `width`, and the highest rate held."""
+        yield f"{self.title}; missed and late in % of its cycles"
+        head = ["rate, Hz", "cycles", "missed", "cyclictest late", "beyond", "late p50, us", "p99", "processor, us", ""]
+        yield from table(head, [self._row(one) for one in self.figures], width, ("cycles", "p99", "late p50, us"))
+        if self.absent is not None:
+            yield f"{self.absent.line}; every miss counts against the rack"
+        highest = self.highest_held_hz
+        bound = f"missed at most {BEYOND:.1%} beyond cyclictest"
+        yield f"highest rate held: {'none of these' if highest is None else f'{highest:g} Hz'} ({bound})"
+
+    @staticmethod
+    def _row(one: RateFigures) -> list[str]:
+        late = None if one.late is None else 100 * one.late
+        shares = [decimal(100 * one.missed), decimal(late), decimal(100 * one.beyond)]
+        late_us = [figure(one.lateness_us, name, 0) for name in ("p50", "p99")]
+        return [f"{one.rate_hz:g}", str(one.cycles), *shares, *late_us, decimal(one.processor_us, 0), one.verdict]
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write missed cycles and load by rate as PNG and SVG into `folder`; return their paths."""
+        from matplotlib.ticker import ScalarFormatter
+
+        rates = [one.rate_hz for one in self.figures]
+        paths = paths_of(folder / "rate")
+        with picture(paths, 6.4, 5.2, layout="constrained") as drawn:
+            shares, load = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+            shares.plot(rates, [100 * one.missed for one in self.figures], "o-", color=RACK, label="rack: missed")
+            if self.absent is None:
+                late = [100 * (one.late or 0.0) for one in self.figures]
+                shares.plot(rates, late, "s-", color=PEER, label="cyclictest: late by a cycle")
+                permitted = [share + 100 * BEYOND for share in late]
+                shares.plot(rates, permitted, ":", color=PEER, linewidth=0.8, label=f"{BEYOND:.1%} beyond it")
+            # Linear below the bound: 0 has its place.
+            shares.set_yscale("symlog", linthresh=100 * BEYOND)
+            shares.set_ylim(0, max(1.0, *(200 * one.missed for one in self.figures)))
+            shares.yaxis.set_major_formatter(ScalarFormatter())
+            shares.set_ylabel("% of the cycles")
+            shares.legend(frameon=False, loc="upper left")
+            parts = [one.processor_us * one.rate_hz * 1e-4 for one in self.figures]
+            load.plot(rates, parts, "o-", color=RACK)
+            load.axhline(100.0, color=PEER, linewidth=0.8, linestyle=":")
+            load.set_ylim(0, 1.1 * max(100.0, *parts))
+            load.set_ylabel("processor time of a\ncycle, % of its period")
+            load.set_xlabel("servo rate, Hz")
+            load.set_xticks(rates, [f"{rate:g}" for rate in rates])
+            for axes in (shares, load):
+                axes.grid(color="#bbccdd", linewidth=0.4)
+                axes.spines[["top", "right"]].set_visible(False)
+            drawn.suptitle(self.title, fontsize="medium")
+        return paths
+
+
+def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Rates:
+    """Run a rack at every rate, by turns with `cyclictest` on the core of its fastest board."""
+    config = load(name, [f"name=bench-{os.getpid()}"])
+    racks = {rate_hz: at_rate(config, rate_hz) for rate_hz in sorted(rates_hz)}
+    board = next(name for name in config.board if config.every(name) == 1)
+    core, absent = obtained_core(config.board[board].core), absent_cyclictest()
+    each_s = runs.rounds * (2 * runs.seconds + LAUNCH_S)
+    progress.total(len(racks) * each_s)
+    figures = []
+    for rate_hz, rack in racks.items():
+        progress.begin(f"{rate_hz:g} Hz")
+        priority = config.board[board].priority or 1
+        grid = WakeGrid((core,), round(1e9 / rate_hz), max(1, round(runs.seconds * rate_hz)), priority)
+        ran: list[Observed] = []
+        late: list[np.ndarray] = []
+        for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), runs.rounds):
+            if who == CYCLICTEST:
+                late.append(cyclictest(grid))
+            else:
+                ran.append(observe(rack, runs.seconds, runs.share))
+        figures.append(_figures(rate_hz, board, ran, np.concatenate(late) if late else None, grid.period_ns))
+        progress.end(each_s, figures[-1].verdict)
+    return Rates(name, board, core, tuple(figures), absent)
+
+
+def _figures(rate_hz: float, board: str, runs: Sequence[Observed], late_us: Late, period_ns: int) -> RateFigures:
+    settled = np.concatenate([run.settled(board) for run in runs])
+    ended = [run.outcome for run in runs if not run.outcome.worked]
+    return RateFigures(
+        rate_hz=rate_hz,
+        cycles=sum(run.cycles(board).due for run in runs),
+        missed=missed_share(run.cycles(board) for run in runs),
+        late=None if late_us is None else overdue(late_us, period_ns),
+        lateness_us=distribution(lateness_ns(settled) * 1e-3),
+        processor_us=float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0,
+        failure=f"{ended[0].cause}: {'; '.join(ended[0].faults) or ended[0].reason}" if ended else "",
+    )

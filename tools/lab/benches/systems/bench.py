@@ -1,0 +1,158 @@
+"""Racks compared with each other: what their configs promise, and what their runs show.
+
+Nothing is known of a rack in advance: levels, rates and bounds are read from its config, ages and responses from its
+messages, by what each of them rests on.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rack.boards.config import load, rack_timing, wire
+from rack.boards.config.files import CONFIGS, read
+from rack.boards.config.layout import obtained_core
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
+from rack.tools.lab.benches.observed import Runs, missed_share, record
+from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, Systems
+from rack.tools.lab.benches.systems.hold import held, hold_for
+from rack.tools.lab.benches.systems.kills import kill_each, kills_s
+from rack.tools.lab.benches.systems.motion import LONGEST_S, PosesBench, poses_config
+from rack.tools.lab.benches.systems.prediction import prediction
+from rack.tools.lab.benches.systems.realtime import ages_ms, board_loads, bus_traffic, cycles_in, plan_latencies
+from rack.tools.live.launch import RunResult
+from rack.tools.recording.cycles import cycles_of
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.analysis import core_loads
+from rack.tools.timing.measured_response import system_response
+
+LAUNCH_S = 3.0
+"""About how long launching and recording a run take in addition to its time."""
+LOCKSTEP_SPEED = 2.5
+"""Times real time, about, on two cores."""
+
+
+def systems() -> list[str]:
+    """Return the bundled racks to compare: the default rack, and those that have a folder of their own.
+
+    Racks of a network are not among them: they need others to work with.
+    """
+    found = sorted(path for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)
+    return ["nasrem", *(path.stem for path in found if "adapter" not in read(path))]
+
+
+def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
+    """Run every rack in real time and in lockstep, and `cyclictest` at the rate of its fastest boards, by turns.
+
+    Raises `ConfigError` for a config with mistakes, before any rack runs.
+    """
+    absent = absent_cyclictest()
+    racks = [_System(name, runs, is_compared=absent is None) for name in names]
+    progress.total(sum(rack.lasts_s for rack in racks))
+    figures = []
+    with TemporaryDirectory(prefix="rack-bench-") as scratch:
+        for number, rack in enumerate(racks):
+            figures.append(rack.measure(Path(scratch) / str(number), progress))
+    return Systems(tuple(figures), runs.seconds, absent)
+
+
+class _System:
+    """One rack, checked."""
+
+    def __init__(self, name: str, runs: Runs, is_compared: bool) -> None:
+        self._name, self._runs, self._is_compared = name, runs, is_compared
+        own = f"systems-{os.getpid()}"
+        self._lockstep = load(name, [f"name={own}", "clock.mode=lockstep", "clock.speed=1.0"])
+        self._config = load(name, [f"name={own}", "clock.mode=realtime", "clock.speed=1.0"])
+        self._layout = wire(self._config)
+        self._timing = rack_timing(self._config, self._layout)
+        self._hold = hold_for(self._config, self._timing, self._layout, runs.seconds)
+        poses = poses_config(name)
+        self._poses = None if poses is None else PosesBench(poses, own, runs.share)
+
+    @property
+    def lasts_s(self) -> float:
+        """About how long measuring takes."""
+        return sum(lasts_s for _, lasts_s in self._parts())
+
+    def _parts(self) -> Iterator[tuple[str, float]]:
+        """Yield what is done, and about how long each takes."""
+        yield "in real time", (1 + self._is_compared) * self._runs.seconds + LAUNCH_S
+        yield "killing each board", kills_s(self._layout) / LOCKSTEP_SPEED + LAUNCH_S
+        if self._poses is not None:
+            yield "three poses", 2.0 * LONGEST_S / LOCKSTEP_SPEED + 3 * LAUNCH_S
+
+    def measure(self, folder: Path, progress: Progress) -> SystemFigures:
+        """Run the rack, and return its figures."""
+        parts = dict(self._parts())
+        progress.begin(f"{self._name}: in real time")
+        realtime, failure = self._in_real_time(folder / "own")
+        progress.end(parts["in real time"], realtime.verdict)
+        progress.begin(f"{self._name}: killing each board")
+        kills = kill_each(self._lockstep, self._layout, self._runs.share)
+        progress.end(parts["killing each board"], kills.failure or kills.verdict)
+        poses, unmoved = None, ""
+        if self._poses is not None:
+            progress.begin(f"{self._name}: three poses")
+            try:
+                poses = self._poses.measure(folder / "poses")
+            except Failure as why:
+                unmoved = str(why)
+            progress.end(parts["three poses"], unmoved if poses is None else poses.verdict)
+        killed = kills.failure and f"killing each board: {kills.failure}"
+        failures = [text for text in (failure, killed, unmoved) if text]
+        return SystemFigures(
+            rack=Path(self._name).stem,
+            predicted=prediction(self._config, self._timing, self._layout),
+            realtime=realtime,
+            kills=kills,
+            poses=poses,
+            failure="; ".join(failures),
+        )
+
+    def _in_real_time(self, folder: Path) -> tuple[RealTimeFigures, str]:
+        commands = () if self._hold is None else (self._hold,)
+        config = self._config.model_copy(update={"command": (*self._config.command, *commands)})
+        run, recording = record(config, self._runs.seconds, folder, self._runs.share)
+        late_us = cyclictest(self._grid()) if self._is_compared else None
+        late = None if late_us is None else overdue(late_us, self._grid().period_ns)
+        return self._figures(run, recording, late), "" if run.worked else run.failure()
+
+    @property
+    def _fastest(self) -> list[str]:
+        """The boards of the shortest cycle."""
+        cycles = {name: board.every for name, board in self._timing.boards.items()}
+        return [name for name, every in cycles.items() if every == min(cycles.values())]
+
+    def _grid(self) -> WakeGrid:
+        boards = [self._config.board[name] for name in self._fastest]
+        period_ns = self._timing.boards[self._fastest[0]].every * self._timing.tick_ns
+        return WakeGrid(
+            cores=tuple(sorted({obtained_core(board.core) for board in boards})),
+            period_ns=period_ns,
+            wakes=max(1, round(self._runs.seconds * 1e9 / period_ns)),
+            priority=max(*(board.priority for board in boards), 1),
+        )
+
+    def _figures(self, run: RunResult, recording: Recording, late: float | None) -> RealTimeFigures:
+        counts = [cycles_in(run, self._layout, name) for name in self._fastest]
+        cycles, response = cycles_of(recording), system_response(recording)
+        return RealTimeFigures(
+            missed=missed_share(counts),
+            late=late,
+            commanded="" if response is None else next(iter(response["command"]["levels"]), ""),
+            command_bound_ms=None if response is None else response["command"]["bound_ms"],
+            command_ms=None if response is None else response["command"]["measured_ms"],
+            status_ms=None if response is None else response["status"]["measured_ms"],
+            command_age_ms=ages_ms(recording, self._timing, down=True),
+            status_age_ms=ages_ms(recording, self._timing, down=False),
+            hold=None if self._hold is None else held(recording, self._hold),
+            plans=plan_latencies(recording, cycles),
+            bus=bus_traffic(run.tasks, run.outcome.ticks, self._layout),
+            loads=core_loads(recording, cycles, self._timing) if cycles else {},
+            board_loads=board_loads(recording, cycles, self._timing) if cycles else {},
+        )

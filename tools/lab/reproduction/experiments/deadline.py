@@ -1,0 +1,80 @@
+"""GOTO A, and GOTO A BY t: the same motion in soft time, by a time that is too early, and by one that can be met."""
+
+from __future__ import annotations
+
+from math import ceil
+
+from rack.boards.config import RackConfig, load
+from rack.tools.console.answer import Failure
+from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
+from rack.tools.recording.recording import Recording
+
+NAME = "nasrem"
+ABOVE_M = 0.12
+"""A is so far above the place to which the rack's own program takes its first object."""
+TOO_EARLY = 0.5
+"""Part of the time in soft time that is demanded first."""
+LASTS_S = 12.0
+
+
+def _run(workshop: Workshop) -> Document:
+    place = _place(load(NAME))
+    soft = _outcome(workshop, "goto", place, None)
+    early = _outcome(workshop, "goto-too-early", place, round(TOO_EARLY * soft["done_s"], 2))
+    if early["earliest_s"] is None:
+        raise Failure(f"goto by {early['by_s']:g} s was not refused; without a time it is done at {soft['done_s']:g} s")
+    met = _outcome(workshop, "goto-by", place, ceil(early["earliest_s"] * 10) / 10)
+    return {"place": place, "runs": [soft, early, met]}
+
+
+DEADLINE = Experiment(
+    "goto",
+    "goto in soft time, and by a time",
+    LASTS_S,
+    lambda: {"config": load(NAME).text(), "above": ABOVE_M, "too_early": TOO_EARLY},
+    _run,
+)
+
+
+def _place(config: RackConfig) -> list[float]:
+    """Return A: above the goal of the first object that the program moves."""
+    x, y, z = next(action["to"] for action in config.task["action"] if "to" in action)
+    return [x, y, round(z + ABOVE_M, 6)]
+
+
+def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | None) -> Document:
+    """Run GOTO A, then GOTO B, the start; return when A was reported done, or the refusal."""
+    by = "" if by_s is None else f", by = {by_s!r}"
+    program = f'task.action=[{{ do = "goto", position = {place}{by} }}, {{ do = "home" }}]'
+    recording = workshop.run(label, workshop.config(NAME, ["clock.mode=lockstep", program]), None)
+    outcome = recording.ended["outcome"]
+    return {
+        "run": label,
+        "by_s": by_s,
+        "done_s": _done_s(recording),
+        "earliest_s": _earliest_s(recording),
+        "moved": _has_moved(recording),
+        "cause": outcome["cause"],
+        "reason": outcome["reason"] or str(recording.signal("task.status", "reason")[-1]),
+        "ticks": outcome["ticks"],
+    }
+
+
+def _done_s(recording: Recording) -> float | None:
+    """Return the end of the cycle in which the task level reported A done, s; None: it never did."""
+    done, ticks = (recording.signal("task.status", name) for name in ("action", "visible_at"))
+    reported = ticks[done >= 1]
+    return float(reported[0]) * recording.layout.clock_ns * 1e-9 if len(reported) else None
+
+
+def _earliest_s(recording: Recording) -> float | None:
+    """Return the time that the planner offered instead, s; None: it did not refuse."""
+    if "task.plan" not in recording.mailboxes:
+        return None
+    earliest = recording.signal("task.plan", "earliest")
+    return next((float(time_s) for time_s in earliest if time_s > 0), None)
+
+
+def _has_moved(recording: Recording) -> bool:
+    moves = recording.signal("task.status", "moves_done")
+    return bool(len(moves)) and int(moves[-1]) > 0

@@ -1,0 +1,59 @@
+"""The same rack in lockstep and in real time: do all runs write the same messages?"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from rack.boards.config import load
+from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
+from rack.tools.recording.history import first_difference, misses
+from rack.tools.recording.recording import Recording
+
+NAME = "nasrem"
+SECONDS = 6.0
+"""Simulated time: the arm is on its way by then."""
+ATTEMPTS = 3
+"""Most runs in real time: one without a missed deadline is wanted."""
+LASTS_S = 2 * 3.0 + 2 * (SECONDS + 3.0)
+
+
+def _run(workshop: Workshop) -> Document:
+    first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
+    runs = [_outcome(first, None), _outcome(second, first)]
+    for attempt in range(1, ATTEMPTS + 1):
+        found = _outcome(_recorded(workshop, f"{NAME}-realtime-{attempt}", "realtime"), first)
+        runs.append(found)
+        if found["first_miss"] is None:
+            break
+    return {"seconds": SECONDS, "runs": runs}
+
+
+DETERMINISM = Experiment(
+    "determinism",
+    "nasrem twice in lockstep, then in real time",
+    LASTS_S,
+    lambda: {"config": load(NAME).text(), "seconds": SECONDS, "attempts": ATTEMPTS},
+    _run,
+)
+
+
+def _recorded(workshop: Workshop, label: str, mode: str) -> Recording:
+    return workshop.run(label, workshop.config(NAME, [f"clock.mode={mode}"]), SECONDS)
+
+
+def _outcome(recording: Recording, reference: Recording | None) -> Document:
+    """Return how a run ended, its first missed deadline, and where it diverges from the reference."""
+    ended, config = recording.ended, recording.rack_config
+    found = misses(recording)
+    difference = None if reference is None else first_difference(recording, reference)
+    return {
+        "run": recording.folder.name,
+        "mode": config.clock.mode,
+        "digest": ended["outcome"]["digest"],
+        "ticks": ended["outcome"]["ticks"],
+        "wall_s": ended["wall_s"],
+        "messages": sum(len(recording.signal(name, "serial")) for name in recording.mailboxes),
+        "missed": len(found),
+        "first_miss": min((miss["tick"] for miss in found), default=None),
+        "difference": None if difference is None else asdict(difference),
+    }

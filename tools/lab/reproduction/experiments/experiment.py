@@ -1,0 +1,192 @@
+"""Experiments, and the folder that keeps what they found.
+
+What an experiment found is kept as JSON with all that it depends on: its configs, its own settings, the program and the
+machine. It is made again only if one of these has changed, a picture is gone, or it was not finished: a file appears
+whole or not at all, so even a killed command continues where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import xxhash
+
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import racks
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.clean import remove_dead
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.lab.benches.cyclictest import permits_fifo
+from rack.tools.lab.benches.observed import record
+from rack.tools.recording.recording import Recording
+
+KEPT, RUNS, PICTURES = "parts", "runs", "pictures"
+"""In the folder: results of experiments, recordings of their runs, pictures."""
+PROGRAM = Path(__file__).resolve().parents[4]
+FLOORS = ("backplane", "levels", "boards", "tools", "configs")
+RACK = "reproduce"
+"""What the names of racks in shared memory begin with."""
+LIBRARIES = ("mujoco", "numpy", "numba", "ompl", "ruckig")
+
+Document = dict[str, Any]
+
+
+class Lacking(Failure):
+    """The machine lacks what an experiment needs: its claims cannot be tested here, which is no failure."""
+
+
+class Workshop:
+    """Where experiments work: the folder of the page. `share`: run on cores that another rack holds."""
+
+    def __init__(self, folder: Path, share: bool) -> None:
+        self.folder, self.share = folder, share
+
+    @property
+    def rack(self) -> str:
+        """The name of its racks in shared memory: one runs at a time."""
+        return f"{RACK}-{os.getpid()}"
+
+    def prepare(self) -> None:
+        """Make the folders, and remove racks that a killed command has left in shared memory."""
+        for name in (KEPT, RUNS, PICTURES):
+            (self.folder / name).mkdir(parents=True, exist_ok=True)
+        for rack in racks():
+            if rack.startswith(f"{RACK}-"):
+                # That of a command which is running is in use.
+                with suppress(SegmentError):
+                    remove_dead(rack)
+
+    def config(self, name: str, settings: Sequence[str] = (), faults: str | None = None) -> RackConfig:
+        """Return a config under a name of its own. Raises `ConfigError`."""
+        return load(name, [*settings, f"name={self.rack}"], faults)
+
+    def run(self, label: str, config: RackConfig, seconds: float | None) -> Recording:
+        """Run a rack and return its recording, which stays in the folder; one of an unfinished run is replaced."""
+        folder = self.folder / RUNS / label
+        shutil.rmtree(folder, ignore_errors=True)
+        return record(config, seconds, folder, self.share).recording
+
+    def picture(self, name: str) -> Path:
+        """Return the path of a picture without its suffix."""
+        return self.folder / PICTURES / name
+
+    def shown(self, paths: Sequence[Path]) -> str:
+        """Return a picture that was drawn, by its path within the folder; the page shows SVG, and needs no other."""
+        for path in paths:
+            if path.suffix != ".svg":
+                path.unlink()
+        return str(next(path for path in paths if path.suffix == ".svg").relative_to(self.folder))
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A measurement: `make` returns what it found as plain data, after about `seconds`.
+
+    `inputs` returns what it rests on besides program and machine. The names of its pictures, within the folder, are in
+    the result under "pictures". `make` raises `Lacking` and `Failure`.
+    """
+
+    name: str
+    about: str
+    seconds: float
+    inputs: Callable[[], Any]
+    make: Callable[[Workshop], Document]
+
+    def depends(self) -> Document:
+        """Return all that the result depends on, as it is now."""
+        return {"inputs": self.inputs(), "program": program(), "machine": machine()}
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A result that is kept: what was found, when, in which time; or why nothing can be found on this machine."""
+
+    found: Document
+    took_s: float
+    made_at: str
+    lacking: str = ""
+
+
+def kept(experiment: Experiment, folder: Path) -> Kept | None:
+    """Return the result of an experiment if it is still right; None if it must be made."""
+    try:
+        document = json.loads((folder / KEPT / f"{experiment.name}.json").read_text(encoding="utf-8"))
+        found = Kept(document["found"], document["took_s"], document["made_at"], document["lacking"])
+        pictures = found.found.get("pictures", {})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    if document.get("depends") != json.loads(json.dumps(experiment.depends())):
+        return None
+    return found if all((folder / path).is_file() for path in pictures.values()) else None
+
+
+def made(experiment: Experiment, workshop: Workshop) -> Kept:
+    """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
+    started, depends, lacking = time.monotonic(), experiment.depends(), ""
+    try:
+        found = experiment.make(workshop)
+    except Lacking as reason:
+        found, lacking = {}, str(reason)
+    if INTERRUPT.number:
+        # A signal ends a run in order, but before its time.
+        INTERRUPT.end()
+    result = Kept(found, round(time.monotonic() - started, 1), time.strftime("%Y-%m-%d %H:%M:%S"), lacking)
+    path = workshop.folder / KEPT / f"{experiment.name}.json"
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps({"depends": depends, **vars(result)}, indent=1) + "\n", encoding="utf-8")
+    part.replace(path)
+    return result
+
+
+@cache
+def machine() -> Document:
+    """Return what the figures depend on in this machine."""
+    cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    model = next((line.partition(":")[2].strip() for line in cpu if line.startswith("model name")), platform.machine())
+    return {
+        "processor": model,
+        "cores": len(os.sched_getaffinity(0)),
+        "kernel": platform.release(),
+        "python": platform.python_version(),
+        "real-time priorities": permits_fifo(),
+        "libraries": {name: version(name) for name in LIBRARIES},
+    }
+
+
+def need_real_time(cores: int = 1) -> None:
+    """Raise `Lacking` on a machine without real-time priorities, or without so many cores."""
+    if not permits_fifo():
+        why = "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot preempt its planner"
+        raise Lacking(why)
+    if (there := len(os.sched_getaffinity(0))) < cores:
+        raise Lacking(f"it needs {cores} processors; this machine has {there}")
+
+
+@cache
+def program() -> str:
+    """Return a checksum of the program and its configs, without what only writes the page."""
+    page = PROGRAM / "tools" / "reproduction"
+    digest = xxhash.xxh3_64()
+    for floor in FLOORS:
+        for path in sorted((PROGRAM / floor).rglob("*")):
+            if (
+                path.suffix in (".py", ".toml", ".xml")
+                and path.parent not in (page, page / "sections")
+                and path.is_file()
+            ):
+                digest.update(str(path.relative_to(PROGRAM)).encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,171 @@
+"""Figures 2 to 4 of the paper run by real processes, and their planning computed for every X."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+from rack.boards.config import RackConfig, load, rack_timing, wire
+from rack.levels.timing.forecast import Forecast
+from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop, need_real_time
+from rack.tools.recording.history import steal
+from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.timing.charts.measured import TracedRun
+from rack.tools.timing.charts.panel import Panel
+from rack.tools.timing.charts.scheduled import Schedule
+
+SECONDS = 3.0
+ATTEMPTS = 3
+"""Most runs of a figure, until the cycles of its executor are in time."""
+LAUNCH_S = 2.5
+LEVEL, PLANNER = "level", "level.planner"
+"""Tasks of these racks."""
+COMMON = 4
+"""Patterns of a lane that are kept, the most frequent ones."""
+MS = 1e-6
+
+
+@dataclass(frozen=True)
+class FigureRack:
+    """A figure of the paper: its config, drawn over so many cycles, with another X, ms, if given."""
+
+    config: str
+    cycles: int
+    process_ms: float | None = None
+
+    @property
+    def label(self) -> str:
+        """Name of its experiment and of its pictures."""
+        return self.config if self.process_ms is None else f"{self.config}-x{self.process_ms:g}"
+
+    @property
+    def settings(self) -> list[str]:
+        """The settings with which the executor takes this X, in its budget and on its board."""
+        if self.process_ms is None:
+            return []
+        board = load(self.config).board[LEVEL]
+        assert board.budget is not None, "every figure has a budget"
+        own_ms = board.budget.process_ms - board.params["process_ms"]
+        computed = f"board.{LEVEL}.params.process_ms={max(self.process_ms - own_ms, 0.0):.6g}"
+        return [f"board.{LEVEL}.budget.process_ms={self.process_ms:g}", computed]
+
+    def loaded(self) -> RackConfig:
+        """Return the config."""
+        return load(self.config, self.settings)
+
+    def experiment(self) -> Experiment:
+        """Return its run by real processes."""
+        about = f"{self.label} by real processes"
+        return Experiment(self.label, about, SECONDS + LAUNCH_S, self._inputs, partial(_run, self))
+
+    def _inputs(self) -> Any:
+        return {"config": self.loaded().text(), "seconds": SECONDS, "cycles": self.cycles, "attempts": ATTEMPTS}
+
+    def panel(self) -> Panel:
+        """Return the schedule that follows from its budget, from the first cycle on."""
+        config = self.loaded()
+        return Schedule(config, wire(config), {}).panel(0, self.window_ns(config))
+
+    def window_ns(self, config: RackConfig) -> int:
+        """Return the time that its charts show."""
+        return self.cycles * config.every(LEVEL) * config.clock_ns
+
+
+def column_ns(config: RackConfig, window_ns: int) -> int:
+    """Return the time of a letter in a chart: its shortest unit function."""
+    return column_for(window_ns, Schedule(config, wire(config), {}).shortest_ns)
+
+
+def _run(figure: FigureRack, workshop: Workshop) -> Document:
+    from rack.tools.timing.charts.picture import save
+
+    config = figure.loaded()
+    need_real_time(2 if config.board[LEVEL].coupling == "loose" else 1)
+    run = _least_disturbed(figure, workshop)
+    start = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
+    window_ns = figure.window_ns(config)
+    panel = run.panel(start, start + window_ns, lambda part: None)
+    drawn = save([panel], f"{figure.label}: a run", workshop.picture(f"{figure.label}-run"))
+    return {
+        "tasks": {name: asdict(count) for name, count in panel.counts.items()},
+        "patterns": {lane: [one.most_common(COMMON) for one in counts] for lane, counts in panel.patterns.items()},
+        "letters": list(lines(panel, column_ns(config, window_ns))),
+        "steal": steal(run.recording)["percent"],
+        "pictures": {"measured": workshop.shown(drawn)},
+    }
+
+
+def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
+    """Return the run in which the fewest of the executor's cycles were late: other programs take cores away.
+
+    An executor that is late by its own schedule runs once.
+    """
+    tried: list[tuple[int, TracedRun]] = []
+    is_late = bool(figure.panel().chart.late(LEVEL))
+    for attempt in range(1, ATTEMPTS + 1):
+        label = f"{figure.label}-{attempt}"
+        run = TracedRun(workshop.run(label, workshop.config(figure.config, figure.settings), SECONDS))
+        late = len(run.chart(0, run.end_ns).late(LEVEL))
+        tried.append((late, run))
+        if is_late or not late:
+            break
+    return min(tried, key=lambda one: one[0])[1]
+
+
+@dataclass(frozen=True)
+class Planning:
+    """A figure with one X, ms, and the time that its planner has.
+
+    `each_ms` is left for P in every cycle if U too is in every cycle, as the pattern "RXWPU" reads; `cycles_each` are
+    the cycles until P is done that way, None if it never is. `once_ms` is left for P and U together, U once a plan;
+    `cycles_once` are those cycles. `permitted` are the cycles that a plan may take. `failing` names the equations that
+    fail. `idle_ms` is left of an executor's cycle. `pattern` is the schedule's over the cycles of a plan, and `in_time`
+    says whether all its cycles and plans are in time.
+    """
+
+    process_ms: float
+    each_ms: float
+    cycles_each: int | None
+    once_ms: float
+    cycles_once: int | None
+    permitted: int
+    failing: tuple[str, ...]
+    idle_ms: float
+    pattern: str
+    in_time: bool
+
+
+def planning(name: str, process_ms: float) -> Planning:
+    """Return what the timing model says of a figure with this X, ms."""
+    config = FigureRack(name, 1, process_ms).loaded()
+    layout = wire(config)
+    rack = rack_timing(config, layout)
+    level = rack.level(LEVEL)
+    panel = Schedule(config, layout, {}).panel(0, level.cycle_ns)
+    once_ns = level.cycle_ns if level.coupling == "loose" else level.residual_ns
+    each_ns, plan_ns = once_ns - level.update_ns, level.plan_ns or 0
+    patterns = panel.patterns[LEVEL]
+    return Planning(
+        process_ms=process_ms,
+        each_ms=each_ns * MS,
+        cycles_each=_cycles(plan_ns, each_ns),
+        once_ms=once_ns * MS,
+        cycles_once=_cycles(plan_ns + level.update_ns, once_ns),
+        permitted=level.within_cycles or 0,
+        failing=tuple(dict.fromkeys(v.equation for v in Forecast.of(rack).verdicts if not v.holds)),
+        idle_ms=level.residual_ns * MS,
+        pattern=(patterns.plans or patterns.cycles).most_common(1)[0][0],
+        in_time=not any(count.late for count in panel.counts.values()),
+    )
+
+
+def _cycles(work_ns: int, left_ns: int) -> int | None:
+    """Return the cycles in which work is done, with so much time left for it in each; None: it never is."""
+    return -(-work_ns // left_ns) if left_ns > 0 else None
+
+
+def sweep(name: str, values: Iterable[float]) -> list[Planning]:
+    """Return a figure with every one of these X, ms."""
+    return [planning(name, value) for value in values]

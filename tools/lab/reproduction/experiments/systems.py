@@ -1,0 +1,46 @@
+"""The paper's other systems: each rack measured by itself, as `rack bench systems` does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+
+from pydantic import TypeAdapter
+
+from rack.boards.config import load
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.observed import Runs
+from rack.tools.lab.benches.systems.bench import measure, systems
+from rack.tools.lab.benches.systems.figures import Systems
+from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
+
+SECONDS = 4.0
+LASTS_S = 35.0
+PREFIX = "system-"
+
+
+def system_experiment(name: str) -> Experiment:
+    """Return the figures of one rack, in lockstep and in real time."""
+    return Experiment(
+        f"{PREFIX}{name}",
+        f"{name} next to the other systems",
+        LASTS_S,
+        lambda: {"config": load(name).text(), "seconds": SECONDS},
+        partial(_run, name),
+    )
+
+
+def _run(name: str, workshop: Workshop) -> Document:
+    found = measure([name], Runs(SECONDS, 1, workshop.share), Progress())
+    plain: Document = TypeAdapter(Systems).dump_python(found, mode="json")
+    return plain
+
+
+def systems_of(found: Iterable[Document]) -> Systems:
+    """Return what was measured of several racks, as one comparison."""
+    each = [TypeAdapter(Systems).validate_python(one) for one in found]
+    return Systems(tuple(figures for one in each for figures in one.figures), SECONDS, each[0].absent)
+
+
+SYSTEMS = tuple(system_experiment(name) for name in systems())
+"""Every rack that models a system, NASREM first."""

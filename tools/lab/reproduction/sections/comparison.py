@@ -1,0 +1,219 @@
+"""Section 4.1 of the paper: the systems with which it compares its model."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from rack.boards.config import load, rack_timing, wire
+from rack.levels.timing.trace_times import Distribution
+from rack.tools.lab.benches.systems.bench import systems
+from rack.tools.lab.benches.systems.figures import SystemFigures
+from rack.tools.lab.benches.systems.prediction import SystemPrediction, prediction
+from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
+from rack.tools.lab.reproduction.experiments.systems import SYSTEMS, systems_of
+from rack.tools.lab.reproduction.sections.gantt import DISTURBED
+from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listing, Plate, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
+
+RCCL = "rccl"
+RCCL_RUN = next(one for one in SYSTEMS if one.name.endswith(f"-{RCCL}"))
+
+
+@cache
+def _promise(name: str) -> SystemPrediction:
+    config = load(name)
+    layout = wire(config)
+    return prediction(config, rack_timing(config, layout), layout)
+
+
+def _promised(workshop: Workshop) -> Side:
+    rows = [_promise_row(name, _promise(name)) for name in systems()]
+    head = (
+        "rack",
+        "levels",
+        "rates, Hz",
+        "boards",
+        "hosts",
+        "R<sub>max</sub>",
+        "n R<sub>max</sub>",
+        "sum",
+        "command",
+        "status",
+        "fits",
+    )
+    caption = "Responses by equations 3.2 and 3.3, and on the clock's grid, ms. Hosts are boards without real time."
+    return Side.of(Columns(head, rows, caption))
+
+
+def _promise_row(name: str, said: SystemPrediction) -> tuple[str, ...]:
+    times = (said.longest_cycle_ms, said.bound_ms, said.sum_ms, said.command_ms, said.status_ms)
+    return (
+        code(name),
+        text(" → ".join(said.levels)) or "-",
+        ", ".join(f"{rate:.4g}" for rate in said.rates_hz) or "-",
+        str(said.boards),
+        str(said.hosts),
+        *(f"{time_ms:g}" if said.levels else "-" for time_ms in times),
+        {True: "yes", False: "NO", None: "-"}[said.fits],
+    )
+
+
+def _compared(findings: Findings) -> Assessment:
+    """Judge whether all systems run, with their responses within the bounds."""
+    found = systems_of(findings[one.name] for one in SYSTEMS)
+    head = (
+        "rack",
+        "command down",
+        "status up",
+        "hold by an operator, longest",
+        "killed: ticks until a neighbour",
+        "missed, %",
+    )
+    rows = [_measured_row(one) for one in found.figures]
+    caption = "Responses in ms: longest of a run in real time. A hold is given to the highest level that takes one."
+    drawn = findings.workshop.shown(found.plot(findings.workshop.folder / PICTURES))
+    side = Side.of(
+        Columns(head, rows, caption),
+        Plate(Path(drawn), "Responses with their bounds, ages of messages, and more, system by system."),
+        Listing("\n".join(found.lines(None)), f"All figures, as {code('rack bench systems')} prints them."),
+    )
+    failed = [one for one in found.figures if not one.worked]
+    if failed and all(one.realtime.missed > DISTURBED for one in failed):
+        missed = ", ".join(f"{one.rack} ({100 * one.realtime.missed:.1f} % of its fastest cycles)" for one in failed)
+        why = f"Missed too many cycles to do its task: {missed}. Should other programs have had the processors: "
+        return Assessment(side, Ruling.UNTESTABLE, f"{why}{code('rack reproduce --only 4.1 --again')}.")
+    if failed:
+        names = "; ".join(f"{one.rack}: {one.failure}" for one in failed)
+        return Assessment(side, Ruling.FAILS, f"These did not run as they should: {text(names)}.")
+    late = [one.rack for one in found.figures if _is_beyond(one)]
+    count = len(found.figures)
+    if late:
+        why = (
+            f"All {count} systems run on one set of mechanisms. Beyond its bound after missed cycles: "
+            f"{', '.join(late)}."
+        )
+        return Assessment(side, Ruling.BOUNDED, why)
+    return Assessment(side, Ruling.HOLDS, f"All {count} systems run on one set of mechanisms, within their bounds.")
+
+
+def _measured_row(one: SystemFigures) -> tuple[str, ...]:
+    ran, hold = one.realtime, one.realtime.hold
+    ticks = sorted(kill.neighbour for kill in one.kills.detections if kill.neighbour is not None)
+    held = (
+        "-"
+        if hold is None or hold.measured_ms is None
+        else f"{hold.measured_ms:g} of {hold.longest_ms:g} ({hold.level})"
+    )
+    killed = f"{ticks[0]} to {ticks[-1]}" if ticks else "-"
+    return (code(one.rack), _longest(ran.command_ms), _longest(ran.status_ms), held, killed, f"{100 * ran.missed:.2f}")
+
+
+def _longest(times: Distribution | None) -> str:
+    return "-" if times is None else f"{times['max']:g}"
+
+
+def _is_beyond(one: SystemFigures) -> bool:
+    """Return whether a response of the run was longer than predicted."""
+    ran, said = one.realtime, one.predicted
+    pairs = ((ran.command_ms, said.command_ms), (ran.status_ms, said.status_ms))
+    return any(times is not None and times["max"] > bound + 1e-6 for times, bound in pairs) or bool(
+        ran.hold and ran.hold.beyond
+    )
+
+
+def _layered(workshop: Workshop) -> Side:
+    rows = []
+    for name in systems():
+        said = _promise(name)
+        ratio = max(said.rates_hz) / min(said.rates_hz) if said.rates_hz else 1.0
+        rows.append((code(name), str(len(said.levels)), str(said.hosts), f"{ratio:.4g}"))
+    return Side.of(Columns(("rack", "levels", "boards without real time", "fastest rate to slowest"), rows))
+
+
+def _layered_tested(findings: Findings) -> Assessment:
+    """Judge from the configs alone: levels, and whether the slow ones are above the fast ones."""
+    promised = {name: _promise(name) for name in systems()}
+    flat = [name for name, said in promised.items() if len(said.levels) < 2]
+    even = [name for name, said in promised.items() if sorted(said.rates_hz) != list(said.rates_hz)]
+    if flat or even:
+        why = (
+            f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a faster level above a "
+            f"slower one: {', '.join(even) or 'none'}."
+        )
+        return Assessment(Side(), Ruling.BOUNDED, why)
+    why = (
+        f"From the configs alone: all {len(promised)} have at least two levels, and no level is faster than the one "
+        "below."
+    )
+    return Assessment(Side(), Ruling.HOLDS, why)
+
+
+def _rccl(workshop: Workshop) -> Side:
+    layout = wire(load(RCCL))
+    rows = [
+        (task.name, f"{1e9 / (task.every * layout.clock_ns):g}", str(task.core), str(task.priority or "-"))
+        for task in layout.tasks
+    ]
+    queues = [
+        f"{code(box.name)}, {box.capacity} messages, read by {', '.join(box.readers)}"
+        for box in layout.mailboxes
+        if box.capacity
+    ]
+    return Side.of(Columns(("task", "rate, Hz", "processor", "priority"), rows), f"Queues: {'; '.join(queues)}.")
+
+
+def _rccl_tested(findings: Findings) -> Assessment:
+    found = systems_of([findings[RCCL_RUN.name]]).figures[0]
+    rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
+    layout = wire(load(RCCL))
+    fastest = [task for task in layout.tasks if task.every == min(other.every for other in layout.tasks)]
+    cores = {task.core for task in layout.tasks}
+    side = Side.of(Columns(("board", "processor time, share of one"), rows))
+    if not found.worked:
+        return Assessment(side, Ruling.FAILS, text(found.failure))
+    why = (
+        f"Joint control has a board a joint, but {len(fastest)} boards of that rate share {len(cores)} processors: "
+        f"each joint its own processor cannot be had here. At 1 kHz {100 * found.realtime.missed:.2f} % of their "
+        "cycles were missed."
+    )
+    return Assessment(side, Ruling.BOUNDED, why)
+
+
+CHAPTER = Chapter(
+    name="4.1",
+    title="Comparison of Concurrent Hierarchical Control to Other Models",
+    intro="The systems of section 4.1 as racks: what each was, what is modelled and what is assumed is in the README "
+    "of its folder in <code>configs</code>.",
+    statements=(
+        Statement(
+            name="systems",
+            title="The systems next to each other",
+            quote="A survey of existing robot control systems provides numerous concurrent models. ... These "
+            "architectures share common characteristics with the concurrent, hierarchical control model.",
+            experiments=SYSTEMS,
+            predicted=_promised,
+            tested=_compared,
+        ),
+        Statement(
+            name="two-levels",
+            title="At least two levels",
+            quote="Although few of these control systems are directly labeled as a hierarchical, most systems have at "
+            "least a two-level hierarchy, with a low-level, real-time subsystem handling real-time motion control, "
+            "and a slower high-level subsystem responsible for planning.",
+            experiments=(),
+            predicted=_layered,
+            tested=_layered_tested,
+        ),
+        Statement(
+            name="rccl",
+            title="RCCL: a processor a joint",
+            quote="The joint control level operates at 1 kHz and assigns 1 processor per joint. The fine motion "
+            "trajectory level runs a 50 Hz and runs as high-priority cyclic task. Concurrently, a rough motion "
+            "planner asynchronously produces a queue of motion requests for the trajectory level as a background task.",
+            experiments=(RCCL_RUN,),
+            predicted=_rccl,
+            tested=_rccl_tested,
+        ),
+    ),
+)

@@ -1,0 +1,138 @@
+"""Equations as statements: predicted for the NASREM rack, measured in its run, and a rack in which each fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from rack.boards.config import RackConfig, load, rack_timing, wire
+from rack.boards.errors import ConfigError
+from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.verdicts import EquationVerdict
+from rack.tools.console.tables import ms
+from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
+from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listing, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.statement import Findings, Statement
+
+SIGNS = {"<": "&lt;", "<=": "≤", "=": "="}
+HEAD = ("of", "left side", "", "right side", "margin", "")
+
+
+@dataclass(frozen=True)
+class Biting:
+    """A rack in which an equation fails: a config with settings, and what they mean."""
+
+    config: str
+    settings: tuple[str, ...]
+    about: str
+
+    def side(self, equation: str) -> tuple[str, Columns | Listing]:
+        """Return the rack in words, and what the timing model, or the check of the config, says of it."""
+        given = " ".join(f"--set {setting}" for setting in self.settings)
+        words = f"Where it fails: {self.about} ({code(f'rack check {self.config} {given}'.strip())})."
+        try:
+            found = verdicts_of(load(self.config, self.settings), equation)
+        except ConfigError as error:
+            return words, Listing(str(error))
+        return words, Columns(HEAD, rows_of(equation, [verdict.document() for verdict in found]))
+
+
+def forecast_of(config: RackConfig) -> Forecast:
+    """Return what the timing model predicts of a rack."""
+    return Forecast.of(rack_timing(config, wire(config)))
+
+
+def verdicts_of(config: RackConfig, equation: str) -> list[EquationVerdict]:
+    """Return the predicted verdicts on one equation in a rack."""
+    return [verdict for verdict in forecast_of(config).verdicts if verdict.equation == equation]
+
+
+@dataclass(frozen=True)
+class PaperEquation:
+    """An equation of the paper: its number, its wording, its form, how we read it, and a rack in which it fails."""
+
+    number: str
+    title: str
+    quote: str
+    form: str
+    reading: str
+    biting: Biting
+
+    def statement(self, tested: Callable[[PaperEquation, Findings], Assessment] | None = None) -> Statement:
+        """Return the equation as a statement, judged by `tested` or by all of its subjects in the run."""
+        return Statement(
+            name=f"equation-{self.number}",
+            title=f"Equation {self.number}: {self.title}",
+            quote=self.quote,
+            equation=f"{self.form} &nbsp; ({self.number})",
+            experiments=(NASREM,),
+            predicted=self.predicted,
+            tested=partial(tested or judged, self),
+        )
+
+    def predicted(self, workshop: Workshop) -> Side:
+        """Return both sides for the NASREM rack by its budgets, and the rack in which the equation fails."""
+        found = verdicts_of(load(NAME), self.number)
+        meanings = dict.fromkeys(code(verdict.meaning) for verdict in found)
+        table = Columns(HEAD, rows_of(self.number, [verdict.document() for verdict in found]))
+        words = f"{self.reading} For {code(NAME)}, by the budgets of its config: {'; '.join(meanings)}."
+        return Side.of(words, table, *self.biting.side(self.number))
+
+
+def rows_of(equation: str, verdicts: list[Document]) -> list[tuple[str, ...]]:
+    """Return rows of a table: subject, both sides, margin, and whether it holds."""
+    return [_row(verdict) for verdict in verdicts if verdict["equation"] == equation]
+
+
+def _row(verdict: Document) -> tuple[str, ...]:
+    left, right, margin = (_shown(verdict[side], verdict["unit"]) for side in ("left", "right", "margin"))
+    return text(verdict["subject"]), left, SIGNS[verdict["sign"]], right, margin, "ok" if verdict["holds"] else "FAILS"
+
+
+def _shown(side: float | None, unit: str) -> str:
+    if side is None:
+        return "∞"
+    return ms(side) if unit == "ns" else f"{side:.3g}"
+
+
+def measured_of(equation: str, found: Document) -> list[Document]:
+    """Return the measured verdicts on one equation, each with whether it holds in most cycles."""
+    pairs = [pair for pair in found["pairs"] if pair["equation"] == equation and pair["measured"] is not None]
+    return [{**pair["measured"], "mostly": pair["mostly"]} for pair in pairs]
+
+
+def table_of(verdicts: list[Document]) -> Columns:
+    """Return the measured verdicts as a table: the worst cycle of the run, and whether most cycles are better."""
+    rows = [(*_row(verdict), "yes" if verdict["mostly"] else "NO") for verdict in verdicts]
+    return Columns((*HEAD[:-1], "worst cycle", "in 99 of 100"), rows)
+
+
+def judged(equation: PaperEquation, findings: Findings) -> Assessment:
+    """Judge an equation by the worst cycle of every subject, and by 99 of 100 cycles."""
+    found = findings[NASREM.name]
+    verdicts = measured_of(equation.number, found)
+    counts = found["breaches"].get(equation.number, 0)
+    lasted = found["outcome"]["ticks"] * load(NAME).clock_ns * 1e-9
+    words = (
+        f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without those of the start-up."
+    )
+    side = Side.of(words, table_of(verdicts))
+    broken = [verdict["subject"] for verdict in verdicts if not verdict["holds"]]
+    if not broken:
+        return Assessment(
+            side, Ruling.HOLDS, "It holds as predicted for every level, in the worst cycle of the run too."
+        )
+    if all(verdict["mostly"] for verdict in verdicts):
+        why = f"It holds as predicted in 99 of 100 cycles; in the worst it fails for {text(', '.join(broken))}. "
+        why += f"{counts} cycles broke it by their own numbers. " if counts else ""
+        why += stolen(found)
+        return Assessment(side, Ruling.BOUNDED, why)
+    return Assessment(side, Ruling.FAILS, f"It fails for {text(', '.join(broken))}, in more than one of 100 cycles.")
+
+
+def stolen(found: Document) -> str:
+    """Return how much of its cores the hypervisor took from a run."""
+    taken = ", ".join(f"{percent:g} % of core {core}" for core, percent in found["steal"].items())
+    return f"Meanwhile the hypervisor took {taken}." if taken else "The hypervisor's share is not known."

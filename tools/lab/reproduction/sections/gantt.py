@@ -1,0 +1,340 @@
+"""Section 3.4 of the paper: figures 2 to 4, drawn, run, and with every X that the paper permits."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+from rack.boards.config import RackConfig
+from rack.boards.config.schema import BudgetConfig
+from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.figures import (
+    LEVEL,
+    MS,
+    PLANNER,
+    FigureRack,
+    Planning,
+    column_ns,
+    sweep,
+)
+from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listing, Plate, Ruling, Side, code
+from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
+from rack.tools.timing.charts.letters import lines
+
+LEAST_X, MOST_X, NEWER_X = 1.0, 3.0, 4.0
+"""The paper's X, ms: "will range from 1 to 3 ms", and the newer version's."""
+STEP_X = 0.5
+LEAST_P = 3.0
+""""The planner runs at least 3 ms each cycle"."""
+WORST_CYCLES = 3
+""""At worst an updated plan should be available every third cycle"."""
+AGAIN = code("rack reproduce --only 3.4 --again")
+DISTURBED = 0.02
+"""Part of an executor's cycles late from which on a run shows the machine, not the figure."""
+MOSTLY = 0.5
+"""Part of the cycles, or plans, late from which on a run is said to fail: the figures fail in all, or in none."""
+PAPER_X = [LEAST_X + STEP_X * k for k in range(round((MOST_X - LEAST_X) / STEP_X) + 1)]
+
+FIG2, FIG3, FIG4 = FigureRack("fig2", 2), FigureRack("fig3", 3), FigureRack("fig4", 2)
+OVERLOAD = FigureRack("fig4-overload", 3)
+SHORT_2, LONG_2, SHORT_3 = (
+    FigureRack("fig2", 2, LEAST_X),
+    FigureRack("fig2", 3, MOST_X),
+    FigureRack("fig3", 3, LEAST_X),
+)
+
+
+def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:
+    """Return a figure as the paper draws it, as a picture and as letters."""
+    from rack.tools.timing.charts.picture import save
+
+    panel, config = figure.panel(), figure.loaded()
+    paths = save([panel], f"{figure.label}: the schedule of its budget", workshop.picture(figure.label))
+    caption = f"The schedule computed from the budget of {code(figure.label)}, drawn as in the paper."
+    letters = "\n".join(lines(panel, column_ns(config, figure.window_ns(config))))
+    return Plate(Path(workshop.shown(paths)), caption), Listing(letters)
+
+
+def ran(figure: FigureRack, found: Document) -> Side:
+    """Return the run of a figure: its chart, how many cycles and plans were late, and its patterns."""
+    steal = ", ".join(f"core {core} {percent:g} %" for core, percent in found["steal"].items())
+    rows = [
+        (
+            {LEVEL: "executor: cycles", PLANNER: "planner: plans"}[task],
+            str(count["jobs"]),
+            str(count["late"]),
+            str(count["skipped"]),
+        )
+        for task, count in found["tasks"].items()
+    ]
+    caption = (
+        "Late: past its deadline; skipped: of the late ones, those that never began. Taken by the hypervisor "
+        f"meanwhile: {steal or 'not measured'}."
+    )
+    return Side.of(
+        Plate(
+            Path(found["pictures"]["measured"]), f"A run of {code(figure.label)} by real processes, from its middle."
+        ),
+        Columns(("", "all", "late", "skipped"), rows, caption),
+        _patterns(found),
+    )
+
+
+def _patterns(found: Document) -> Columns:
+    rows = [
+        (lane, code(pattern), str(count)) for lane, both in found["patterns"].items() for pattern, count in chain(*both)
+    ]
+    return Columns(("processor of", "pattern", "times"), rows, "The most frequent patterns, over the cycles of a plan.")
+
+
+def late(found: Document, task: str) -> float:
+    """Return the part of a task's jobs that were late."""
+    count = found["tasks"][task]
+    return count["late"] / count["jobs"] if count["jobs"] else 1.0
+
+
+def fails(found: Document) -> bool:
+    """Return whether a run fails: whether cycles or plans are mostly late."""
+    return max(late(found, LEVEL), late(found, PLANNER)) > MOSTLY
+
+
+def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
+    """Judge a figure of which the paper says that it works, or that it fails."""
+    found = findings[figure.label]
+    counts = [found["tasks"][task] for task in (LEVEL, PLANNER)]
+    said = (
+        f"{counts[0]['late']} of {counts[0]['jobs']} cycles and {counts[1]['late']} of {counts[1]['jobs']} plans late"
+    )
+    measured = ran(figure, found)
+    if fails(found) == works and DISTURBED < late(found, LEVEL) < MOSTLY:
+        why = f"Other programs had the processors too often: {said}. On a quiet machine: {AGAIN}."
+        return Assessment(measured, Ruling.UNTESTABLE, why)
+    if fails(found) == works:
+        return Assessment(measured, Ruling.FAILS, f"The paper says that it {_verb(works)}; the run had {said}.")
+    stray = [count for count in counts if count["late"] and count["late"] <= MOSTLY * count["jobs"]]
+    if stray:
+        why = (
+            f"It {_verb(works)}, as the paper says: {said}. The stray ones are this machine's: see the time taken away."
+        )
+        return Assessment(measured, Ruling.BOUNDED, why)
+    return Assessment(measured, Ruling.HOLDS, f"It {_verb(works)}, as the paper says: {said}.")
+
+
+def _verb(works: bool) -> str:
+    return "works" if works else "fails"
+
+
+def _predicted(figure: FigureRack, workshop: Workshop) -> Side:
+    plate, letters = drawn(figure, workshop)
+    (found,) = sweep(figure.config, [budget_of(figure.loaded()).process_ms])
+    failing = ", ".join(found.failing)
+    judged = f"These fail: {failing}." if failing else "Every equation holds, and every cycle and plan is in time."
+    about = f"With X = {found.process_ms:g} ms a cycle leaves {found.idle_ms:g} ms after the executor. {judged}"
+    return Side.of(plate, letters, about)
+
+
+def budget_of(config: RackConfig) -> BudgetConfig:
+    """Return the budget of a figure's only level."""
+    budget = config.board[LEVEL].budget
+    assert budget is not None, "every figure has a budget"
+    return budget
+
+
+def _planning_table(rows: list[Planning]) -> Columns:
+    head = ["X", "P a cycle, U in each", "plan after", "P and U a cycle, U once", "plan after", "permitted"]
+    head += ["eqs that fail", "schedule", "in time"]
+    cells = [
+        (
+            f"{one.process_ms:g}",
+            f"{one.each_ms:g}",
+            _in_cycles(one.cycles_each),
+            f"{one.once_ms:g}",
+            _in_cycles(one.cycles_once),
+            _in_cycles(one.permitted),
+            ", ".join(one.failing) or "none",
+            code(one.pattern),
+            "yes" if one.in_time else "NO",
+        )
+        for one in rows
+    ]
+    return Columns(head, cells)
+
+
+def _in_cycles(count: int | None) -> str:
+    return "never" if count is None else f"{count} cycles"
+
+
+def contradicting(rows: list[Planning]) -> list[Planning]:
+    """Return the cases in which figure 2 does not do what the paper says of it.
+
+    It says that the planner runs at least `LEAST_P` in each cycle, and that two cycles suffice for P and U.
+    """
+    return [one for one in rows if one.each_ms < LEAST_P or _is_slow(one)]
+
+
+def _is_slow(one: Planning) -> bool:
+    return one.cycles_once is None or one.cycles_once > one.permitted
+
+
+def _sweep_side(workshop: Workshop) -> Side:
+    """Compute both readings of the pattern for every X, and the largest X that each permits."""
+    rows = sweep(FIG2.config, PAPER_X)
+    config = FIG2.loaded()
+    cycle_ms, budget = config.every(LEVEL) * config.clock_ns * MS, budget_of(config)
+    fixed_ms, work_ms = budget.read_ms + budget.write_ms, budget.plan_ms + budget.update_ms
+    worst, less, slow = rows[-1], [one for one in rows if one.each_ms < LEAST_P], [one for one in rows if _is_slow(one)]
+    most_each = cycle_ms - fixed_ms - budget.update_ms - LEAST_P
+    most_once = cycle_ms - fixed_ms - work_ms / worst.permitted
+    literal = (
+        'Read literally, "RXWPU" has U in every cycle, and P has '
+        f"{cycle_ms - fixed_ms - budget.update_ms:g} &minus; X ms in each: at least {LEAST_P:g} ms up to X = "
+        f"{most_each:g}. With X = {_values(less) or 'none'} it is less; "
+        f"with X = {worst.process_ms:g} it is {worst.each_ms:g} ms, and a plan takes {_in_cycles(worst.cycles_each)}, "
+        f"{(worst.cycles_each or 0) * cycle_ms:g} ms instead of {worst.permitted * cycle_ms:g}."
+    )
+    kind = (
+        f"Read kindly, there is one U for each plan, and P and U share {cycle_ms - fixed_ms:g} &minus; X ms of a "
+        f"cycle. In {worst.permitted} cycles with X = {worst.process_ms:g} that is "
+        f"{worst.permitted * worst.once_ms:g} ms, but P and U need {work_ms:g}: the plan is computed in time, its "
+        f"update comes in cycle {worst.cycles_once}. Up to X = {most_once:g} two cycles would do; equation 3.8 "
+        f"demands less than that. Too slow: X = {_values(slow) or 'none'}."
+    )
+    third = all(count is not None and count <= WORST_CYCLES for count in (worst.cycles_each, worst.cycles_once))
+    follows = (
+        f"So the figure is what its text says as long as X is at most {most_each:g} ms, or at most {most_once:g} on "
+        f"average over the cycles of a plan, whereas the paper permits {MOST_X:g}. Its weaker demand, a plan at worst "
+        f"in every third cycle, is {'met' if third else 'not met'} with X = {worst.process_ms:g} in both readings."
+    )
+    return Side.of(_planning_table(rows), literal, kind, follows)
+
+
+def _values(rows: list[Planning]) -> str:
+    return ", ".join(f"{one.process_ms:g}" for one in rows)
+
+
+def _sweep_tested(findings: Findings) -> Assessment:
+    rows = sweep(FIG2.config, PAPER_X)
+    odd = contradicting(rows)
+    short, long = (findings[figure.label] for figure in (SHORT_2, LONG_2))
+    measured = Side.of(*ran(SHORT_2, short).items, *ran(LONG_2, long).items)
+    said = ", ".join(
+        f"X = {x:g}: {100 * late(found, PLANNER):.0f} % of the plans late"
+        for x, found in ((LEAST_X, short), (MOST_X, long))
+    )
+    if not odd:
+        return Assessment(measured, Ruling.HOLDS, f"Every X from {LEAST_X:g} to {MOST_X:g} ms works. Runs: {said}.")
+    agrees = fails(long) == _is_slow(rows[-1]) and fails(short) == _is_slow(rows[0])
+    if not agrees:
+        return Assessment(measured, Ruling.FAILS, f"The computation is not confirmed by the runs: {said}.")
+    why = (
+        '"X will range from 1 to 3 ms" and "the planner runs at least 3 ms each cycle" exclude each other for X = '
+        f"{_values(odd)}. Runs agree with the computation: {said}."
+    )
+    return Assessment(measured, Ruling.CONTRADICTS, why)
+
+
+def _fig3_side(workshop: Workshop) -> Side:
+    rows = sweep(FIG3.config, PAPER_X)
+    works = [one for one in rows if not _is_slow(one)]
+    text = (
+        f"The failure depends on X. With X = {_values(works) or 'none'} three cycles are enough for P and U; with "
+        f"X = {_values([one for one in rows if one not in works])} they are not."
+    )
+    return Side.of(*_predicted(FIG3, workshop).items, _planning_table(rows), text)
+
+
+def _fig3_tested(findings: Findings) -> Assessment:
+    own, short = _judged(FIG3, False, findings), findings[SHORT_3.label]
+    works = [one for one in sweep(FIG3.config, PAPER_X) if not _is_slow(one)]
+    measured = Side.of(*own.measured.items, *ran(SHORT_3, short).items)
+    if own.ruling is Ruling.FAILS or not works:
+        return Assessment(measured, own.ruling, own.why)
+    in_time = 100 * (1 - late(short, PLANNER))
+    why = (
+        f"{own.why} With X = {LEAST_X:g}, which the paper permits too, {in_time:.0f} % of the plans were in time: the "
+        "figure fails only from a certain X on."
+    )
+    return Assessment(measured, Ruling.BOUNDED, why)
+
+
+def _fig4_side(workshop: Workshop) -> Side:
+    rows = sweep(FIG4.config, PAPER_X)
+    full = [one for one in rows if one.idle_ms <= 0]
+    text = f'The "-" of the pattern is there up to X = {max(one.process_ms for one in rows if one.idle_ms > 0):g} ms.'
+    if full:
+        text += (
+            f" With X = {_values(full)} the executor fills its cycle: every cycle is still in time, but equation 3.6, "
+            "0 &lt; t<sub>residual</sub>, fails."
+        )
+    return Side.of(*_predicted(FIG4, workshop).items, text, _planning_table(rows))
+
+
+def _statement(name: str, title: str, quote: str, figure: FigureRack, works: bool) -> Statement:
+    return Statement(
+        name=name,
+        title=title,
+        quote=quote,
+        experiments=(figure.experiment(),),
+        predicted=partial(_predicted, figure),
+        tested=partial(_judged, figure, works),
+    )
+
+
+CHAPTER = Chapter(
+    name="3.4",
+    title="Algorithm Timing Analysis",
+    intro="One level as a Gantt chart. R reads command and status (1 ms), X is the executor (1 to 3 ms), W writes "
+    "command and status (1 ms), P plans (1 to 6 ms), U updates the plan (1 ms), C communicates with another processor "
+    "(1 ms). A new plan is wanted within 16 ms, at worst every third cycle. The racks <code>fig2</code>, "
+    "<code>fig3</code>, <code>fig4</code> and <code>fig4-overload</code> really compute that long; they use X = 2 ms, "
+    "as the figures do, and the longest P.",
+    statements=(
+        _statement(
+            "figure-2",
+            "Figure 2: one processor, 8 ms",
+            "For this case, all the functions can run tightly-coupled on one processor in one cycle, with sufficient "
+            'residual processing time. ... The algorithm repeats ad infinitum the basic "RXWPU" computational pattern.',
+            FIG2,
+            works=True,
+        ),
+        Statement(
+            name="figure-2-x",
+            title="Figure 2 with X from 1 to 3 ms",
+            quote="X ... will range from 1 to 3 ms computation intervals. ... The planner runs at least 3 ms. each "
+            "cycle which implies that after two cycles 6 ms. will have been allotted to the planner with 1 ms. for "
+            "plan updating.",
+            experiments=(SHORT_2.experiment(), LONG_2.experiment()),
+            predicted=_sweep_side,
+            tested=_sweep_tested,
+        ),
+        Statement(
+            name="figure-3",
+            title="Figure 3: one processor, 6 ms",
+            quote="A 6 ms. response time allows insufficient time for planning, so that within 3 cycles no updated "
+            "plan exists.",
+            experiments=(FIG3.experiment(), SHORT_3.experiment()),
+            predicted=_fig3_side,
+            tested=_fig3_tested,
+        ),
+        Statement(
+            name="figure-4",
+            title="Figure 4: two processors, 6 ms",
+            quote='The executor repeats ad infinitum a "CRXW-" computational pattern. Processor two (P2) will execute '
+            "planning exclusively. Computational resources easily guarantee 6 ms. planning to generate updated plans "
+            "with 12 ms. ... The control level effectively meets all timing constraints with some computational waste.",
+            experiments=(FIG4.experiment(),),
+            predicted=_fig4_side,
+            tested=partial(_judged, FIG4, True),
+        ),
+        _statement(
+            "figure-4-overload",
+            "Figure 4 with X = 4 ms",
+            "If the function X is replaced by a newer version which requires 4 ms. a cycle, then the above functional "
+            "allocation across processors will not work. For in the worst case, there is no time for interprocessor "
+            "communication with the planner (C).",
+            OVERLOAD,
+            works=False,
+        ),
+    ),
+)

@@ -1,0 +1,165 @@
+"""Abstract and introduction of the paper: determinism first, and the cost of communication."""
+
+from __future__ import annotations
+
+from rack.boards.config import load, rack_timing, wire
+from rack.tools.lab.reproduction.experiments.determinism import ATTEMPTS, DETERMINISM, NAME, SECONDS
+from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.nasrem import NASREM
+from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
+
+REAL, LOCKSTEP = "realtime", "lockstep"
+
+
+def _determined(workshop: Workshop) -> Side:
+    layout = wire(load(NAME))
+    by_ticks = sum(box.is_by_ticks for box in layout.mailboxes)
+    return Side.of(
+        f"{by_ticks} of the {len(layout.mailboxes)} mailboxes of {code(NAME)} show a message at a tick that is fixed "
+        "in advance: at the end of the cycle in which it was written, however early that was. What a level reads then "
+        "depends on ticks alone. We predict equal digests, which cover every message, in two runs in lockstep and in "
+        "a run in real time, as long as no deadline is missed; and no difference before the first miss. Each run "
+        f"simulates {SECONDS:g} s; there are at most {ATTEMPTS} in real time, until one is without a miss."
+    )
+
+
+def _determined_tested(findings: Findings) -> Assessment:
+    runs = findings[DETERMINISM.name]["runs"]
+    head = (
+        "run",
+        "mode",
+        "wall clock, s",
+        "messages",
+        "misses",
+        "first at tick",
+        "diverges at tick",
+        "first in",
+        "digest",
+    )
+    side = Side.of(Columns(head, [_run_row(run) for run in runs]))
+    reference = next(run["digest"] for run in runs if run["mode"] == LOCKSTEP)
+    if any(run["digest"] != reference for run in runs if run["mode"] == LOCKSTEP):
+        return Assessment(side, Ruling.FAILS, "Two runs in lockstep differ.")
+    real = [run for run in runs if run["mode"] == REAL]
+    if any(not _is_explained(run) for run in real):
+        return Assessment(side, Ruling.FAILS, "A run in real time diverged before it had missed a deadline.")
+    if any(run["first_miss"] is None and run["digest"] == reference for run in real):
+        why = "Lockstep twice and a run in real time without a miss wrote the same messages, bit for bit"
+        missed = " Runs that missed deadlines diverged no earlier than at the first miss." if len(real) > 1 else ""
+        return Assessment(side, Ruling.HOLDS, f"{why}.{missed}")
+    why = (
+        "Lockstep twice wrote the same messages. This machine kept no run in real time free of misses; none "
+        "diverged before its first miss, and every miss is on record."
+    )
+    return Assessment(side, Ruling.BOUNDED, why)
+
+
+def _is_explained(run: Document) -> bool:
+    """Return whether a run diverges from the reference only after it has missed a deadline."""
+    if run["difference"] is None:
+        return True
+    return run["first_miss"] is not None and run["first_miss"] <= run["difference"]["tick"]
+
+
+def _run_row(run: Document) -> tuple[str, ...]:
+    difference = run["difference"]
+    return (
+        text(run["run"]),
+        run["mode"],
+        f"{run['wall_s']:.2f}",
+        str(run["messages"]),
+        str(run["missed"]),
+        "-" if run["first_miss"] is None else str(run["first_miss"]),
+        "-" if difference is None else str(difference["tick"]),
+        "-" if difference is None else code(difference["mailbox"]),
+        code(run["digest"][:12]),
+    )
+
+
+def _costs(workshop: Workshop) -> Side:
+    config = load(NAME)
+    rack = rack_timing(config, wire(config))
+    rows = []
+    for name, level in rack.levels.items():
+        share = 100 * level.communication_ns / (level.communication_ns + level.execution_ns)
+        rows.append((name, f"{level.execution_ns * 1e-6:g}", f"{level.communication_ns * 1e-6:g}", f"{share:.0f}"))
+    head = ("level", "t<sub>exec</sub>", "t<sub>comm</sub>", "communication, % of both")
+    loads = ", ".join(f"core {core}: {100 * load_:.0f} %" for core, load_ in rack.loads.items())
+    return Side.of(
+        Columns(head, rows, f"Worst case, by the budgets. Loads of the processors, planners included: {loads}.")
+    )
+
+
+def _costs_tested(findings: Findings) -> Assessment:
+    """Compare the processor time of communication with what the less loaded processor takes off the other one."""
+    found = findings[NASREM.name]
+    rows, communicates = [], 0.0
+    for level, parts in found["phases"].items():
+        comm_us = sum(parts[name]["p50"] for name in ("exchange", "read", "write"))
+        rate_hz = 1e3 / found["tasks"][level]["slice_ms"]
+        communicates += comm_us * rate_hz * 1e-6
+        both = comm_us + parts["process"]["p50"]
+        rows.append(
+            (
+                level,
+                f"{parts['process']['p50']:.0f}",
+                f"{comm_us:.0f}",
+                f"{100 * comm_us / both:.0f}",
+                f"{comm_us * rate_hz * 1e-3:.1f}",
+            )
+        )
+    saved = min(found["loads"].values()) if len(found["loads"]) > 1 else 0.0
+    head = (
+        "level",
+        "t<sub>exec</sub>, us",
+        "t<sub>comm</sub>, us",
+        "communication, % of both",
+        "communication, ms a second",
+    )
+    loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found["loads"].items())
+    side = Side.of(Columns(head, rows, f"Medians of a run. Processor time of all tasks, ms a second: {loads}."))
+    if not saved:
+        return Assessment(side, Ruling.UNTESTABLE, "All boards ran on one processor: there is nothing to save.")
+    words = (
+        f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second processor takes "
+        f"{1e3 * saved:.0f} ms a second off the first."
+    )
+    return Assessment(side, Ruling.HOLDS if communicates < saved else Ruling.BOUNDED, words)
+
+
+ABSTRACT = Chapter(
+    name="abstract",
+    title="Abstract",
+    intro="The paper presents concurrent hierarchical control as an efficient, flexible and deterministic method, and "
+    "analyses its timing. What follows reproduces it on processes, pinned to the cores of one machine, that share "
+    "memory as the paper's boards share a VME bus.",
+    statements=(
+        Statement(
+            name="determinism",
+            title="Determinism is the measure",
+            quote="Satisfying real-time constraints is important, but determinism, not performance, is the key "
+            "element in assessing a control model.",
+            experiments=(DETERMINISM,),
+            predicted=_determined,
+            tested=_determined_tested,
+        ),
+    ),
+)
+INTRODUCTION = Chapter(
+    name="1",
+    title="Introduction",
+    intro="A robot controller is split into cooperating processes to make it faster; communication is the price.",
+    statements=(
+        Statement(
+            name="communication",
+            title="The cost of communication",
+            quote="The cost of communications must not negate the time savings obtained by parallel execution on the "
+            "different processors. Thus, to achieve the benefits of parallelism, a robot control model must be "
+            "inherently concurrent and have an efficient means of communication.",
+            experiments=(NASREM,),
+            predicted=_costs,
+            tested=_costs_tested,
+        ),
+    ),
+)

@@ -1,0 +1,79 @@
+"""A claim of the paper before it is judged, and how it becomes a claim of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Kept, Workshop
+from rack.tools.lab.reproduction.sections.page import Assessment, PageClaim, PageSection, Ruling, Side, text
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What experiments have found, by their names, and where pictures of it are drawn."""
+
+    found: Mapping[str, Document]
+    workshop: Workshop
+
+    def __getitem__(self, name: str) -> Document:
+        return self.found[name]
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A claim in the paper's words, with the experiments that it rests on.
+
+    `predicted` computes our side from configs alone, and may draw; `tested` judges what the experiments have found.
+    """
+
+    name: str
+    title: str
+    quote: str
+    experiments: tuple[Experiment, ...]
+    predicted: Callable[[Workshop], Side]
+    tested: Callable[[Findings], Assessment]
+    equation: str = ""
+
+    def claim(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageClaim:
+        """Return the claim with its ruling; a text among the `results` says why there is none."""
+        needed = {one.name: results.get(one.name, "") for one in self.experiments}
+        return PageClaim(
+            name=self.name,
+            title=self.title,
+            quote=self.quote,
+            predicted=self.predicted(workshop),
+            tested=self._tested(needed, workshop),
+            equation=self.equation,
+        )
+
+    def _tested(self, needed: Mapping[str, Kept | str], workshop: Workshop) -> Assessment:
+        found: dict[str, Document] = {}
+        for name, result in needed.items():
+            if isinstance(result, str):
+                reason = f": {text(result)}" if result else "; <code>rack reproduce</code> with the same folder goes on"
+                return Assessment(Side(), Ruling.UNMADE, f"The experiment {text(name)} has not been made{reason}.")
+            if result.lacking:
+                return Assessment(Side(), Ruling.UNTESTABLE, f"{text(result.lacking)}.")
+            found[name] = result.found
+        return self.tested(Findings(found, workshop))
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A section of the paper with its claims; `name` is its number, as in "3.1", or "abstract"."""
+
+    name: str
+    title: str
+    intro: str
+    statements: tuple[Statement, ...]
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """All experiments that it needs, each once."""
+        return tuple({one.name: one for statement in self.statements for one in statement.experiments}.values())
+
+    def section(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageSection:
+        """Return the section with every claim judged."""
+        claims = tuple(statement.claim(workshop, results) for statement in self.statements)
+        return PageSection(self.name, self.title, self.intro, claims)

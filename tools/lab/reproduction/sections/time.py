@@ -1,0 +1,63 @@
+"""Section 3 of the paper before its equations: soft time, and real time."""
+
+from __future__ import annotations
+
+from rack.tools.lab.reproduction.experiments.deadline import DEADLINE, TOO_EARLY
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
+
+
+def _goto(workshop: Workshop) -> Side:
+    return Side.of(
+        f"A is a pose above the first object's goal, B the start. In a task, {code('by')} is the simulated time by "
+        "which an action must be done. The task's planner rehearses the whole program before anything moves and adds "
+        "up the longest times of planning, waiting for the grid, motion and settling. It refuses a time that it "
+        "cannot promise, and names the earliest that it can. We first run without times, then with "
+        f"{100 * TOO_EARLY:g} % of the time that took, then with the time that the refusal names, rounded up to a "
+        "tenth of a second."
+    )
+
+
+def _goto_tested(findings: Findings) -> Assessment:
+    soft, early, met = findings[DEADLINE.name]["runs"]
+    rows = [
+        (
+            {None: "GOTO A, GOTO B"}.get(one["by_s"], f"GOTO A BY {one['by_s']} s, GOTO B"),
+            "never" if one["done_s"] is None else f"{one['done_s']:g}",
+            "yes" if one["moved"] else "no",
+            text(one["cause"]),
+            text(one["reason"]) or "-",
+        )
+        for one in (soft, early, met)
+    ]
+    head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
+    side = Side.of(Columns(head, rows, f"At A: {findings[DEADLINE.name]['place']} m. Runs in lockstep."))
+    is_refused = early["done_s"] is None and not early["moved"]
+    is_met = met["done_s"] is not None and met["done_s"] <= met["by_s"]
+    if is_refused and is_met:
+        why = (
+            f"By {early['by_s']:g} s is refused before anything moves; by {met['by_s']:g} s is promised, and done at "
+            f"{met['done_s']:g} s. Without a time nothing is promised."
+        )
+        return Assessment(side, Ruling.HOLDS, why)
+    return Assessment(side, Ruling.FAILS, f"Refused when it must be: {is_refused}; met when promised: {is_met}.")
+
+
+CHAPTER = Chapter(
+    name="3",
+    title="Timing Analysis",
+    intro="Systems that meet their response times are real-time systems. Sequencing alone is not.",
+    statements=(
+        Statement(
+            name="soft-and-real-time",
+            title="GOTO A, and GOTO A BY t",
+            quote="A sequence of robot commands GOTO A, GOTO B, does not contain any timing information. ... However, "
+            "the command GOTO A BY t<sub>i</sub>, GOTO B BY t<sub>i+1</sub> ... demands real time handling. Now, a "
+            "solution must be supplied within an explicit time.",
+            experiments=(DEADLINE,),
+            predicted=_goto,
+            tested=_goto_tested,
+        ),
+    ),
+)

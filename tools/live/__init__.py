@@ -1,0 +1,1 @@
+"""A rack while it runs: launched, shown, watched."""

@@ -1,0 +1,239 @@
+"""The operator's desk of a running rack, from the host side: gives a command to a level and waits for its reply."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config import loads
+from rack.boards.config.commands import asked, commandable, request, takes
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.operator import describe, message_of
+from rack.levels.operator import Answer, Operation
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import table
+from rack.tools.live.holds import resume_command
+from rack.tools.live.watched import WatchedRack
+
+REPLY_CYCLES = 4
+"""Cycles of a level within which it replies: one to read, one to become visible, and two that may be missed."""
+SILENT_S = 5.0
+"""Time without a tick after which a wait is given up."""
+NOTE_S = 1.5
+"""Time after which a wait is explained on stderr."""
+
+Fate = Literal["waiting", "given", "taken", "done", "refused", "overtaken"]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
+
+    The fate "waiting" is that of a command to a rack held for single steps; it has no serial yet.
+    The fate stays "given" where the level's status does not answer operators. `objection` is why it was refused.
+    """
+
+    serial: int
+    level: str
+    text: str
+    given: int
+    fate: Fate = "given"
+    taken_up: int = -1
+    done: int = -1
+    objection: str = ""
+
+    @property
+    def worked(self) -> bool:
+        """Whether it was not refused."""
+        return self.fate != "refused"
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether it is in force, as far as is known."""
+        return self.fate in ("taken", "done")
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {**asdict(self), "worked": self.worked}
+
+    @property
+    def line(self) -> str:
+        """All of it as one line."""
+        if self.fate == "waiting":
+            return f"command to '{self.level}', {self.text}: waits for the next step of the rack, which is held"
+        ends = {
+            "given": "; the status of this level does not answer operators",
+            "taken": f", taken up at tick {self.taken_up}",
+            "done": f", taken up at tick {self.taken_up}, done at tick {self.done}",
+            "refused": f", refused at tick {self.taken_up}: {self.objection}",
+            "overtaken": ", overtaken by a newer command",
+        }
+        return f"command {self.serial} to '{self.level}', {self.text}: given at tick {self.given}{ends[self.fate]}"
+
+
+class LiveDesk:
+    """The desk of one rack."""
+
+    def __init__(self, rack: WatchedRack) -> None:
+        self._rack, self._segment = rack, rack.segment
+        self._config = loads(self._segment.config)
+
+    def levels(self) -> list[dict[str, str]]:
+        """Return the commands that each level takes, and the one in force, as plain data."""
+        known = commandable(self._config)
+        return [
+            {"level": name, "in_force": self._in_force(name), "takes": takes(self._config, name, commands)}
+            for name, commands in known.items()
+        ]
+
+    def text(self, width: int | None = None) -> Iterator[str]:
+        """Yield the same as a table that fits `width`."""
+        yield from table(["level", "in force", "takes"], [list(row.values()) for row in self.levels()], width)
+
+    def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Reply:
+        """Give a command and wait until its level takes it up; with `wait`, until it is done.
+
+        `timeout_s` of wall-clock time bounds that wait; None: until the end of the run.
+
+        Raises `ConfigError` with every mistake, and `Failure` when it is not given or not answered in time.
+        """
+        segment, tick = self._segment, self._segment.words[System.TICK]
+        command = asked({key: value for key, value in given.items() if value is not None})
+        wanted = request(command, self._config, segment.layout)
+        if 0 <= wanted.tick <= tick:
+            key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
+            raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
+        if _Patience(self._rack, "").is_in_vain:
+            raise Failure(f"rack '{segment.rack}': its run is over")
+        if segment.words[System.HELD]:
+            # Without a client: the user steps the rack afterwards.
+            entry = OperatorTable(segment).add(wanted)
+            return Reply(0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting")
+        if (answering := _answering(segment, command.level)) is not None:
+            self._rack.follow(answering.name)
+        # However the wait ends, leaving the claim withdraws a request that has not been given.
+        with self._rack.claim(wanted) as entry:
+            ticket, text = entry[RequestWord.TICKET], describe(message_of(entry, segment.layout))
+            reply = self._await_giving(entry, ticket, command.level, text)
+        return self._await_reply(reply, wait, timeout_s)
+
+    def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Reply:
+        about = f"'{level}', {text}"
+        patience = _Patience(self._rack, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}")
+        while entry[RequestWord.TICKET] == ticket:
+            if entry.stage == RequestStage.GIVEN:
+                return Reply(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
+            if patience.is_in_vain:
+                raise Failure(f"{about}: the run ended before it was given")
+            if not patience.look_again():
+                raise Failure(f"{about}: not given, the clock has not ticked for {SILENT_S:g} s")
+        raise Failure(f"{about}: given, but its reply is lost: too many commands followed")
+
+    def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        status = _answering(self._segment, reply.level)
+        if status is None:
+            return reply
+        replies = Replies(self._segment, status, reply)
+        last = reply.given + REPLY_CYCLES * status.every
+        about = f"command {reply.serial}: "
+        patience = _Patience(self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks")
+        while True:
+            # Before the look: a reply written just before the run ended still counts.
+            in_vain, tick = patience.is_in_vain, self._segment.words[System.TICK]
+            reply = replies.look()
+            if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
+                return reply
+            if in_vain:
+                raise Failure(f"{reply.line}; the run ended")
+            if reply.fate == "given" and tick > last:
+                raise Failure(f"{about}'{reply.level}' has not answered in {REPLY_CYCLES} of its cycles")
+            if time.monotonic() > deadline:
+                still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
+                raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
+            if not patience.look_again():
+                raise Failure(f"{about}the clock has not ticked for {SILENT_S:g} s")
+
+    def _in_force(self, level: str) -> str:
+        """Return the operator's command in force at a level; empty: none."""
+        box = _answering(self._segment, level)
+        seen = open_observer(self._segment, box.name).peek() if box is not None else None
+        if seen is None or not seen.is_there or not seen.value.standing:
+            return ""
+        return Operation(seen.value.standing).name.lower()
+
+
+def _answering(segment: Segment, level: str) -> MailboxSpec | None:
+    """Return the status mailbox of a level; None where its status does not answer operators."""
+    boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
+    return next((box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}), None)
+
+
+class Replies:
+    """Follows a level's statuses, message by message, for their reply to one command."""
+
+    def __init__(self, segment: Segment, status: MailboxSpec, reply: Reply) -> None:
+        self._ring = MailboxRing(segment, status.name)
+        self.reply = reply  # as of the last look
+
+    def look(self) -> Reply:
+        """Read the statuses written since the last call."""
+        rows = self._ring.drain().rows
+        orders, answers = rows["message"]["order"], rows["message"]["answer"]
+        mine = orders == self.reply.serial
+        if self.reply.taken_up < 0 and mine.any():
+            self._take_up(rows[int(np.argmax(mine))])
+        done = mine & (answers == Answer.DONE)
+        if self.reply.fate == "taken" and done.any():
+            self.reply = replace(self.reply, fate="done", done=int(rows["tick"][int(np.argmax(done))]))
+        if self.reply.fate == "taken" and (late := mine & (answers == Answer.REFUSED)).any():
+            self._refuse(rows[int(np.argmax(late))])
+        if self.reply.fate in ("given", "taken") and (orders > self.reply.serial).any():
+            self.reply = replace(self.reply, fate="overtaken")
+        return self.reply
+
+    def _take_up(self, row: np.void) -> None:
+        self.reply = replace(self.reply, fate="taken", taken_up=int(row["tick"]))
+        if row["message"]["answer"] == Answer.REFUSED:
+            self._refuse(row)
+
+    def _refuse(self, row: np.void) -> None:
+        objection = row["message"]["objection"].decode("ascii", "replace")
+        self.reply = replace(self.reply, fate="refused", objection=objection)
+
+
+class _Patience:
+    """Waits as long as the rack's clock ticks; explains a long wait on stderr, once."""
+
+    def __init__(self, rack: WatchedRack, what: str) -> None:
+        self._rack, self._words, self._what = rack, rack.segment.words, what
+        self._tick, self._changed = self._words[System.TICK], time.monotonic()
+        self._note_at: float | None = self._changed + NOTE_S
+
+    def look_again(self) -> bool:
+        """Wait a moment; return False when the clock has not ticked for too long."""
+        self._rack.refresh()
+        now, tick = time.monotonic(), self._words[System.TICK]
+        if tick != self._tick:
+            self._tick, self._changed = tick, now
+        if self._note_at is not None and now > self._note_at:
+            self._note_at = None
+            print(f"{self._what}; the rack is at tick {tick}", file=sys.stderr, flush=True)
+        return now - self._changed < SILENT_S
+
+    @property
+    def is_in_vain(self) -> bool:
+        """Whether the run is over."""
+        return self._rack.segment.run_is_over

@@ -1,0 +1,83 @@
+"""A run's folder, and the event log in it: events.jsonl, one JSON object a line, the outcome last."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TextIO
+
+from rack.boards.events import Event
+from rack.tools.console.answer import Failure
+from rack.tools.live.display import Display
+
+RUNS = Path("runs")
+
+
+def folder_of(wanted: Path | None, rack: str) -> Path:
+    """Return the folder for a run that is about to start: `wanted`, or runs/<rack>-<time>. It is created later.
+
+    Raises `Failure` when `wanted` holds files already.
+    """
+    if wanted is None:
+        name = f"{rack}-{time.strftime('%Y%m%d-%H%M%S')}"
+        taken = len(list(RUNS.glob(f"{name}*")))
+        return RUNS / (f"{name}-{taken + 1}" if taken else name)
+    if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
+        raise Failure(f"--out {wanted}: exists already and is not an empty folder", 2)
+    return wanted
+
+
+class EventLog:
+    """Shows every event and writes it to events.jsonl, which is opened only once the rack is launched.
+
+    A write that fails, on a full disk, is reported once and does not end the run.
+    """
+
+    def __init__(self, display: Display) -> None:
+        self._display = display
+        self._waiting: list[str] = []
+        self._file: TextIO | None = None
+        self._has_failed = False
+
+    def add(self, event: Event) -> None:
+        """Show and write an event."""
+        self._display.show_event(event)
+        self._write(asdict(event))
+
+    def open(self, path: Path) -> None:
+        """Write to a file from now on, earlier events first."""
+        # Line-buffered: the log of a killed run is complete up to its end.
+        self._file = path.open("w", buffering=1)
+        waiting, self._waiting = self._waiting, []
+        self._put("".join(waiting))
+
+    def end(self, outcome: dict[str, Any]) -> None:
+        """Write the outcome and close the file."""
+        self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, with or without an outcome."""
+        if self._file is not None:
+            # Closing retries what could not be written.
+            with suppress(OSError):
+                self._file.close()
+
+    def _write(self, entry: dict[str, Any]) -> None:
+        line = json.dumps(entry) + "\n"
+        if self._file is None:
+            self._waiting.append(line)
+        else:
+            self._put(line)
+
+    def _put(self, text: str) -> None:
+        try:
+            if self._file is not None and not self._has_failed:
+                self._file.write(text)
+        except OSError as error:
+            self._has_failed = True
+            lost = f"events.jsonl ends here: {error.strerror}"
+            self._display.show_event(Event(time.time_ns(), -1, "recorder", "", lost))

@@ -1,0 +1,206 @@
+"""One run: launched, watched, recorded, and ended in order however it ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, System
+from rack.boards import Rack
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import CrateLine
+from rack.boards.events import Event, Outcome, braked_text
+from rack.boards.wiring import Entries
+from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.faults.ending import Strike, strikes
+from rack.tools.live.display import Display
+from rack.tools.live.folder import EventLog
+from rack.tools.live.holds import Standstill
+from rack.tools.live.queues import Queues
+from rack.tools.live.snapshot import RackMonitor
+from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.viewer.window import ViewerWindow, free_port, url
+
+COUNTED = (
+    *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
+    *("READS", "READ_BYTES", "WRITES", "WRITE_BYTES", "CORRUPT", "BUS_ERRORS"),
+)
+"""Words of a task's control block that a result keeps."""
+NO_TIME = "no time for the report: 'rack report {}' makes it"
+NO_RECORDER = "the recorder has not begun yet: real time begins without it, lockstep waits"
+
+News = Callable[[], list[str]]
+"""Returns messages for the user since the last call, of the recorder or the viewer."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run: its outcome, the counts of every task's control block, and the faults injected into it.
+
+    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events. `refused`: messages
+    that full queues refused, by queue. `recording` is "complete", "none" (not wanted), or what is missing; `rows_lost`
+    are the rows missing, by task and by mailbox.
+    """
+
+    rack: str
+    outcome: Outcome
+    wall_s: float
+    clock_skipped: int
+    tasks: dict[str, dict[str, int]]
+    recording: str
+    rows_lost: dict[str, int]
+    faults: tuple[Strike, ...]
+    clock_offset_ns: int
+    refused: dict[str, int]
+
+    @property
+    def worked(self) -> bool:
+        """Whether the run succeeded, and was recorded as wanted."""
+        return self.outcome.worked and self.recording in ("complete", "none")
+
+    def failure(self) -> str:
+        """Return in one line why the run did not succeed."""
+        end = self.outcome
+        if end.worked:
+            return f"{self.rack}: {end.cause}, but not all is recorded: {self.recording}"
+        return f"{self.rack}: {end.cause}: {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {**asdict(self), "worked": self.worked}
+
+    def text(self) -> str:
+        """Return the outcome as readable text."""
+        end = self.outcome
+        lines = [f"{self.rack}: {end.cause} after {end.ticks} ticks{': ' + end.reason if end.reason else ''}"]
+        lines += [f"fault: {fault}" for fault in end.faults]
+        lines += [braked_text(end.brakings)] if end.brakings else []
+        return "\n".join([*lines, f"digest {end.digest}"])
+
+
+def run_rack(
+    config: RackConfig,
+    seconds: float | None,
+    folder: Path | None,
+    display: Display,
+    *,
+    view: bool = False,
+    share: bool = True,
+    crate: CrateLine | None = None,
+    step: bool = False,
+    entries: Mapping[str, Entries] | None = None,
+) -> RunResult:
+    """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
+
+    With `view`, open a viewer on what the recorder serves; it may be closed at any time. With `step`, in lockstep, hold
+    before tick 0 until the rack is stepped. `share`, `crate` and `entries` are as in `Rack`.
+
+    Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that dies does not end the
+    run, but files that cannot be written do: raises `Failure`.
+    """
+    log = EventLog(display)
+    news: list[News] = []
+    with closing(log), ExitStack() as stack:
+        # Until the run has begun there is nothing to keep.
+        with INTERRUPT.at_once():
+            recorder = None if folder is None else RecorderProcess()
+            if recorder is not None:
+                stack.callback(recorder.finish)
+            rack = stack.enter_context(Rack(config, log.add, share, crate, entries))
+            rack.segment.words[System.HOLD_AT] = int(step)
+            if folder is not None and recorder is not None:
+                try:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    (folder / "config.toml").write_text(config.text())
+                    log.open(folder / "events.jsonl")
+                except OSError as error:
+                    raise Failure(f"{folder}: {error.strerror}") from None
+                port = free_port() if view else None
+                if not recorder.attach(config.name, folder, port, rack.segment.words):
+                    log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
+                news = [recorder.news, *([] if port is None else [_viewer(port)])]
+        unfinished = NO_TIME.format(folder) if folder else ""
+        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
+            started = time.monotonic()
+            outcome = _watch(rack, seconds, display, log, news)
+            wall_s, segment = time.monotonic() - started, rack.segment
+        _log_news(news, segment, log)
+        if recorder is not None and not INTERRUPT.number:
+            # Later it would find no rack to attach to.
+            recorder.await_begun()
+        rack.close()
+        recording, rows_lost = "none", dict[str, int]()
+        if folder is not None and recorder is not None:
+            recording, rows_lost = _compared(folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0))
+        _log_news(news, segment, log)
+        blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
+        result = RunResult(
+            rack=config.name,
+            outcome=outcome,
+            wall_s=wall_s,
+            clock_skipped=segment.words[System.CLOCK_SKIPPED],
+            tasks={task: {name.lower(): block[Block[name]] for name in COUNTED} for task, block in blocks.items()},
+            recording=recording,
+            rows_lost=rows_lost,
+            faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
+            clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+            refused={queue.mailbox: queue.refused for queue in Queues(segment).look()},
+        )
+        log.end(result.document())
+    return result
+
+
+def _viewer(port: int) -> News:
+    """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs all the same."""
+    try:
+        return ViewerWindow(url(port)).news
+    except Failure as failure:
+        news = [f"no viewer: {failure}"]
+        return lambda: [news.pop()] if news else []
+
+
+def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, news: list[News]) -> Outcome:
+    """Run the rack to its end; show it, and log what only the host side can see."""
+    rack.start(seconds)
+    monitor, standstill = RackMonitor(rack.segment), Standstill(rack.segment)
+    while rack.watch(display.period_s):
+        display.show(monitor.look())
+        _log_news(news, rack.segment, log)
+        for event in standstill.look():
+            log.add(event)
+    display.show(monitor.look())
+    if rack.outcome is None:
+        raise Failure("the run ended without an outcome")
+    return rack.outcome
+
+
+def _compared(folder: Path, segment: Segment, why: str) -> tuple[str, dict[str, int]]:
+    """Compare the files with what the rings say was written; `why` is how the recorder ended.
+
+    Return "complete" or what is missing, and the rows missing by task and by mailbox.
+    """
+    # Here, not above: its libraries would delay the launch.
+    from rack.tools.recording.recording import Recording
+
+    try:
+        missing = Recording(folder).missing(segment)
+    except Failure as error:
+        return f"{why}; {error}", {}
+    if not missing:
+        return "complete", {}
+    most, name = max((found, name) for name, found in missing.items())
+    text = f"{most.rows:,} of {most.written:,} rows of {name} are missing"
+    if len(missing) > 1:
+        text += f" (and rows of {len(missing) - 1} more tasks and mailboxes)"
+    return f"{text}; {why}", {name: found.rows for name, found in missing.items()}
+
+
+def _log_news(news: list[News], segment: Segment, log: EventLog) -> None:
+    for text in [text for source in news for text in source()]:
+        log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))

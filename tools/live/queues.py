@@ -1,0 +1,73 @@
+"""How full the queues of a rack are, and were in a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.mailbox.queue import queues_of, taken_name
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box
+
+if TYPE_CHECKING:
+    from rack.tools.recording.recording import Recording
+
+
+@dataclass(frozen=True)
+class QueueFill:
+    """A queue now: `unread` messages, of at most `capacity`, and how many were refused so far because it was full."""
+
+    mailbox: str
+    unread: int
+    capacity: int
+    refused: int
+
+    @property
+    def line(self) -> str:
+        """The queue as one line."""
+        refused = f", {self.refused} refused" if self.refused else ""
+        return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
+
+
+class Queues:
+    """Looks at the queues of a rack, from the host side."""
+
+    def __init__(self, segment: Segment) -> None:
+        names = [box.name for box in queues_of(segment.layout)]
+        self._ends = [(open_observer(segment, name), open_observer(segment, taken_name(name))) for name in names]
+
+    def look(self) -> tuple[QueueFill, ...]:
+        """Return every queue as it is now."""
+        found = []
+        for queue, position in self._ends:
+            # The position first: what is taken meanwhile was in the queue.
+            taken = int(position.peek().value.taken)
+            words, spec = queue.slots.box, queue.spec
+            found.append(QueueFill(spec.name, words[Box.SENT] - taken, spec.capacity, words[Box.REFUSED]))
+        return tuple(found)
+
+
+def queues(recording: Recording) -> list[dict[str, Any]]:
+    """Return what went through every queue: messages `sent`, `refused` (None: not recorded), most that ever waited.
+
+    `waiting` counts the messages that a read could see, before it took any.
+    """
+    refused = recording.ended.get("refused", {})
+    found = []
+    for box in queues_of(recording.layout):
+        taken, unread = (recording.signal(taken_name(box.name), field) for field in ("taken", "unread"))
+        before, sent = np.concatenate(([0], taken[:-1])), recording.signal(box.name, "serial")
+        found.append(
+            {
+                "mailbox": box.name,
+                "capacity": box.capacity,
+                "sent": int(sent[-1]) if len(sent) else 0,
+                "taken": int(taken[-1]) if len(taken) else 0,
+                "waiting": int((taken + unread - before).max()) if len(taken) else 0,
+                "refused": refused.get(box.name),
+            }
+        )
+    return found

@@ -1,0 +1,242 @@
+"""A snapshot of a running rack, from the host side: one row a task, what holds the rack, the progress of its task."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from rack.backplane.fault_table import FaultTable, Stage
+from rack.backplane.layout import TaskSpec
+from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import Message, State
+from rack.backplane.segment import Segment
+from rack.backplane.trace import trace_ring
+from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
+from rack.boards.exchange import EXCHANGE, PortAge, ages_of
+from rack.levels.timing.trace_times import execution_ns, lateness_ns
+from rack.tools.live.holds import Hold, Holds
+from rack.tools.live.host_side import EntryRow, HostRow, entry_rows, host_rows
+from rack.tools.live.interrupts import Inboxes, InboxFill
+from rack.tools.live.network import ExportRow, ImportRow, Network, PeerRow
+from rack.tools.live.queues import QueueFill, Queues
+
+LOST = "lost"
+"""State of a task that died or does not respond, until its new process has rejoined."""
+DEAD = "dead"
+"""State of a run whose launcher is gone: 'rack clean' removes it."""
+GONE = "gone"
+"""State of a run on another machine that does not answer any more."""
+HELD = "HELD: 'rack step {}' lets it go on"
+"""Line of a rack in lockstep that is single-stepped."""
+TASK_STATUS = "task_status"
+"""Message type of the level that reports the progress of the whole task."""
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """One task now. Times are the longest of the newest cycles, in ms; None before the first.
+
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `row` is what fired of a state table.
+    """
+
+    task: str
+    slot: int
+    core: int
+    priority: int
+    rate_hz: float
+    state: str
+    tick: int
+    cycles: int
+    plans: int
+    missed: int
+    skipped: int
+    restarts: int
+    exec_ms: float | None
+    lateness_ms: float | None
+    reason: str
+    row: str = ""
+
+
+@dataclass(frozen=True)
+class TaskProgress:
+    """Progress of the task: elemental moves and actions done, of how many."""
+
+    moves_done: int
+    moves: int
+    actions_done: int
+    actions: int
+    state: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
+
+    `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
+    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
+    `queues` are all of them, empty ones too; `inboxes` those of boards that messages interrupt; `exchanges` the
+    messages in use of boards with an exchange, by port; `peers` other racks on the network, `imports` and `exports`
+    what passes to and from them.
+    """
+
+    rack: str
+    run: str
+    tick: int
+    time_s: float
+    clock_skipped: int
+    lines: tuple[str, ...]
+    demand: str
+    faults: tuple[str, ...]
+    tasks: tuple[TaskRow, ...]
+    progress: TaskProgress | None
+    holds: tuple[Hold, ...] = ()
+    hosts: tuple[HostRow, ...] = ()
+    entries: tuple[EntryRow, ...] = ()
+    queues: tuple[QueueFill, ...] = ()
+    inboxes: tuple[InboxFill, ...] = ()
+    exchanges: Mapping[str, Mapping[str, PortAge]] = field(default_factory=dict)
+    peers: tuple[PeerRow, ...] = ()
+    imports: tuple[ImportRow, ...] = ()
+    exports: tuple[ExportRow, ...] = ()
+
+
+class RackMonitor:
+    """Takes snapshots of one rack; each covers the cycles since the one before."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._lines = UtilityLines(segment)
+        self._faults = FaultTable(segment)
+        self._holds = Holds(segment)
+        self._queues = Queues(segment)
+        self._inboxes = Inboxes(segment)
+        self._network = Network(segment)
+        self._joints = joint_names(segment.config)
+        self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+        self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
+        written = {m.name: m.message for m in segment.layout.mailboxes}
+        self._statuses = {
+            task.name: open_observer(segment, f"{task.name}.status")
+            for task in segment.layout.tasks
+            if f"{task.name}.status" in written
+        }
+        self._exchanges = {
+            box.writer: open_observer(segment, box.name) for box in segment.layout.mailboxes if box.message == EXCHANGE
+        }
+        whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
+        self._whole = open_observer(segment, whole) if whole else None
+
+    def look(self) -> Snapshot:
+        """Return the rack as it is now."""
+        words, layout = self._segment.words, self._segment.layout
+        lost = GONE if self._segment.is_mirror else DEAD
+        tick = words[System.TICK]
+        return Snapshot(
+            rack=layout.rack,
+            run=Run(words[System.STATE]).name.lower() if self._segment.launcher_is_alive else lost,
+            tick=tick,
+            time_s=tick * layout.clock_ns * 1e-9,
+            clock_skipped=words[System.CLOCK_SKIPPED],
+            lines=tuple(self._asserted()),
+            demand=Demand(words[System.DEMAND]).name.lower(),
+            faults=tuple(self._active_faults()),
+            tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
+            progress=self._progress(),
+            holds=self._holds.look(),
+            hosts=host_rows(self._segment),
+            entries=entry_rows(self._segment),
+            queues=self._queues.look(),
+            inboxes=self._inboxes.look(),
+            peers=self._network.peers(),
+            imports=self._network.imports(),
+            exports=self._network.exports(),
+            exchanges={
+                board: ages_of(reading.value)
+                for board, reader in self._exchanges.items()
+                if (reading := reader.peek()).is_there
+            },
+        )
+
+    def _active_faults(self) -> Iterator[str]:
+        for fault in self._faults.staged((Stage.ACTIVE,)):
+            # The kinds of faults take a while to import; most racks have none.
+            from rack.boards.faults.describe import describe
+
+            yield describe(fault, self._segment.layout, self._joints)
+
+    def _asserted(self) -> list[str]:
+        lines = self._lines
+        held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
+        single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
+        stepped = [HELD.format(self._segment.rack)] if self._segment.words[System.HELD] else []
+        return held + [name for name, asserted in single.items() if asserted] + self._without_priority() + stepped
+
+    def _without_priority(self) -> list[str]:
+        """Return a warning when tasks were refused their real-time priority."""
+        blocks = {task.name: self._segment.block(task.name) for task in self._segment.layout.tasks if task.priority}
+        refused = [name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]]
+        is_up = self._segment.words[System.STATE] != Run.STARTING
+        return [f"NO REAL-TIME PRIORITY: {', '.join(refused)}"] if refused and is_up else []
+
+    def _row(self, task: TaskSpec) -> TaskRow:
+        block = self._segment.block(task.name)
+        exec_ms, lateness_ms = self._times_ms(task.name)
+        state, reason, row = TaskState(block[Block.STATE]).name.lower(), "", ""
+        if block[Block.LOST]:
+            state = LOST
+        elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
+            state, reason = State(status.value.state).name.lower(), status.value.reason
+            row = fired(status.value)
+        return TaskRow(
+            task=task.name,
+            slot=task.slot,
+            core=block[Block.CORE],
+            priority=block[Block.PRIORITY],
+            rate_hz=1e9 / (task.every * self._segment.layout.clock_ns),
+            state=state,
+            tick=block[Block.DONE],
+            cycles=block[Block.CYCLES],
+            plans=block[Block.PLANS],
+            missed=block[Block.MISSED],
+            skipped=block[Block.SKIPPED],
+            restarts=self._restarts(task.name),
+            exec_ms=exec_ms,
+            lateness_ms=lateness_ms,
+            reason=reason,
+            row=row,
+        )
+
+    def _restarts(self, task: str) -> int:
+        """Return how often a new process took over the task's mailboxes: each writes in a new epoch."""
+        segment = self._segment
+        heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == task]
+        return max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)])
+
+    def _times_ms(self, task: str) -> tuple[float | None, float | None]:
+        """Return the longest execution and lateness of the cycles since the last look that saw any."""
+        cycles = self._traces[task].drain().rows
+        if len(cycles):
+            self._times[task] = float(execution_ns(cycles).max()) * 1e-6, float(lateness_ns(cycles).max()) * 1e-6
+        return self._times[task]
+
+    def _progress(self) -> TaskProgress | None:
+        if self._whole is None or not (status := self._whole.peek()).is_there:
+            return None
+        at = status.value
+        return TaskProgress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+
+
+def fired(status: Message) -> str:
+    """Return what fired of a state table in a level's newest cycle, as text; empty for a level without one."""
+    if "fired" not in (status.record.dtype.names or ()):
+        return ""
+    what = f"row {status.row} '{status.fired}'" if status.row else "no row"
+    return f"{what}, now in '{status.in_state}', table {status.table}"
+
+
+def joint_names(config: str) -> tuple[str, ...]:
+    """Return the joints of the arm in a resolved config, from base to tool; empty without an arm."""
+    return tuple(tomllib.loads(config).get("robot", {}).get("joints", ()))

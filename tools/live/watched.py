@@ -1,0 +1,81 @@
+"""A running rack to look at and to command: on this machine, or by HOST/RACK on another one."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol, Self
+
+from rack.backplane.segment import Segment
+from rack.tools.console.address import Asker, RackAddress, needing_zenoh
+
+if TYPE_CHECKING:
+    from rack.backplane.operator_table import Request, RequestEntry
+
+LOOK_S = 0.001
+
+
+class WatchedRack(Protocol):
+    """A rack in a context, with its segment as of the last `refresh`; on this machine that is always up to date."""
+
+    @property
+    def segment(self) -> Segment:
+        """The rack's segment, or a mirror of it."""
+
+    def __enter__(self) -> Self:
+        """Return it."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None, /
+    ) -> None:
+        """Leave it."""
+
+    def refresh(self) -> bool:
+        """Bring the segment up to date, or wait a moment; False when the rack is out of reach."""
+
+    def follow(self, mailbox: str) -> None:
+        """Let no message of a mailbox be missing from now on, as far as its slots reach back."""
+
+    def claim(self, request: Request) -> AbstractContextManager[RequestEntry]:
+        """Add a request, and withdraw it at the end of the `with` block unless it has been issued."""
+
+
+class LocalRack:
+    """A rack on this machine. Raises `SegmentError` when there is none."""
+
+    def __init__(self, rack: str) -> None:
+        self.segment = Segment.attach(rack)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.segment.close()
+
+    def refresh(self) -> bool:
+        """Wait a moment."""
+        time.sleep(LOOK_S)
+        return True
+
+    def follow(self, mailbox: str) -> None:
+        """Do nothing: all messages are here."""
+
+    def claim(self, request: Request) -> AbstractContextManager[RequestEntry]:
+        """Add a request to the operator table."""
+        from rack.backplane.operator_table import OperatorTable
+
+        return OperatorTable(self.segment).claim(request)
+
+
+def watched(rack: str, asker: Asker | None = None) -> WatchedRack:
+    """Return a rack by its name, or by HOST/RACK, which `asker` asks.
+
+    Raises `SegmentError` when there is none, or `Failure` for one on another machine.
+    """
+    if "/" not in rack:
+        return LocalRack(rack)
+    address = RackAddress.of(rack)
+    with needing_zenoh():
+        from rack.tools.network.remote import RemoteRack
+    return RemoteRack(address, asker or Asker.default())

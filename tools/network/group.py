@@ -1,0 +1,77 @@
+"""`rack lan`: what racks on a network need before they run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+YEAR = 365
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="folder of the set; made if it does not exist")]
+For = Annotated[
+    list[str],
+    typer.Option(
+        "--for",
+        metavar="NAME[=ADDRESS,...]",
+        help="rack, or person, that gets a certificate, with the addresses at which others reach it; repeatable",
+    ),
+]
+Days = Annotated[int, typer.Option(metavar="N", min=1, max=3650, help="validity, days")]
+
+
+@app.callback()
+def lan() -> None:
+    """Prepare racks that work together over a network."""
+
+
+@app.command()
+def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = False) -> None:
+    """Make a set of certificates for tests: an authority, a pair for each name, and a secret.
+
+    Racks know each other by name: the common name of a certificate is the name of the rack, and what a rack may send,
+    read or command depends on it. Give a rack that listens the addresses or host names that stand in the others'
+    `connect`: they check them. One that only connects, or a person who uses `rack status HOST/RACK` and the like, needs
+    none.
+
+    In DIR it writes authority.pem and authority-key.pem, NAME.pem and NAME-key.pem for each name, and secret, the key
+    of the seals on all messages. In a folder that holds a set already, it adds names to it. It never overwrites.
+
+    A config names the folder in [adapter.lan]: certificates = "DIR", relative to the config. Each machine needs only
+    authority.pem, secret, and its own pair. Keys and secret must be readable by their owner alone.
+
+    It is a set for tests: one folder holds the keys of all. Where it matters, have your own authority sign certificates
+    with the same names, from keys that never leave their machines.
+
+    Exit status: 0 made, 2 nothing was made.
+
+    \b
+    Examples:
+      rack lan certificates certs --for cell=10.0.0.1 --for cell-puma=10.0.0.2
+      rack lan certificates certs --for operator --days 30
+    """
+    try:
+        from rack.tools.network.certificates import make_credentials, named_addresses
+    except ImportError:
+        raise Failure("certificates are made with 'cryptography', which is missing: install nasrem-rack[lan]") from None
+    by_name = named_addresses(names)
+    made = make_credentials(folder, by_name, days)
+    answer = {
+        "folder": str(folder),
+        "made": list(made.files),
+        "names": by_name,
+        "expires": made.expires.isoformat(timespec="seconds"),
+    }
+    first = next(iter(by_name))
+    lines = [
+        f"made in {folder}: {', '.join(made.files)}",
+        f"valid until {made.expires:%Y-%m-%d}",
+        "A set for tests: whoever has this folder can pass for any of these racks.",
+        f"Each machine needs only authority.pem, secret, and its own pair, as in {first}.pem and {first}-key.pem.",
+    ]
+    print_answer(answer, lines, as_json)

@@ -1,0 +1,138 @@
+"""A rack on another machine, as if it were here: its mirrored segment, and commands to it."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Self
+
+from rack.backplane.address_map import OPERATOR_ENTRIES
+from rack.backplane.operator_table import Request, RequestEntry, RequestStage, RequestWord
+from rack.boards.lan.questions import (
+    MOST_CONTENT,
+    MOST_STRETCHES,
+    DeskAnswer,
+    Stretch,
+    Ticket,
+    packed_request,
+    packed_stretches,
+)
+from rack.tools.console.address import Asker, RackAddress
+from rack.tools.console.answer import Failure
+from rack.tools.network.mirror import Mirror
+from rack.tools.network.questioner import Questioner
+
+AT_ONCE = 4
+"""Questions on their way at once: as many as a desk answers in one cycle."""
+
+
+class RemoteRack:
+    """One launch of a rack on another machine, in a context.
+
+    `segment` is a mirror of its segment as of the last `refresh`. Raises `Failure` when the rack cannot be reached, or
+    does not permit this user to watch.
+    """
+
+    def __init__(self, address: RackAddress, asker: Asker | None = None) -> None:
+        self.address, self._asker = address, asker or Asker.default()
+        self._racks = Questioner(address.at, self._asker)
+        try:
+            self._launch = self._racks.launch(address.rack)
+            self.segment = Mirror(str(address), self._fetch)
+            self.segment.refresh()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the session."""
+        self._racks.__exit__()
+
+    def refresh(self) -> bool:
+        """Fetch what has changed; False when the rack is gone, or does not answer any more."""
+        segment = self.segment
+        if segment.is_there:
+            try:
+                segment.refresh()
+            except Failure:
+                segment.is_there = False
+        return segment.is_there
+
+    def follow(self, mailbox: str) -> None:
+        """Fetch every message of a mailbox from now on, as far as its slots reach back."""
+        self.segment.follow(mailbox)
+
+    def _fetch(self, stretches: Sequence[Stretch]) -> tuple[list[bytes], DeskAnswer]:
+        found: list[bytes] = []
+        questions = list(_questions(stretches))
+        for at in range(0, len(questions), AT_ONCE):
+            group = questions[at : at + AT_ONCE]
+            payloads = [packed_stretches(part) for part in group]
+            answers = self._racks.ask(self._launch, "read", payloads)
+            for part, answer in zip(group, answers, strict=True):
+                found += _parts(answer.content, part)
+        return found, answer
+
+    @contextmanager
+    def claim(self, request: Request) -> Iterator[RequestEntry]:
+        """Give a request to the rack, and withdraw it at the end of the `with` block unless it has been issued."""
+        self._check_right("command")
+        (answer,) = self._racks.ask(self._launch, "give", [packed_request(request)])
+        ticket = Ticket.unpacked(answer.content)
+        if ticket is None or ticket.entry >= OPERATOR_ENTRIES:
+            raise Failure(f"rack '{self.address}': its answer to the command is malformed")
+        entry = RequestEntry(self.segment, ticket.entry)
+        try:
+            self.refresh()
+            yield entry
+        finally:
+            is_known = entry[RequestWord.TICKET] == ticket.number
+            if not is_known or entry.stage == RequestStage.WAITING:
+                # If the rack is out of reach, it withdraws the request by itself.
+                with suppress(Failure):
+                    list(self._racks.ask(self._launch, "withdraw", [ticket.packed()]))
+
+    def _check_right(self, right: str) -> None:
+        permit = tomllib.loads(self.segment.config)["adapter"]["lan"].get("permit", {})
+        name = self._asker.name
+        if right not in permit.get(name, ()):
+            why = f"does not permit '{name}' to {right}; its config: adapter.lan.permit"
+            raise Failure(f"rack '{self.address.rack}' {why}")
+
+
+def stop(address: RackAddress, asker: Asker) -> int:
+    """Set the emergency stop of a rack; return the tick at which that was done. Raises `Failure`."""
+    with Questioner(address.at, asker) as racks:
+        (answer,) = racks.ask(racks.launch(address.rack), "stop", [b""])
+        return answer.tick
+
+
+def _questions(stretches: Sequence[Stretch]) -> Iterator[list[Stretch]]:
+    """Yield stretches in groups that one answer holds."""
+    group: list[Stretch] = []
+    size = 0
+    for stretch in stretches:
+        if group and (size + stretch.size > MOST_CONTENT or len(group) == MOST_STRETCHES):
+            yield group
+            group, size = [], 0
+        group.append(stretch)
+        size += stretch.size
+    if group:
+        yield group
+
+
+def _parts(content: bytes, stretches: Sequence[Stretch]) -> Iterator[bytes]:
+    """Yield the part of an answer that belongs to each stretch. Raises `Failure` when it is too short or too long."""
+    if len(content) != sum(stretch.size for stretch in stretches):
+        raise Failure("an answer is not as long as what was asked for")
+    at = 0
+    for stretch in stretches:
+        yield content[at : at + stretch.size]
+        at += stretch.size

@@ -1,0 +1,67 @@
+"""What entered a recorded run through its bus adapters, for a replay without host boards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rack.backplane.layout import MailboxSpec
+from rack.boards.classes import find_class
+from rack.boards.config.resolved import resolve
+from rack.boards.config.schema import RackConfig
+from rack.boards.host.adapter import STATUS
+from rack.boards.host.bus_adapter import BusAdapter
+from rack.boards.host.entries import AdapterParams, EntryConfig
+from rack.boards.wiring import Entries
+from rack.levels.level import Executor
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recording import Recording
+
+
+def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
+    """Return what each bus adapter of a config wrote in the run in folder `run`, by adapter and port.
+
+    Raises `ConfigError` for mistakes in the config, and `Failure` if the run has other entries, or lost some.
+    """
+    layout, recording = resolve(config).layout, Recording(run)
+    ran = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
+    hosts = {host.name for host in layout.hosts}
+    found: dict[str, Entries] = {}
+    for board, entries in _bridges(config):
+        inward = [port for port, entry in entries.items() if layout.mailbox(entry.source).writer in hosts]
+        boxes = {port: layout.mailbox(f"{board}.{port}") for port in (*inward, STATUS)}
+        for box in boxes.values():
+            _check(box, ran.get(box.name), recording)
+        found[board] = {
+            port: _rows(recording, box, is_queued=port != STATUS and entries[port].asynchronous)
+            for port, box in boxes.items()
+        }
+    if not found:
+        raise Failure(f"--entries {run}: '{config.name}' has no bus adapter", 2)
+    return found
+
+
+def _bridges(config: RackConfig) -> Iterator[tuple[str, dict[str, EntryConfig]]]:
+    for name, board in config.board.items():
+        if issubclass(find_class(board.executor, Executor), BusAdapter):
+            yield name, AdapterParams.entries_of(board.params)
+
+
+def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:
+    if recorded is None or (recorded.message, recorded.version, recorded.size) != (box.message, box.version, box.size):
+        what = (
+            "no such mailbox" if recorded is None else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
+        )
+        wanted = f"{box.message} {box.version}, {box.size} bytes"
+        raise Failure(f"--entries {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
+    if lost := recording.lost.get(box.name):
+        raise Failure(f"--entries {recording.folder}: {box.name}: its recorder lost {lost} messages", 2)
+
+
+def _rows(recording: Recording, box: MailboxSpec, is_queued: bool) -> list[tuple[int, bytes]]:
+    """Return ticks and messages of a mailbox; of one that repeats itself only the changes."""
+    if box.name not in recording.mailboxes:
+        return []
+    ticks, messages = recording.signal(box.name, "tick"), recording.messages(box)
+    rows = [(int(tick), message.tobytes()) for tick, message in zip(ticks, messages, strict=True)]
+    return [row for at, row in enumerate(rows) if is_queued or not at or row[1] != rows[at - 1][1]]

@@ -1,0 +1,159 @@
+"""What happened in a run: misses, what the machine did to its cores, holds, and the tick at which two runs diverge."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rack.backplane.layout import TaskSpec
+from rack.backplane.message import State
+from rack.levels.operator import Operation
+from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
+from rack.tools.console.answer import Failure
+
+if TYPE_CHECKING:
+    from rack.tools.recording.recording import Recording
+
+OWN = "holding"
+"""`by` of a hold whose reason comes from the level itself."""
+
+
+def misses(recording: Recording) -> list[dict[str, Any]]:
+    """Return every miss in the trace, earliest first: task, tick, `what` ("late" or "skipped"), count, times.
+
+    A skipped release leaves no record of its own: the next record has the number skipped before it.
+    """
+    found = [miss for task in recording.layout.tasks for miss in _misses_of(task, recording.trace(task.name))]
+    return sorted(found, key=lambda miss: (miss["tick"], miss["task"]))
+
+
+def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
+    rows = cycles[is_missed(cycles) | (skipped(cycles) > 0)]
+    found = []
+    columns = rows["tick"], skipped(rows), is_missed(rows), lateness_ns(rows) * 1e-6, lasted_ns(rows) * 1e-6
+    for tick, before, missed, late_ms, took_ms in zip(*(column.tolist() for column in columns), strict=True):
+        if before:
+            found.append({"task": task.name, "tick": tick - before * task.every, "what": "skipped", "count": before})
+        if missed:
+            times = {"started_ms": round(late_ms, 6), "took_ms": round(took_ms, 6)}
+            found.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
+    return found
+
+
+def counted(found: Sequence[dict[str, Any]]) -> tuple[int, int]:
+    """Return how many cycles of `misses` ended late, and how many were skipped."""
+    late, left_out = (sum(miss["count"] for miss in found if miss["what"] == what) for what in ("late", "skipped"))
+    return late, left_out
+
+
+def steal(recording: Recording) -> dict[str, Any]:
+    """Return the time stolen by the hypervisor, by core: ms, and `percent` of the run's time.
+
+    In lockstep, and where the kernel does not count it, steal is not `measured`.
+    """
+    record = recording.cores
+    stolen_ms = {str(core): ms for core, ms in record.stolen_ms().items()}
+    percent = {core: round(1e8 * ms / record.lasted_ns, 3) for core, ms in stolen_ms.items()}
+    return {"measured": record.stolen is not None, "ms": stolen_ms, "percent": percent}
+
+
+def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
+    """Return lowest and highest MHz by core; None where they were not measured."""
+    return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
+
+
+def holds(recording: Recording) -> list[dict[str, Any]]:
+    """Return every hold, the earliest first; `until_s` is None where it lasted to the end of the run.
+
+    `by` is "operator", with the command as `why`; or "holding", with the last reason that the level gave.
+    """
+    levels = [mailbox.removesuffix(".status") for mailbox in recording.mailboxes if mailbox.endswith(".status")]
+    found = [hold for level in levels for hold in _holds_of(recording, level)]
+    return sorted(found, key=lambda hold: (hold["since_s"], hold["level"]))
+
+
+def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
+    """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when first."""
+    found = {}
+    for mailbox in recording.mailboxes:
+        if not {"table", "row", "fired"} <= recording.fields(mailbox):
+            continue
+        ticks, row = recording.signal(mailbox, "tick"), recording.signal(mailbox, "row")
+        texts = recording.signal(mailbox, "table"), recording.signal(mailbox, "fired")
+        cycles: dict[tuple[str, int, str], list[int]] = {}
+        for tick, key in zip(ticks.tolist(), zip(texts[0], row.tolist(), texts[1], strict=True), strict=True):
+            cycles.setdefault(key, [0, tick])[0] += 1
+        tick_s = recording.layout.clock_ns * 1e-9
+        found[mailbox.removesuffix(".status")] = [
+            {"table": table, "row": number, "name": name, "cycles": count, "first_s": round(first * tick_s, 6)}
+            for (table, number, name), (count, first) in sorted(cycles.items(), key=lambda item: item[1][1])
+        ]
+    return found
+
+
+def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
+    mailbox, tick_s = f"{level}.status", recording.layout.clock_ns * 1e-9
+    fields = recording.fields(mailbox)
+    if "state" not in fields:
+        return
+    ticks, own = recording.signal(mailbox, "tick"), recording.signal(mailbox, "state") == State.HOLDING
+    standing = recording.signal(mailbox, "standing").astype(int) if "standing" in fields else np.zeros(len(ticks), int)
+    # An operator's command takes precedence over the level's own state.
+    what = np.where(standing > 0, standing, -own.astype(int))
+    for first, end in _stretches(what):
+        is_operators = what[first] > 0
+        why = Operation(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
+        since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
+        yield {
+            "level": level,
+            "by": "operator" if is_operators else OWN,
+            "why": why,
+            "since_s": round(since * tick_s, 6),
+            "until_s": None if until is None else round(until * tick_s, 6),
+            "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),
+        }
+
+
+def _stretches(what: np.ndarray) -> list[tuple[int, int]]:
+    """Return the stretches of equal numbers other than 0, each as its first place and the one after its last."""
+    borders = [0, *(np.flatnonzero(np.diff(what)) + 1).tolist(), len(what)]
+    return [(first, end) for first, end in pairwise(borders) if first < end and what[first]]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Where two runs diverge: the release tick of the first message that differs, and its mailbox."""
+
+    tick: int
+    mailbox: str
+
+
+def first_difference(one: Recording, other: Recording) -> Difference | None:
+    """Return where two runs diverge, up to the end of the shorter one; None when all that both wrote is equal.
+
+    Raises `Failure` when the two have no mailbox in common, or either lost rows.
+    """
+    for recording in (one, other):
+        lost = sum(recording.lost.values())
+        if lost:
+            raise Failure(f"{recording.folder}: its recorder lost {lost} rows; the two runs cannot be compared")
+    shared = [name for name in one.mailboxes if name in other.mailboxes]
+    if not shared:
+        raise Failure(f"{one.folder} and {other.folder} have no mailbox in common")
+    found = [difference for name in shared if (difference := _difference(one, other, name)) is not None]
+    return min(found, key=lambda difference: difference.tick, default=None)
+
+
+def _difference(one: Recording, other: Recording, mailbox: str) -> Difference | None:
+    # The chain covers serial, tick and content of a message and of all before it.
+    chains = [recording.signal(mailbox, "chain") for recording in (one, other)]
+    length = min(len(chain) for chain in chains)
+    differs = np.flatnonzero(chains[0][:length] != chains[1][:length])
+    if not len(differs):
+        return None
+    first = differs[0]
+    return Difference(int(min(recording.signal(mailbox, "tick")[first] for recording in (one, other))), mailbox)

@@ -1,0 +1,82 @@
+"""The recorder process, `python -m rack.tools.recording.recorder`.
+
+Its stdin names rack and folder, and closes when the run is over. It prints "recording" once it has attached;
+every other line is a message for the user.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from contextlib import suppress
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rack.backplane.segment import Segment
+    from rack.tools.recording.recorder.recorder import Sink
+
+NICENESS = 10
+"""On a shared core, boards go first, even those without real-time priority."""
+
+
+def main() -> None:
+    """Attach to the rack that one line of JSON names, and record until stdin closes; another line means: in a hurry."""
+    # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is complete.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    os.nice(NICENESS)
+    from rack.backplane.segment import Segment
+    from rack.backplane.words import System
+    from rack.tools.recording.recorder.recorder import Recorder, SafeSink
+    from rack.tools.recording.recorder_process import UNWRITABLE
+
+    # It takes half a second. A thread begins with it while the rack is being launched.
+    Thread(target=_import_viewer, daemon=True).start()
+    line = sys.stdin.readline()
+    if not line:
+        return
+    name, folder, port = json.loads(line)
+    segment = Segment.attach(name)
+    # A run in real time need not wait for the libraries of the viewer, unless the user wants to look on from the start.
+    in_background = port is None and not segment.words[System.LOCKSTEP]
+    view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
+    try:
+        with Recorder(segment, Path(folder), view) as recorder:
+            _tell("recording")
+            recorder.follow(until=sys.stdin.fileno())
+            if sys.stdin.readline():
+                view.hurry()
+    except OSError as error:
+        # The text of pyarrow's own errors is long.
+        why = os.strerror(error.errno) if error.errno else error
+        ended = f"{folder}: {why}: the recording ends at tick {segment.words[System.FOLLOWER_TICK]}"
+        print(ended, file=sys.stderr, flush=True)
+        os._exit(UNWRITABLE)
+
+
+def _import_viewer() -> None:
+    # If it is not there, opening the view says so.
+    with suppress(ImportError):
+        import rack.tools.viewer.sink  # noqa: F401
+
+
+def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
+    from rack.tools.viewer.sink import ViewSink
+
+    return ViewSink(segment, folder, port)
+
+
+def _tell(text: str) -> None:
+    # The launcher may be gone; the files are finished all the same.
+    with suppress(OSError):
+        print(text, flush=True)
+
+
+if __name__ == "__main__":
+    main()
+    # All files are complete. To take the interpreter apart under a thread that still imports could crash it.
+    os._exit(0)

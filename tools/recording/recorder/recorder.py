@@ -1,0 +1,199 @@
+"""The recorder: follows a rack by its rings, from the host side, and costs its boards nothing."""
+
+from __future__ import annotations
+
+import os
+import select
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from threading import Thread
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from rack.backplane.process import is_alive
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config.layout import KEPT_S
+from rack.tools.recording.cores import UNMEASURED, CoreMeter
+from rack.tools.recording.spool import Frame, RunFiles, Spool, rings
+
+REALTIME_S = 0.05
+LOCKSTEP_S = 0.005
+"""How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs faster than time."""
+
+HURRIED_S = 0.5
+"""Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends within 2 s."""
+
+
+class Sink(Protocol):
+    """Takes what a recorder drains."""
+
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Take rows of a ring, shape (rows,): trace records of a task, or messages of a mailbox."""
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Note that everything before `tick` has been taken; `lost` counts lost rows by ring."""
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Finish."""
+
+
+class SafeSink:
+    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the recorder continues.
+
+    Opened `in_background`, by a thread, it lets the recorder begin earlier: what it imports may take as long as a
+    launch. The rows of that time wait.
+    """
+
+    def __init__(self, opened: Callable[[], Sink], tell: Callable[[str], None], in_background: bool = False) -> None:
+        self._tell = tell
+        self._sink: Sink | None = None
+        # Kept: the viewer's library waits, maybe for ever, where a stream is dropped whose file could not be written.
+        self._failed: Sink | None = None
+        self._waiting: list[Callable[[Sink], None]] = []
+        # A daemon: a process in a hurry does not wait for it.
+        self._opening = Thread(target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True)
+        self._opening.start()
+        if not in_background:
+            self._opening.join()
+        self._patience_s: float | None = None
+
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Pass rows on."""
+        self._pass(lambda sink: sink.add(ring, rows))
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Pass the tick on."""
+        self._pass(lambda sink: sink.advance(tick, lost))
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Finish the sink, once it is open."""
+        self._pass(lambda sink: sink.close(tick, lost))
+        self._opening.join(self._patience_s)
+        if self._opening.is_alive():
+            self._tell("run.rrd is missing: the run was interrupted before the libraries of the viewer were loaded")
+        else:
+            self._hand_over()
+
+    def hurry(self) -> None:
+        """Do without a sink that will not be open soon."""
+        self._patience_s = HURRIED_S
+
+    def _pass(self, call: Callable[[Sink], None]) -> None:
+        self._waiting.append(call)
+        if not self._opening.is_alive():
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Make the calls that waited for the sink; there are none to make of one that has failed."""
+        waiting, self._waiting = self._waiting, []
+        for call in waiting:
+            if (sink := self._sink) is not None:
+                self._guarded(partial(call, sink))
+
+    def _guarded(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except Exception as error:
+            self._sink, self._failed = None, self._sink
+            self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
+
+
+RISKED_PART = 4
+"""Lockstep may be ahead of the spool's file by one part in so many of the rings."""
+
+
+class Recorder:
+    """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the same rows.
+
+    The first recorder of a rack in lockstep is its follower: the clock waits for it. `refresh` brings a mirror of a
+    segment on another machine up to date.
+    """
+
+    def __init__(
+        self, segment: Segment, folder: Path, view: Sink | None = None, refresh: Callable[[], object] | None = None
+    ) -> None:
+        layout = segment.layout
+        self._view, self._refresh = view, refresh
+        self._segment, self._words = segment, segment.words
+        # The spool first: it fails where another recorder is running, and leaves that one's files alone.
+        self._spool = Spool(folder, layout, segment.launch)
+        self._files = RunFiles(folder, layout, segment.launch)
+        self._spool.resume(self._files.add)
+        self._rings = rings(segment)
+        for name, taken in self._files.taken.items():
+            self._rings[name].resume(taken)
+        # Lockstep has no deadlines that the machine could break; the cores of another machine are not seen.
+        self._cores = None if self._words[System.LOCKSTEP] or refresh is not None else CoreMeter()
+        self._is_stopped = False
+        follower = self._words[System.FOLLOWER_PID]
+        is_awaited = follower == os.getpid()
+        self._is_follower = is_awaited or not is_alive(follower)
+        # All rows up to here are in the spool's file. The launcher's recorder still has to read those after, even if
+        # the one before it died with no row in the file; another one begins now.
+        self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
+        self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
+        self._report_progress()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def drain(self) -> None:
+        """Record everything written since the last call."""
+        if self._refresh is not None:
+            self._refresh()
+        tick = self._words[System.TICK]
+        for name, ring in self._rings.items():
+            rows, lost = ring.drain()
+            self._spool.add(name, rows, lost)
+            self._files.add(Frame(name, rows, lost))
+            if self._view is not None:
+                self._view.add(name, rows)
+        if self._is_follower:
+            self._words[System.FOLLOWER_DRAINED] = tick
+        # A killed recorder loses the rows that are not in its file: lockstep must not run far ahead of it.
+        is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
+        if self._spool.flush(now=is_late):
+            self._safe_tick = tick
+        if self._cores is not None:
+            self._cores.look()
+        if self._view is not None:
+            self._view.advance(tick, self._files.lost)
+        self._report_progress()
+
+    def _report_progress(self) -> None:
+        """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost after a delay."""
+        if self._is_follower:
+            self._words[System.FOLLOWER_TICK] = self._safe_tick
+            self._words[System.FOLLOWER_PID] = os.getpid()
+
+    def follow(self, until: int | None = None) -> None:
+        """Record until the run is over; with a descriptor `until`, until that is readable or closed."""
+        period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
+        watched = [] if until is None else [until]
+        while not select.select(watched, [], [], period_s)[0]:
+            self.drain()
+            over = self._segment.run_is_over
+            if self._is_stopped or (until is None and over):
+                break
+        self.drain()
+
+    def stop(self) -> None:
+        """Make `follow` return soon."""
+        self._is_stopped = True
+
+    def close(self) -> None:
+        """Finish both files; the rack continues without a follower."""
+        if self._is_follower:
+            self._words[System.FOLLOWER_PID] = 0
+        self._spool.flush(now=True)
+        self._files.close(UNMEASURED if self._cores is None else self._cores.record())
+        self._spool.remove()
+        if self._view is not None:
+            self._view.close(self._words[System.TICK] + 1, self._files.lost)

@@ -1,0 +1,276 @@
+"""A recording, read back: the trace, the signals and the events of one run."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.mailbox.history import row_dtype
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.segment import Launch, Segment, layout_of, mailbox_of
+from rack.backplane.trace import FIELDS, RECORD
+from rack.boards.config import RackConfig, loads
+from rack.boards.errors import ConfigError
+from rack.boards.events import Event
+from rack.tools.console.answer import Failure
+from rack.tools.recording.cores import UNMEASURED, CoreRecord
+from rack.tools.recording.parquet import CONFIG, HEAD, columns_of, config_check
+from rack.tools.recording.spool import mend, rings
+
+
+class Missing(NamedTuple):
+    """Rows of a ring that a recording lacks, of how many that were written."""
+
+    rows: int
+    written: int
+
+
+UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
+"""Errors of reading a damaged file, or a file of another kind."""
+
+
+class Recording:
+    """The folder of a run. Every part raises `Failure`, with the file and its fault, when it cannot be read.
+
+    The spool of a recorder that was killed is first turned into readable files, with a note on stderr.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.config = self._text(CONFIG)
+        """The resolved config, as TOML text."""
+        with _naming(folder):
+            if mend(folder):
+                _note(f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and signals.parquet")
+        self._cycles = self._open("cycles.parquet", ("task", "tick"))
+        self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
+        # Earlier versions stored no checksum.
+        recorded = (self._signals.schema_arrow.metadata or {}).get(b"config", b"").decode()
+        if recorded and recorded != config_check(folder):
+            raise Failure(f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2)
+
+    @cached_property
+    def rack_config(self) -> RackConfig:
+        """The resolved config. Raises `Failure` with every mistake in it."""
+        try:
+            return loads(self.config)
+        except ConfigError as error:
+            mistakes = "; ".join(str(error).splitlines())
+            raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
+
+    def _open(self, name: str, columns: Sequence[str]) -> pq.ParquetFile:
+        path = self._there(name)
+        with _naming(path):
+            file = pq.ParquetFile(path)
+        if absent := [column for column in columns if column not in file.schema_arrow.names]:
+            raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
+        return file
+
+    def _text(self, name: str) -> str:
+        path = self._there(name)
+        try:
+            return path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise Failure(f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2) from None
+        except OSError as error:
+            raise Failure(f"{path}: {error.strerror}", 2) from None
+
+    def _there(self, name: str) -> Path:
+        if not (self.folder / name).is_file():
+            raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
+        return self.folder / name
+
+    @cached_property
+    def events(self) -> list[dict[str, Any]]:
+        """The events of the run, oldest first. Raises `Failure` when a line is not an event."""
+        path = self.folder / "events.jsonl"
+        if not path.is_file():
+            return []
+        *lines, last = self._text(path.name).split("\n")
+        found = [_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1)]
+        if last:
+            # A run that was killed leaves half a line.
+            _note(f"{path}: line {len(lines) + 1} is cut off, and left out")
+        return found
+
+    @cached_property
+    def ended(self) -> dict[str, Any]:
+        """Counts at the end of the run, as in `rack.tools.live.launch.RunResult`; empty where they are not recorded."""
+        return next((event for event in self.events if event["kind"] == "outcome"), {})
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The rack's layout, without the fields of its messages: see `fields` and `signal`."""
+        with _naming(self.folder / "signals.parquet"):
+            text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
+            boxes = [mailbox_of({**m, "fields": ()}) for m in text["mailboxes"]]
+            # Earlier versions recorded no host boards.
+            tasks, hosts = (tuple(TaskSpec(**task) for task in text.get(key, ())) for key in ("tasks", "hosts"))
+            return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes), hosts)
+
+    @cached_property
+    def whole_layout(self) -> Layout:
+        """The rack's layout with the fields of its messages."""
+        with _naming(self.folder / "signals.parquet"):
+            return layout_of({"hosts": (), **json.loads(self._signals.schema_arrow.metadata[b"layout"])})
+
+    @property
+    def launch(self) -> Launch:
+        """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do not hold it."""
+        text = (self._signals.schema_arrow.metadata or {}).get(b"launch")
+        if text is None:
+            why = "does not say when the rack was launched: it was recorded by an earlier version; run the rack again"
+            raise Failure(f"{self.folder}: {why}", 2)
+        return Launch(*json.loads(text))
+
+    @cached_property
+    def lost(self) -> dict[str, int]:
+        """Rows that were written and are not in the files, by task and by mailbox."""
+        if "rows_lost" in self.ended:
+            return dict(self.ended["rows_lost"])
+        with _naming(self.folder):
+            texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
+            return {name: count for text in texts for name, count in json.loads(text).items()}
+
+    def missing(self, segment: Segment) -> dict[str, Missing]:
+        """Return what the files lack of the rings of a rack that has ended, by task and by mailbox."""
+        found = {}
+        for name, ring in rings(segment).items():
+            lost = self.lost[name]
+            if name in self.cycles:
+                rows = len(self.cycles[name])
+                at = lost + rows
+            else:
+                serials = self.signal(name, "serial")
+                rows = len(serials)
+                at = int(serials[-1]) if rows else 0
+            ring.resume(at)
+            written = at + ring.waiting
+            left, overwritten = ring.drain()
+            # Messages that every reader rejects are absent and not lost; those lost last are overwritten.
+            if count := min(lost, at - rows) + overwritten + len(left):
+                found[name] = Missing(count, written)
+        return found
+
+    @cached_property
+    def cores(self) -> CoreRecord:
+        """What the machine did to its cores; empty if the recorder did not measure it, or was killed."""
+        with _naming(self.folder / "cycles.parquet"):
+            text = self._cycles.metadata.metadata.get(b"cores")
+            return UNMEASURED if text is None else CoreRecord.of(text)
+
+    def need_all_columns(self) -> None:
+        """Raise `Failure` for a trace that lacks columns."""
+        if lacking := [name for name in FIELDS if name not in self._cycles.schema_arrow.names]:
+            why = f"cycles.parquet has no column {', '.join(lacking)}: it was recorded by an earlier version"
+            raise Failure(f"{self.folder}: {why}; run the rack again", 2)
+
+    @cached_property
+    def cycles(self) -> dict[str, np.ndarray]:
+        """The trace by task: structured rows, oldest first, with the fields of `rack.backplane.trace.RECORD`."""
+        with _naming(self.folder / "cycles.parquet"):
+            table = self._cycles.read()
+            tasks = table["task"].to_numpy()
+            # 0 in columns that an earlier version did not record.
+            rows = np.zeros(len(tasks), dtype=RECORD)
+            for name in table.column_names[1:]:
+                rows[name] = table[name].to_numpy()
+        return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
+
+    def place(self, task: TaskSpec) -> tuple[int, int]:
+        """Return core and priority that a task obtained; those of the config where the run's end is not recorded."""
+        counted = self.ended.get("tasks", {}).get(task.name, {})
+        return counted.get("core", task.core), counted.get("priority", task.priority)
+
+    def trace(self, task: str) -> np.ndarray:
+        """Return the trace of a task, as in `cycles`; empty for a task that left none."""
+        return self.cycles.get(task, np.empty(0, dtype=RECORD))
+
+    def signal(self, mailbox: str, field: str) -> np.ndarray:
+        """Return one field of every message of a mailbox, oldest first, shape (messages, *shape of the field).
+
+        "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox. Raises `KeyError`.
+        """
+        schema = self._signals.schema_arrow
+        name = field if field in schema.names else f"{mailbox}.{field}"
+        column = schema.field(name)
+        groups = [group for group in range(self._signals.num_row_groups) if self._mailbox_of(group) == mailbox]
+        with _naming(self.folder / "signals.parquet"):
+            read = [self._signals.read_row_group(group, columns=[name]).column(0).combine_chunks() for group in groups]
+        shape = tuple(json.loads(column.metadata[b"shape"])) if column.metadata else ()
+        values = [(block.flatten() if shape else block).to_numpy(zero_copy_only=False) for block in read]
+        if not values:
+            return np.empty((0, *shape))
+        return np.concatenate(values).reshape(-1, *shape)
+
+    def messages(self, box: MailboxSpec) -> np.ndarray:
+        """Return every message of a mailbox as it was written, oldest first; `box` with its fields."""
+        found = np.zeros(len(self.signal(box.name, "tick")), message_dtype(box.fields, box.size))
+        for column in columns_of(box):
+            part = found
+            for key in column.path[:-1]:
+                part = part[key]
+            part[column.path[-1]] = self.signal(box.name, column.name.removeprefix(f"{box.name}."))
+        return found
+
+    def rows(self, name: str) -> np.ndarray:
+        """Return what a recorder took from a ring, oldest first: trace records of a task, or messages of a mailbox."""
+        if name in self.cycles:
+            return self.cycles[name]
+        box = self.whole_layout.mailbox(name)
+        found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
+        for field in HEAD:
+            found[field] = self.signal(name, field)
+        found["message"] = self.messages(box)
+        return found
+
+    def fields(self, mailbox: str) -> set[str]:
+        """Return the fields of a mailbox's messages."""
+        names = [name for name in self._signals.schema_arrow.names if name.startswith(f"{mailbox}.")]
+        return {name.removeprefix(f"{mailbox}.") for name in names}
+
+    @cached_property
+    def mailboxes(self) -> list[str]:
+        """The mailboxes that hold messages."""
+        return list(dict.fromkeys(self._mailbox_of(group) for group in range(self._signals.num_row_groups)))
+
+    def _mailbox_of(self, group: int) -> str:
+        # A row group holds rows of one mailbox only: its smallest name is its only one.
+        return str(self._signals.metadata.row_group(group).column(0).statistics.min)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turn an error of reading into a `Failure` that names the file."""
+    try:
+        yield
+    except UNREADABLE as error:
+        raise Failure(f"{path}: not readable as a recording: {' '.join(str(error).split()) or error!r}", 2) from None
+
+
+def _event(line: str, place: str) -> dict[str, Any]:
+    """Return an event from its line. Raises `Failure`."""
+    try:
+        event = json.loads(line)
+        if event["kind"] == "outcome":
+            {**event["outcome"], **event["tasks"]}
+        else:
+            Event(**event)
+            int(event["tick"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise Failure(f"{place}: not an event of a run: {error or error!r}", 2) from None
+    return dict(event)
+
+
+def _note(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,196 @@
+"""A run compared with the timing model: every equation twice, predicted from the budgets and as measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from rack.boards.config import RackConfig, rack_timing
+from rack.boards.config.timing import without_interrupts
+from rack.levels.timing.equations import Relation
+from rack.levels.timing.rack import RackTiming
+from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, verdicts
+from rack.tools.console.answer import Failure
+from rack.tools.recording.cycles import WORST, Cycles, budgets_of, cycles_of, worst_of
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.breaches import Breach, breaches
+from rack.tools.timing.analysis.rules import cycle_ns, response_ns, slice_ns, steps_ns
+from rack.tools.timing.measured_response import system_response
+
+MOSTLY = 99.0
+"""Percentile for the question whether a level fails in most of its cycles."""
+OBSERVED = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
+"""Equations that a run shows directly; the others follow from the times of its levels."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One equation put to one subject. `predicted` is None without a budget, `measured` if a run cannot show it."""
+
+    equation: str
+    subject: str
+    predicted: EquationVerdict | None
+    measured: EquationVerdict | None
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the run contradicts the prediction."""
+        if self.predicted is None or self.measured is None:
+            return False
+        # The measured load of an overloaded core stays below 1.
+        is_full = self.equation == LOAD and not self.predicted.holds
+        return self.predicted.holds != self.measured.holds and not is_full
+
+    @property
+    def fails(self) -> bool:
+        """Whether the equation failed in the run."""
+        return self.measured is not None and not self.measured.holds
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """A run compared with the timing model.
+
+    `predicted` is the rack with the budgets of its config, `measured` the rack with those of the run. `cycles` are by
+    task, `loads` by core, as parts of its time; `response` is that of the system, None without a hierarchy. `pairs` are
+    of the `percentile`, `mostly` of the longest of `MOSTLY` in 100 cycles: a level that does not fit fails in most of
+    its cycles, a machine that stalls now and then does not.
+    """
+
+    recording: Recording
+    config: RackConfig
+    percentile: float
+    cycles: Mapping[str, Cycles]
+    loads: Mapping[int, float]
+    response: Mapping[str, Any] | None
+    predicted: RackTiming
+    measured: RackTiming
+    pairs: tuple[Pair, ...]
+    mostly: tuple[Pair, ...]
+    breaches: tuple[Breach, ...]
+
+    @classmethod
+    def of(
+        cls, recording: Recording, percentile: float = WORST, progress: Callable[[float], None] = lambda part: None
+    ) -> Analysis:
+        """Analyze a recorded run; `progress` takes the part done. Raises `Failure` for an empty or old trace."""
+        config, layout = recording.rack_config, recording.layout
+        cycles = cycles_of(recording)
+        if not cycles:
+            raise Failure(f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2)
+        progress(0.4)
+        predicted = rack_timing(config, layout)
+        loads, response = core_loads(recording, cycles, predicted), system_response(recording)
+
+        def measured(percent: float) -> RackTiming:
+            return rack_timing(config, layout, without_interrupts(predicted, budgets_of(cycles, percent)))
+
+        def pairs(percent: float) -> tuple[Pair, ...]:
+            rack = measured(percent)
+            directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *_cores(loads)]
+            derived = [verdict for verdict in verdicts(rack) if verdict.equation not in OBSERVED]
+            return tuple(_paired(verdicts(predicted), [*derived, *directly]))
+
+        found = pairs(percentile)
+        progress(0.7)
+        return cls(
+            recording=recording,
+            config=config,
+            percentile=percentile,
+            cycles=cycles,
+            loads=loads,
+            response=response,
+            predicted=predicted,
+            measured=measured(percentile),
+            pairs=found,
+            mostly=pairs(min(percentile, MOSTLY)),
+            breaches=tuple(breaches(cycles, predicted)),
+        )
+
+    @property
+    def holds(self) -> bool:
+        """Whether every equation held in the run."""
+        return not any(pair.fails for pair in self.pairs)
+
+    @property
+    def judged_breaches(self) -> tuple[Breach, ...]:
+        """The breaches of cycles that are judged, the worst first."""
+        return tuple(breach for breach in self.breaches if breach.is_judged)
+
+
+def _paired(predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]) -> list[Pair]:
+    """Return every equation on every subject, in the order of the equations."""
+    sides = [{_key(verdict): verdict for verdict in side} for side in (predicted, measured)]
+    pairs = [Pair(*key[:2], *(side.get(key) for side in sides)) for key in dict.fromkeys([*sides[0], *sides[1]])]
+    return sorted(pairs, key=lambda pair: ORDER.index(pair.equation))
+
+
+def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
+    # The system's response is judged down and up; eq. 3.7 asks something else of a config than of a run.
+    meaning = verdict.meaning if verdict.equation in ("3.2", "3.3", "3.7") else ""
+    return verdict.equation, verdict.subject, meaning
+
+
+def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield eq. 3.2 on the longest response of the run, and eq. 3.3 on the sum with its waits for the grid."""
+    if response is None:
+        return
+    # The response is in simulated time.
+    wall_ns = 1e6 * rack.tick_ns / rack.clock_ns
+    for found, way in product((response, *response["others"]), ("command", "status")):
+        if (times := found[way]["measured_ms"]) is None:
+            continue
+        bound, limit = found["bound_eq_3_2_ms"] * wall_ns, "n R_max"
+        if rack.response_goal_ns is not None:
+            bound, limit = rack.response_goal_ns / rack.speed, "timing.response_ms"
+        longest_ns, bound_ns = times["max"] * wall_ns, found[way]["bound_ms"] * wall_ns
+        meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
+        yield EquationVerdict.of("3.2", found["subject"], Relation(longest_ns, "<=", bound), meaning)
+        meaning = f"R_s of a {way} <= sum of R_i and of the waits for the grid"
+        yield EquationVerdict.of("3.3", found["subject"], Relation(longest_ns, "<=", bound_ns), meaning)
+
+
+def _tasks(found: Mapping[str, Cycles], rack: RackTiming, percentile: float) -> Iterator[EquationVerdict]:
+    for name, cycles in found.items():
+        if cycles.task.role == "executor":
+            step = worst_of(steps_ns(cycles, rack)[cycles.is_judged], percentile)
+            relation = Relation(step, "=", cycle_ns(rack, cycles.task))
+            yield EquationVerdict.of("3.7", name, relation, "t_(k+1) - t_k = R_i")
+        if not rack.is_lockstep:
+            worst = worst_of(response_ns(cycles, rack)[cycles.is_judged], percentile)
+            relation = Relation(worst, "<=", slice_ns(rack, cycles.task))
+            yield EquationVerdict.of(RESPONSE_TIME, name, relation, "measured response <= deadline")
+
+
+def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
+    for core, load in loads.items():
+        relation = Relation(load, "<=", 1.0)
+        yield EquationVerdict.of(LOAD, f"core {core}", relation, "time used by its tasks", "1")
+
+
+def core_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[int, float]:
+    """Return by core the part of its time that tasks used, as `task_loads`."""
+    loads: dict[int, float] = {}
+    for name, load in task_loads(recording, found, rack).items():
+        loads[found[name].core] = loads.get(found[name].core, 0.0) + load
+    return dict(sorted(loads.items()))
+
+
+def task_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[str, float]:
+    """Return by task the part of its core's time that it used, without the clock's own.
+
+    An executor counts at all its releases, skipped ones too: so the load of an overloaded core exceeds 1.
+    """
+    first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
+    last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
+    lasted_ns = (last - first + 1) * rack.tick_ns
+    loads: dict[str, float] = {}
+    for name, cycles in found.items():
+        used_ns = recording.cycles[name]["processor_ns"]
+        if cycles.task.role == "executor":
+            loads[name] = float(used_ns.mean()) / cycle_ns(rack, cycles.task)
+        else:
+            loads[name] = int(used_ns.sum()) / lasted_ns
+    return loads

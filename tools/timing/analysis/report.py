@@ -1,0 +1,320 @@
+"""report.json and report.md of one run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.message import State
+from rack.boards.config import RackConfig, wire
+from rack.boards.config.timing import tick_ns
+from rack.levels.messages import SCENE, TASK_STATUS
+from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
+from rack.levels.systems.hand.messages import HAND_STATUS
+from rack.levels.systems.joint_boards.messages import DRIVING
+from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
+from rack.levels.timing.trace_times import (
+    communication_ns,
+    distribution,
+    execution_ns,
+    gaps_ns,
+    lateness_ns,
+    plan_ages,
+    residual_ns,
+)
+from rack.tools.faults.judge import faults
+from rack.tools.live.host_side import entries_of
+from rack.tools.live.interrupts import interrupts
+from rack.tools.live.queues import queues
+from rack.tools.recording.history import counted, fired_rows, first_difference, frequency, holds, misses, steal
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.stalls import stalls_of
+from rack.tools.timing.analysis.network import network
+from rack.tools.timing.analysis.report_markdown import markdown
+from rack.tools.timing.measured_response import system_response
+
+Report = dict[str, Any]
+FALLING_M_S = 0.05
+"""Speed from which an object falls: a grip that slips, or fingers that lower it, are slower."""
+BOUNCE = 2
+"""Samples between the parts of one fall."""
+SETTLE = 20
+"""Samples after a fall in which the object comes to rest: at first it sinks into what it landed on, or bounces."""
+LEAST_M = 0.005
+"""Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part along."""
+ENTRY_COUNTS = ("passed", "refused", "overtaken", "full", "waiting")
+
+
+def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
+    """Write the report of the run in `folder` into it, and return it as data and as text.
+
+    With the folder of another run, `against`, it says where the two diverge.
+    """
+    recording = Recording(folder)
+    report = report_of(recording)
+    if against is not None:
+        report["against"] = _compared(recording, Recording(against), report["misses"])
+    text = markdown(report)
+    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    (folder / "report.md").write_text(text)
+    return report, text
+
+
+def report_of(recording: Recording) -> Report:
+    """Return the report of a recorded run as plain data."""
+    config, layout = recording.rack_config, recording.layout
+    ended, found = recording.ended, misses(recording)
+    last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
+    report = _head(config, ended, last + 1)
+    if not ended:
+        # Without the end of the run in the recording, the trace has to do.
+        report["missed"], report["skipped"] = counted(found)
+    return {
+        **report,
+        "folder": str(recording.folder),
+        "misses": found,
+        "steal": steal(recording),
+        "stalls": asdict(stalls_of(recording)[0]),
+        "frequency_mhz": frequency(recording),
+        "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
+        "holds": holds(recording),
+        "state_tables": fired_rows(recording),
+        **faults(recording.events, layout),
+        "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
+        "system_response": system_response(recording),
+        "entries": _entries(recording),
+        "network": network(recording),
+        "task": _task_outcome(recording),
+        "objects": list(_objects(recording, config)),
+        "motion": _motion(recording),
+        "hand": _hand(recording, config),
+        "force": _force(recording),
+        "queues": queues(recording),
+        "interrupts": interrupts(recording),
+        "recording": ended.get("recording", "without the end of the run"),
+        "rows_lost": {name: count for name, count in recording.lost.items() if count},
+    }
+
+
+def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
+    """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
+    unknown = (
+        *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
+        *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
+        *("task", "motion", "hand", "force", "queues", "interrupts"),
+        "rows_lost",
+    )
+    layout = wire(config)
+    tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
+    head = _head(config, ended, 0)
+    return {**head, **dict.fromkeys(unknown), "folder": None, "tasks": tasks, "recording": ended["recording"]}
+
+
+def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
+    """Return the part that needs no recording; `ticks` is the length of a run whose end is not known."""
+    outcome, counters = ended.get("outcome", {}), ended.get("tasks", {}).values()
+    return {
+        "rack": config.name,
+        "folder": None,
+        "mode": config.clock.mode,
+        "speed": config.clock.speed,
+        "clock_ms": config.clock.period_ms,
+        "worked": ended.get("worked", False),
+        "outcome": outcome or None,
+        "digest": outcome.get("digest"),
+        "objects": outcome.get("objects", []),
+        "simulated_s": round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
+        "wall_s": round(ended.get("wall_s", 0.0), 6),
+        "clock_skipped": ended.get("clock_skipped", 0),
+        "missed": sum(task["missed"] for task in counters),
+        "skipped": sum(task["skipped"] for task in counters),
+    }
+
+
+def _compared(recording: Recording, other: Recording, found: list[Report]) -> Report:
+    difference = first_difference(recording, other)
+    missed = min((miss["tick"] for miss in [*found, *misses(other)]), default=None)
+    return {
+        "folder": str(other.folder),
+        "first_difference": asdict(difference) if difference is not None else None,
+        "first_miss_tick": missed,
+        "explained": difference is None or (missed is not None and missed <= difference.tick),
+    }
+
+
+def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
+    is_lockstep = config.clock.mode == "lockstep"
+    layout, cycles = recording.layout, recording.trace(task.name)
+    entry: Report = {
+        **_about(task, layout),
+        **recording.ended.get("tasks", {}).get(task.name, {}),
+        **task_times(task, cycles, layout.clock_ns if is_lockstep else tick_ns(config), is_lockstep),
+    }
+    plan = f"{task.board}.plan"
+    if task.role == "executor" and plan in recording.mailboxes:
+        made, visible_at = recording.signal(plan, "tick"), recording.signal(plan, "visible_at")
+        entry["plan_age_ms"] = distribution(plan_ages(cycles["tick"], made, visible_at) * (layout.clock_ns * 1e-6))
+    return entry
+
+
+def _about(task: TaskSpec, layout: Layout) -> Report:
+    return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
+
+
+def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False) -> Report:
+    """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec + t_comm + t_residual).
+
+    `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and preemption.
+    `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its R is their time slice. In
+    lockstep a tick lasts as long as its tasks take: everything relative to a release or a time slice is None.
+    """
+    slice_ns = task.every * task.within_cycles * period_ns
+    gaps = gaps_ns(cycles)
+    by_the_clock: Report = {
+        "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
+        "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),
+        "largest_gap_ms": _rounded(gaps.max() * 1e-6) if len(gaps) else None,
+        "alpha_ms": None,
+        "deviation_ms": None,
+    }
+    if len(cycles):
+        times = execution_ns(cycles).tolist(), communication_ns(cycles).tolist()
+        by_the_clock["alpha_ms"] = _rounded(residual_bound_ns(slice_ns, *times) * 1e-6)
+        by_the_clock["deviation_ms"] = _rounded(residual_deviation_ns(*times) * 1e-6)
+    return {
+        "traced": len(cycles),
+        "slice_ms": slice_ns * 1e-6,
+        "execution_ms": distribution(execution_ns(cycles) * 1e-6),
+        "communication_ms": distribution(communication_ns(cycles) * 1e-6),
+        "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
+        **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
+    }
+
+
+def _entries(recording: Recording) -> list[Report]:
+    """Return the entries of all bus adapters: their counts at the end, and the ages of what passed, ms."""
+    found, tick_ms = [], recording.layout.clock_ns * 1e-6
+    for mailbox, entry, source in entries_of(recording.layout, recording.config):
+        if mailbox in recording.mailboxes:
+            ages = recording.signal(mailbox, f"{entry}.age")
+            counts = {name: int(recording.signal(mailbox, f"{entry}.{name}")[-1]) for name in ENTRY_COUNTS}
+            name = f"{mailbox.partition('.')[0]}.{entry}"
+            ages_ms = distribution(ages[ages >= 0] * tick_ms)
+            found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
+    return found
+
+
+def _task_outcome(recording: Recording) -> Report | None:
+    """Return the last status of the level that reports on the whole task."""
+    mailbox = _mailbox_of(recording, TASK_STATUS.name)
+    if mailbox is None:
+        return None
+
+    def last(field: str) -> Any:
+        return recording.signal(mailbox, field)[-1]
+
+    counts = {name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")}
+    return {"state": State(int(last("state"))).name.lower(), "reason": str(last("reason")), **counts}
+
+
+def _objects(recording: Recording, config: RackConfig) -> Iterator[Report]:
+    """Yield where each object that has a goal ended, and its falls."""
+    for end in recording.ended.get("outcome", {}).get("objects", ()):
+        row = config.scene.objects.index(end["object"])
+        yield {**end, "drops": list(_drops(recording, row))}
+
+
+def _drops(recording: Recording, row: int) -> Iterator[Report]:
+    """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the tool."""
+    mailbox = _mailbox_of(recording, SCENE.name)
+    if mailbox is None:
+        return
+    ticks, place = recording.signal(mailbox, "tick"), recording.signal(mailbox, "position")[:, row]
+    # What moves and turns with the tool keeps its distance from it.
+    away = np.linalg.norm(place - recording.signal(mailbox, "tool_position"), axis=1)
+    height, least = place[:, 2], FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
+    falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(away))) > least)
+    first = falling[np.diff(falling, prepend=-BOUNCE - 1) > BOUNCE]
+    last = falling[np.diff(falling, append=len(ticks) + BOUNCE) > BOUNCE] + 1
+    for begin, end in zip(first, last, strict=True):
+        if (fallen := height[begin] - height[end:][:SETTLE][-1]) > LEAST_M:
+            yield {"tick": int(ticks[begin]), "mm": _rounded(fallen * 1e3)}
+
+
+def _motion(recording: Recording) -> Report | None:
+    """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set points, or None."""
+    mailbox = _mailbox_of(recording, *DRIVING)
+    if mailbox is None:
+        return None
+    error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
+    return {
+        "tracking_rms_mrad": _rms(error),
+        "tracking_peak_mrad": _rounded(np.abs(error).max()),
+        **_counts(recording, mailbox),
+    }
+
+
+def _counts(recording: Recording, mailbox: str) -> Report:
+    """Return what a board that drives an arm or a hand has counted."""
+    names = {name: name for name in ("touches", "violations", "pushed")} | {"clipped_cycles": "clipped"}
+    return {key: int(recording.signal(mailbox, name)[-1]) for key, name in names.items()}
+
+
+def _rms(error: np.ndarray) -> float:
+    return _rounded(np.sqrt(np.mean(error**2)))
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 6)
+
+
+def _hand(recording: Recording, config: RackConfig) -> Report | None:
+    """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or None."""
+    mailbox = _mailbox_of(recording, HAND_STATUS.name)
+    if mailbox is None or config.robot is None or config.robot.hand is None:
+        return None
+    tension, force = recording.signal(mailbox, "tension"), recording.signal(mailbox, "force")
+    error = tension - recording.signal(mailbox, "wanted")
+    most = np.linalg.norm(force, axis=2).max(axis=0)
+    fingers = [finger.name for finger in config.robot.hand.finger]
+    return {
+        "tension_rms_n": _rms(error),
+        "tension_peak_n": _rounded(np.abs(error).max()),
+        "least_tension_n": _rounded(tension.min()),
+        "largest_tension_n": _rounded(tension.max()),
+        "largest_force_n": {finger: _rounded(value) for finger, value in zip(fingers, most, strict=True)},
+        "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
+        **_counts(recording, mailbox),
+    }
+
+
+def _force(recording: Recording) -> Report | None:
+    """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N, or None."""
+    wrench, status = _mailbox_of(recording, WRENCH.name), _mailbox_of(recording, FORCE_STATUS.name)
+    if wrench is None:
+        return None
+    halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)
+    force, torque = np.linalg.norm(halves, axis=2).max(axis=0)
+    error = np.zeros(0)
+    if status is not None:
+        # The tool exerts the opposite of what it feels.
+        off = recording.signal(status, "wanted") + recording.signal(status, "wrench")
+        error = off[:, :3][recording.signal(status, "selected")[:, :3] == 1]
+    return {
+        "largest_force_n": _rounded(force),
+        "largest_torque_nm": _rounded(torque),
+        "exceeded_cycles": int(recording.signal(wrench, "exceeded")[-1]),
+        "force_rms_n": _rms(error) if len(error) else None,
+    }
+
+
+def _mailbox_of(recording: Recording, *messages: str) -> str | None:
+    """Return the first mailbox with messages of one of these types; None when it is empty, or there is none."""
+    name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
+    return name if name in recording.mailboxes else None

@@ -1,0 +1,36 @@
+"""The report that a run's folder holds already: right as long as it is newer than the recording and this program."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+FILES = ("report.json", "report.md")
+RECORDED = ("config.toml", "cycles.parquet", "signals.parquet", "events.jsonl")
+SPOOL = "recorder.spool"
+PROGRAM = Path(__file__).resolve().parents[3]
+
+
+def stored_report(folder: Path) -> tuple[dict[str, Any], str] | None:
+    """Return the report in the folder of a run, as data and as text; None if it must be made anew."""
+    try:
+        made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
+        newest_ns = max((folder / name).stat().st_mtime_ns for name in RECORDED)
+        if (folder / SPOOL).exists() or made_ns <= max(newest_ns, *_changed_ns()):
+            return None
+        data, text = (json.loads((folder / FILES[0]).read_bytes()), (folder / FILES[1]).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    # A comparison with another run is no report of this one, and the folder may have been moved.
+    is_own = isinstance(data, dict) and "against" not in data and data.get("folder") == str(folder)
+    return (data, text) if is_own else None
+
+
+def _changed_ns() -> Iterator[int]:
+    """Yield the times at which this program's files were changed."""
+    for floor in ("backplane", "levels", "boards", "tools"):
+        for path, _, names in os.walk(PROGRAM / floor):
+            yield from (Path(path, name).stat().st_mtime_ns for name in names if name.endswith(".py"))

@@ -1,0 +1,182 @@
+"""Figure 5 of the paper, as text and picture: the kind of concurrency that suits the cycle of each level of a rack."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import log10
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rack.boards.config import RackConfig
+from rack.boards.config.timing import tick_ns
+from rack.levels.timing.rack import spanned
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.timing.charts.letters import label_row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+WIDTH = 84
+SHORTEST_S, LONGEST_S = 3e-5, 1e3
+"""Range of the axis."""
+TICKS = {1e-4: "0.1 ms", 1e-3: "1 ms", 1e-2: "10 ms", 1e-1: "100 ms", 1.0: "1 s", 10.0: "10 s", 60.0: "1 min"}
+"""Labels of the axis, s."""
+BANDS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
+"""From the fastest region to the slowest (light tints of Paul Tol's colours)."""
+EDGE = "#222222"
+MARKERS = {"tight": ("s", EDGE), "loose": ("s", "white"), "none": ("x", EDGE)}
+MEANINGS = {"tight": "planner on its executor's processor", "loose": "planner on its own", "none": "no planner"}
+
+
+@dataclass(frozen=True)
+class Region:
+    """A region of implementation: cycles up to `to_s`, s, its name in the figure, and the place it gives a planner."""
+
+    name: str
+    to_s: float
+    words: str
+    asks: str
+
+
+REGIONS = (
+    Region("fine-grained", 1e-3, "fine-grained multiprocessing or dedicated hardware", "hardware of its own"),
+    Region("asynchronous", 0.25, "asynchronous multiprocessing", "a processor of its own"),
+    Region("multitasking", 60.0, "multitasking", "a task on the executor's processor"),
+    Region("distributed", float("inf"), "distributed processing, on a LAN", "a machine of its own"),
+)
+"""By cycle: "under 1 ms", "250 ms", "seconds", "minutes". A bound belongs to the faster region, except 1 ms."""
+COUPLING = {"tight": "multitasking", "loose": "asynchronous"}
+"""The region of each coupling in the figure."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A level in the figure: its cycle, s, the region of that cycle, its coupling, and a remark on both."""
+
+    level: str
+    cycle_s: float
+    region: str
+    coupling: str
+    remark: str
+
+
+def placed(config: RackConfig) -> list[Placed]:
+    """Return the levels of a rack with their regions, the fastest first."""
+    tick_s = tick_ns(config) * 1e-9
+    cycles = {name: config.every(name) * tick_s for name in config.board}
+    found = []
+    for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1]):
+        region, coupling = region_of(cycle_s), config.board[name].coupling
+        found.append(Placed(name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}"))
+    return found
+
+
+def together(levels: Sequence[Placed]) -> list[Placed]:
+    """Return the levels, those of the same place in the figure as one: a board a joint needs one line."""
+    names: dict[Placed, list[str]] = {}
+    for level in levels:
+        names.setdefault(replace(level, level=""), []).append(level.level)
+    return [replace(place, level=spanned(found)) for place, found in names.items()]
+
+
+def region_of(cycle_s: float) -> Region:
+    """Return the region of a cycle."""
+    return next(r for r in REGIONS if cycle_s < r.to_s or (cycle_s == r.to_s and r is not REGIONS[0]))
+
+
+def lines(config: RackConfig) -> Iterator[str]:
+    """Yield the figure as text."""
+    found = together(placed(config))
+    margin = max(len(level.level) for level in found) + 2
+    yield f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
+    yield ""
+    starts = [0, *(bound + 2 for bound in BOUNDS)]
+    yield " " * margin + label_row((start, region.name) for start, region in zip(starts, REGIONS, strict=True))
+    for level in found:
+        yield f"{level.level:{margin}}{_row(level.cycle_s)}"
+    yield " " * margin + label_row((_column(at), label) for at, label in TICKS.items())
+    yield ""
+    yield from (f"{level.level}, {duration(level.cycle_s)}: {level.remark}" for level in found)
+
+
+def document(config: RackConfig) -> dict[str, Any]:
+    """Return the figure as plain data; the last region has no end."""
+    regions = [{"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS]
+    return {"rack": config.name, "figure": 5, "regions": regions, "levels": [asdict(level) for level in placed(config)]}
+
+
+def duration(cycle_s: float) -> str:
+    """Return a cycle with a suitable unit."""
+    if cycle_s >= 60.0:
+        return f"{cycle_s / 60.0:g} min"
+    return f"{cycle_s:g} s" if cycle_s >= 1.0 else f"{cycle_s * 1e3:g} ms"
+
+
+def save(config: RackConfig, stem: Path) -> list[Path]:
+    """Draw the figure with the levels of a rack into `stem`.png and .svg; return their paths."""
+    levels, paths = together(placed(config)), paths_of(stem)
+    with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
+        axes = figure.subplots()
+        _draw_regions(axes)
+        _draw_levels(axes, levels)
+        axes.set_ylim(len(levels) - 0.4, -2.0)
+        axes.set_title(f"Figure 5: implementations for the levels of {config.name}", fontsize=10, loc="left")
+        figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return paths
+
+
+def _draw_regions(axes: Axes) -> None:
+    starts = [SHORTEST_S, *(region.to_s for region in REGIONS[:-1])]
+    ends = [*(region.to_s for region in REGIONS[:-1]), LONGEST_S]
+    for region, start, end, colour in zip(REGIONS, starts, ends, BANDS, strict=True):
+        axes.axvspan(start, end, color=colour, linewidth=0)
+        words = region.words.replace(" or ", "\nor ").replace(", ", ",\n").replace(" multi", "\nmulti")
+        axes.text((start * end) ** 0.5, -1.2, words, ha="center", va="center", fontsize=8)
+    axes.set_xscale("log")
+    axes.set_xlim(SHORTEST_S, LONGEST_S)
+    axes.set_xticks(list(TICKS), list(TICKS.values()))
+    axes.minorticks_off()
+    axes.set_yticks([])
+    axes.set_xlabel("cycle")
+
+
+def _draw_levels(axes: Axes, levels: Sequence[Placed]) -> None:
+    for row, level in enumerate(levels):
+        marker, face = MARKERS[level.coupling]
+        (point,) = axes.plot([level.cycle_s], [row], marker, markersize=8, markeredgewidth=1.4, clip_on=False)
+        point.set(markerfacecolor=face, markeredgecolor=EDGE)
+        label = f"{level.level}, {duration(level.cycle_s)}"
+        axes.annotate(label, (level.cycle_s, row), (9, 0), textcoords="offset points", va="center")
+    for coupling in dict.fromkeys(level.coupling for level in levels):
+        marker, face = MARKERS[coupling]
+        axes.plot([], [], marker, markerfacecolor=face, markeredgecolor=EDGE, label=MEANINGS[coupling])
+
+
+def _remark(region: Region, coupling: str) -> str:
+    if coupling == "none":
+        return "no planner to couple"
+    here = f"coupled {coupling}ly"
+    if COUPLING[coupling] == region.name:
+        return f"{here}, as in the figure"
+    asked = f"the figure gives the planner {region.asks}"
+    if region.name == "asynchronous":
+        return f"{asked}; here it is {here}, which is enough while eqs 3.8 and 3.10 hold"
+    if region.name == "multitasking":
+        return f"{asked}; here it is {here}, at the cost of another processor"
+    return f"{asked}; here it is {here}"
+
+
+def _column(cycle_s: float) -> int:
+    part = log10(min(max(cycle_s, SHORTEST_S), LONGEST_S) / SHORTEST_S) / log10(LONGEST_S / SHORTEST_S)
+    return round(part * (WIDTH - 1))
+
+
+BOUNDS = [_column(region.to_s) for region in REGIONS[:-1]]
+"""Columns of the bounds between regions."""
+
+
+def _row(cycle_s: float) -> str:
+    row = ["|" if at in BOUNDS else " " for at in range(WIDTH)]
+    row[_column(cycle_s)] = "o"
+    return "".join(row).rstrip()

@@ -1,0 +1,106 @@
+"""A Gantt chart of a config or of a run: its panels as text, as plain data and as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rack.backplane.layout import Layout
+from rack.boards.config import RackConfig, budgets, load, wire
+from rack.tools.console.answer import Failure
+from rack.tools.live.folder import RUNS
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.timing.charts.measured import TracedRun
+from rack.tools.timing.charts.panel import Panel
+from rack.tools.timing.charts.scheduled import Schedule
+from rack.tools.timing.charts.window import WindowOptions
+
+NO_BUDGET = "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A config with its layout, and the run that had it, if any; `folder` is for the pictures."""
+
+    config: RackConfig
+    layout: Layout
+    run: TracedRun | None
+    folder: Path
+
+
+def subject_of(text: str, settings: Sequence[str], out: Path | None) -> Subject:
+    """Return the subject named by `text`: the folder of a run, else a config by name or path, with `settings`.
+
+    Raises `Failure` and `ConfigError`.
+    """
+    path = Path(text)
+    if path.is_dir() and ("/" in text or (path / "cycles.parquet").is_file()):
+        if settings:
+            raise Failure(f"--set {settings[0]}: the config of a run cannot be changed: {text}", 2)
+        run = TracedRun(Recording(path))
+        return Subject(run.config, run.recording.layout, run, out or path)
+    if "/" in text and not path.exists():
+        raise Failure(f"{text}: no such run's folder, and no such config", 2)
+    config = load(text, settings)
+    return Subject(config, wire(config), None, out or RUNS / f"{config.name}-gantt")
+
+
+@dataclass(frozen=True)
+class Gantt:
+    """Panels of one window of time, the measurement above the schedule, and notes on them."""
+
+    rack: str
+    panels: tuple[Panel, ...]
+    notes: tuple[str, ...]
+    column_ns: int
+
+    @property
+    def spans(self) -> int:
+        """Number of spans to draw."""
+        return sum(len(panel.chart.spans) for panel in self.panels)
+
+    def text(self) -> str:
+        """Return the chart as text."""
+        panels = [f"{self.rack}: " + "\n".join(lines(panel, self.column_ns)) for panel in self.panels]
+        return "\n\n".join([*panels, *self.notes])
+
+    def document(self) -> dict[str, Any]:
+        """Return the chart as plain data."""
+        panels = [panel.document() for panel in self.panels]
+        return {"rack": self.rack, "panels": panels, "notes": list(self.notes)}
+
+    def save(self, folder: Path) -> list[Path]:
+        """Draw the chart into `folder`, which must exist; return the paths of the pictures."""
+        # matplotlib takes a second to import.
+        from rack.tools.timing.charts.picture import save
+
+        return save(self.panels, self.rack, folder / "gantt")
+
+
+def gantt_of(
+    subject: Subject, options: WindowOptions, process_ns: Mapping[str, Sequence[int]], progress: Callable[[float], None]
+) -> Gantt:
+    """Return the chart of a subject. Raises `Failure`.
+
+    `process_ns` are times of X in a schedule, cycle by cycle, by board. `progress` takes the part of a run read so far.
+    """
+    name, run = subject.config.name, subject.run
+    schedule = Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
+    if run is not None and not run.is_lockstep:
+        task = options.task(run.tasks)
+        start, end = options.window(task, run.end_ns, run.middle_ns(task))
+        measured = run.panel(start, end, progress)
+        if schedule is None:
+            return Gantt(name, (measured,), (f"no schedule: {NO_BUDGET}",), column_for(end - start, None))
+        schedule.on_cores_of(run.recording.layout)
+        panels = measured, schedule.panel(start, end)
+        return Gantt(name, panels, (), column_for(end - start, schedule.shortest_ns))
+    still = f"{name} ran in lockstep: time stood still while its tasks computed"
+    if schedule is None:
+        raise Failure(f"{still}; {NO_BUDGET}" if run is not None else f"{name}: {NO_BUDGET}", 2)
+    start, end = options.window(options.task(schedule.tasks), None, 0, schedule.shown_ns)
+    notes = () if run is None else (f"{still}; only the schedule is shown",)
+    return Gantt(name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns))

@@ -1,0 +1,160 @@
+"""A Gantt chart in letters, as in the paper's figures: a row for each lane, a unit function in each column."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+
+from rack.levels.timing.schedule import Chart, Job, Span
+from rack.tools.console.tables import ms
+from rack.tools.timing.charts.panel import Panel
+from rack.tools.timing.charts.patterns import IDLE, Lane
+
+OTHER = "."
+"""Another board has the core."""
+COLUMNS = 100
+"""Most columns of a chart."""
+CYCLE_COLUMNS = 4
+"""Fewest columns of a cycle whose start is marked."""
+LABEL_COLUMNS = 6
+REPEATED = 3
+"""Most equal cycles in a row that are written one by one."""
+SHOWN = 4
+"""Most patterns, and late jobs, in a list."""
+
+
+def lines(panel: Panel, column_ns: int) -> Iterator[str]:
+    """Yield a panel as text."""
+    chart = panel.chart
+    yield f"{panel.kind}, {ms(chart.start_ns)} to {ms(chart.end_ns)} ms, a column is {ms(column_ns)} ms"
+    margin = max(len(lane.title) for lane in panel.lanes) + 2
+    if panel.frames:
+        starts = [((start - chart.start_ns) // column_ns, f"|{number}") for number, start in panel.frames.items()]
+        yield f"{'frame':{margin}}{label_row(starts)}"
+    for lane in panel.lanes:
+        yield f"{lane.title:{margin}}{_row(chart, lane, column_ns)}"
+        marks = _marks(panel, lane, column_ns)
+        if marks:
+            yield " " * margin + marks
+    yield from (" " * margin + line for line in _axis(panel, column_ns))
+    yield from _patterns(panel)
+    yield from _late(panel)
+
+
+def column_for(window_ns: int, shortest_ns: int | None) -> int:
+    """Return the time of a column, ns: 1, 2 or 5 times a power of ten; it shows the shortest part if possible."""
+    steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
+    fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
+    seen = max((step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits)
+    return max(fits, seen)
+
+
+def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
+    """Return the letters of a lane: in each column the unit function that took most of it."""
+    columns = -(-(chart.end_ns - chart.start_ns) // column_ns)
+    shares: list[dict[str, int]] = [{} for _ in range(columns)]
+    for span in (span for span in chart.spans if span.core == lane.core):
+        letter = span.unit.value if span.task in lane.tasks else OTHER
+        for at, share in _shares(span, chart.start_ns, column_ns):
+            shares[at][letter] = shares[at].get(letter, 0) + share
+    return "".join(_letter(share, column_ns) for share in shares)
+
+
+def _shares(span: Span, start_ns: int, column_ns: int) -> Iterator[tuple[int, int]]:
+    """Yield each column that a span reaches, with the time it takes of it."""
+    first, last = (span.start_ns - start_ns) // column_ns, (span.end_ns - start_ns - 1) // column_ns
+    for at in range(first, last + 1):
+        begin = start_ns + at * column_ns
+        yield at, min(span.end_ns, begin + column_ns) - max(span.start_ns, begin)
+
+
+def _letter(share: dict[str, int], column_ns: int) -> str:
+    idle = column_ns - sum(share.values())
+    letter, most = max(share.items(), key=lambda entry: entry[1], default=(IDLE, 0))
+    return letter if most >= idle and most else IDLE
+
+
+def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
+    """Return "|" where cycles begin and "!" where a deadline was missed; empty when there are none."""
+    chart = panel.chart
+    row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
+    if lane.cycle_ns >= CYCLE_COLUMNS * column_ns:
+        for start in range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns):
+            row[(start - chart.start_ns) // column_ns] = "|"
+    for job in panel.late(lane):
+        if job.deadline_ns >= chart.start_ns:
+            row[(job.deadline_ns - chart.start_ns) // column_ns] = "!"
+    return "".join(row).rstrip()
+
+
+def _axis(panel: Panel, column_ns: int) -> Iterator[str]:
+    """Yield the time below the chart."""
+    chart = panel.chart
+    step = step_for(panel, max(LABEL_COLUMNS, len(ms(chart.end_ns)) + 2) * column_ns)
+    times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
+    yield f"{label_row(((time - chart.start_ns) // column_ns, ms(time)) for time in times)} ms"
+
+
+def label_row(labels: Iterable[tuple[int, str]]) -> str:
+    """Return a row with labels that begin at these columns, or after the label before them."""
+    row = ""
+    for column, label in labels:
+        row = row.ljust(column) + label
+    return row
+
+
+def step_for(panel: Panel, narrowest_ns: int) -> int:
+    """Return the time between two labels of the axis, ns: the cycle of a lane if not too short nor too long."""
+    longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
+    cycles = sorted(lane.cycle_ns for lane in panel.lanes)
+    step = next((cycle for cycle in cycles if narrowest_ns <= cycle <= longest_ns), None)
+    return step or column_for(narrowest_ns * COLUMNS, None)
+
+
+def _patterns(panel: Panel) -> Iterator[str]:
+    """Yield the patterns of every lane, the most frequent first."""
+    for lane in panel.lanes:
+        found = panel.patterns.get(lane.name)
+        if found is None:
+            continue
+        rest = "cycles without a plan" if lane.is_tight else "cycles"
+        for counts, of in ((found.plans, "plans"), (found.cycles, rest)):
+            if counts:
+                yield from _counted(lane.name, counts, of)
+
+
+def _counted(name: str, counts: Counter[str], of: str) -> Iterator[str]:
+    (first, count), *others = [(_short(pattern), number) for pattern, number in counts.most_common(SHOWN)]
+    yield f"{name}: {first}: {count} of {counts.total()} {of}"
+    yield from (f"{' ' * len(name)}  {pattern}: {number}" for pattern, number in others)
+    hidden = len(counts) - len(others) - 1
+    if hidden:
+        yield f"{' ' * len(name)}  and {hidden} more patterns: {counts.total() - count - sum(n for _, n in others)}"
+
+
+def _short(pattern: str) -> str:
+    """Return a pattern with long rows of equal cycles written once."""
+    runs = [(cycle, len(list(equal))) for cycle, equal in groupby(pattern.split(" | "))]
+    return " | ".join(" | ".join([cycle] * n) if n <= REPEATED else f"({cycle}) x {n}" for cycle, n in runs)
+
+
+def _late(panel: Panel) -> Iterator[str]:
+    """Yield the number of late jobs by task, with the first ones of the window."""
+    for lane in panel.lanes:
+        for task in lane.tasks:
+            count = panel.counts.get(task)
+            if count is None or not count.late:
+                continue
+            what = "plans" if task == lane.planner else "cycles"
+            skipped = f", {count.skipped} of them skipped" if count.skipped else ""
+            late = [job for job in panel.late(lane) if job.task == task]
+            yield f"late: {task}: {count.late} of {count.jobs} {what}{skipped}"
+            yield from (f"  {_story(job)}" for job in late[:SHOWN])
+
+
+def _story(job: Job) -> str:
+    due = f"released at {ms(job.release_ns)} ms, due at {ms(job.deadline_ns)} ms"
+    if job.end_ns is None:
+        return f"{due}: not done by then"
+    return f"{due}: done at {ms(job.end_ns)} ms, {ms(job.end_ns - job.deadline_ns)} ms late"

@@ -1,0 +1,136 @@
+"""A chart with its lanes, late jobs and patterns: of a schedule, or as measured; and the arithmetic of stretches."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from rack.levels.timing.schedule import Chart, Job, Span
+from rack.tools.timing.charts.patterns import Lane, Patterns, Stretch
+
+NS_PER_MS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Count:
+    """Number of jobs of one task, and of late ones; `skipped` of the late ones never began."""
+
+    jobs: int = 0
+    late: int = 0
+    skipped: int = 0
+
+    @classmethod
+    def of(cls, chart: Chart, task: str, start_ns: int, end_ns: int) -> Count:
+        """Return the count of the jobs that were released from `start_ns` to `end_ns`."""
+        releases = [job.release_ns for job in chart.jobs if job.task == task]
+        late = [job for job in chart.late(task) if start_ns <= job.release_ns < end_ns]
+        # The newest one may still be running.
+        skipped = sum(job.end_ns is None and job.release_ns < releases[-1] for job in late)
+        return cls(sum(start_ns <= release < end_ns for release in releases), len(late), skipped)
+
+    def __add__(self, other: Count) -> Count:
+        return Count(self.jobs + other.jobs, self.late + other.late, self.skipped + other.skipped)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A chart cut to a window of time, with its lanes.
+
+    `patterns` by lane, and `counts` by task, cover the whole run, or a longer schedule. `frame_ns` is the minor frame
+    of a static schedule; 0: there is none.
+    """
+
+    kind: Literal["schedule", "measured"]
+    chart: Chart
+    lanes: tuple[Lane, ...]
+    patterns: Mapping[str, Patterns] = field(default_factory=dict)
+    counts: Mapping[str, Count] = field(default_factory=dict)
+    frame_ns: int = 0
+
+    @property
+    def frames(self) -> dict[int, int]:
+        """The start of every minor frame that begins in the window, ns, by number from the start of the run."""
+        if not self.frame_ns:
+            return {}
+        numbers = range(-(-self.chart.start_ns // self.frame_ns), -(-self.chart.end_ns // self.frame_ns))
+        return {number: number * self.frame_ns for number in numbers}
+
+    def late(self, lane: Lane) -> list[Job]:
+        """Return the jobs of a lane that were late in the window, by deadline."""
+        found = [job for task in lane.tasks for job in self.chart.late(task)]
+        return sorted((job for job in found if job.deadline_ns <= self.chart.end_ns), key=lambda job: job.deadline_ns)
+
+    def idle(self, lane: Lane) -> Iterator[Stretch]:
+        """Yield the stretches of the window in which the core of a lane was idle."""
+        busy = union((span.start_ns, span.end_ns) for span in self.chart.spans if span.core == lane.core)
+        yield from without((self.chart.start_ns, self.chart.end_ns), busy)
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data; times are ms."""
+        return {
+            "kind": self.kind,
+            "from_ms": self.chart.start_ns / NS_PER_MS,
+            "to_ms": self.chart.end_ns / NS_PER_MS,
+            "frame_ms": self.frame_ns / NS_PER_MS or None,
+            "lanes": [_lane(lane) for lane in self.lanes],
+            "spans": [
+                {
+                    "task": span.task,
+                    "core": span.core,
+                    "unit": span.unit.value,
+                    **_in_ms(span, "start", "end", "release"),
+                }
+                for span in self.chart.spans
+            ],
+            "jobs": list(self._jobs()),
+            "patterns": {
+                lane: {of: dict(counts.most_common()) for of, counts in found._asdict().items()}
+                for lane, found in self.patterns.items()
+            },
+            "counts": {task: vars(count) for task, count in self.counts.items()},
+        }
+
+    def _jobs(self) -> Iterator[dict[str, Any]]:
+        late = {(job.task, job.release_ns) for lane in self.lanes for job in self.late(lane)}
+        for job in self.chart.jobs:
+            yield {
+                "task": job.task,
+                **_in_ms(job, "release", "deadline", "end"),
+                "late": (job.task, job.release_ns) in late,
+            }
+
+
+def _lane(lane: Lane) -> dict[str, Any]:
+    times = _in_ms(lane, "cycle", "slice")
+    return {"core": lane.core, "board": lane.board, "tasks": list(lane.tasks), **times}
+
+
+def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
+    times = {name: getattr(entry, f"{name}_ns") for name in names}
+    return {f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS for name, time_ns in times.items()}
+
+
+def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:
+    """Yield the parts of a stretch that are not in `busy`, a `union`."""
+    start, end = stretch
+    for at in range(bisect_right(busy, start, key=lambda taken: taken[1]), len(busy)):
+        if busy[at][0] >= end:
+            break
+        if busy[at][0] > start:
+            yield start, busy[at][0]
+        start = busy[at][1]
+    if start < end:
+        yield start, end
+
+
+def union(stretches: Iterable[Stretch]) -> list[Stretch]:
+    """Return the union of the stretches, in order, without overlaps."""
+    found: list[Stretch] = []
+    for start, end in sorted(stretches):
+        if found and start <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], end)
+        else:
+            found.append((start, end))
+    return found

@@ -1,0 +1,115 @@
+"""A Gantt chart as a picture. Imports matplotlib: see `rack.tools.console.pictures`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from matplotlib.patches import Patch
+
+from rack.levels.timing.tasks import Unit
+from rack.tools.console.pictures import paths_of, picture
+from rack.tools.timing.charts.letters import step_for
+from rack.tools.timing.charts.panel import NS_PER_MS, Panel
+from rack.tools.timing.charts.patterns import IDLE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rack.levels.timing.schedule import Chart, Job
+    from rack.tools.timing.charts.patterns import Lane
+
+COLOURS = {
+    Unit.EXCHANGE: "#BBCC33",
+    Unit.READ: "#77AADD",
+    Unit.PROCESS: "#EE8866",
+    Unit.WRITE: "#EEDD88",
+    Unit.PLAN: "#44BB99",
+    Unit.UPDATE: "#FFAABB",
+}
+"""Light colours, distinct to the colour-blind too, for black letters on them (Paul Tol)."""
+NAMES = {
+    Unit.EXCHANGE: "C  exchange with the planner",
+    Unit.READ: "R  read",
+    Unit.PROCESS: "X  executor",
+    Unit.WRITE: "W  write",
+    Unit.PLAN: "P  planner",
+    Unit.UPDATE: "U  update of the plan",
+}
+EDGE = 0.2
+LATE, GRID, FLOOR, FRAME = "#CC3311", "#555555", "#F3F3F3", "#999999"
+WIDTH_IN, LANE_IN, BAR = 10.0, 0.55, 0.66
+LABELS = 16
+"""Most numbers along the axis."""
+LETTER = 0.012
+"""Part of the window from which on a span has room for its letter."""
+
+
+def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
+    """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return their paths."""
+    lanes = [len(panel.lanes) for panel in panels]
+    height, paths = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2, paths_of(stem)
+    with picture(paths, WIDTH_IN, height, layout="constrained") as figure:
+        rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=lanes)
+        for axes, panel in zip(rows[:, 0], panels, strict=True):
+            _draw(axes, panel)
+        rows[-1, 0].set_xlabel("time, ms")
+        used = [unit for unit in Unit if any(span.unit is unit for panel in panels for span in panel.chart.spans)]
+        handles = [Patch(facecolor=COLOURS[unit], label=NAMES[unit]) for unit in used]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
+        figure.suptitle(title, fontsize=11)
+    return paths
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    """Draw one panel: the first lane on top."""
+    chart, count = panel.chart, len(panel.lanes)
+    for row, lane in enumerate(panel.lanes):
+        _draw_lane(axes, panel, lane, count - 1 - row)
+    if panel.frames:
+        starts = [start / NS_PER_MS for start in panel.frames.values()]
+        axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
+        for number, start in panel.frames.items():
+            axes.annotate(f"frame {number}", (start / NS_PER_MS, count - 0.5), fontsize=7, va="bottom", color=GRID)
+    axes.set_xlim(chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS)
+    axes.set_ylim(-0.5, count - 0.5)
+    step = step_for(panel, (chart.end_ns - chart.start_ns) // LABELS)
+    labels = [time / NS_PER_MS for time in range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)]
+    axes.set_xticks(labels)
+    axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
+    axes.tick_params(left=False)
+    axes.set_title(panel.kind, fontsize=9, loc="left", pad=14 if panel.frames else None)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+
+
+def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
+    chart, low = panel.chart, at - BAR / 2
+    start, end = chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS
+    axes.broken_barh([(start, end - start)], (low, BAR), facecolors=FLOOR)
+    own = [span for span in chart.spans if span.task in lane.tasks]
+    for unit in Unit:
+        bars = [(s.start_ns / NS_PER_MS, (s.end_ns - s.start_ns) / NS_PER_MS) for s in own if s.unit is unit]
+        axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
+    letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in own]
+    letters += [(IDLE, idle) for idle in panel.idle(lane)]
+    for letter, (begin, stop) in letters:
+        if stop - begin >= LETTER * (chart.end_ns - chart.start_ns):
+            axes.text((begin + stop) / 2 / NS_PER_MS, at, letter, ha="center", va="center")
+    if lane.cycle_ns >= 2 * LETTER * (chart.end_ns - chart.start_ns):
+        starts = range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
+        marks = [time / NS_PER_MS for time in starts]
+        axes.vlines(marks, low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
+    for job in panel.late(lane):
+        _mark_late(axes, chart, job, low + BAR + 0.06)
+
+
+def _mark_late(axes: Axes, chart: Chart, job: Job, at: float) -> None:
+    """Mark a missed deadline, and the time from it to the end of the job."""
+    due = max(job.deadline_ns, chart.start_ns)
+    if due == job.deadline_ns:
+        axes.plot([due / NS_PER_MS], [at], marker="v", markersize=6, color=LATE, clip_on=False)
+    if job.end_ns is not None:
+        stop = min(job.end_ns, chart.end_ns)
+        axes.hlines(at, due / NS_PER_MS, stop / NS_PER_MS, colors=LATE, linewidth=1.6)

@@ -1,0 +1,98 @@
+"""The panel of a schedule, simulated from the budgets of a config."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import lcm
+from typing import TypeVar
+
+from rack.backplane.layout import Layout
+from rack.boards.config import RackConfig, rack_timing
+from rack.levels.timing.frames import core_frames
+from rack.levels.timing.schedule import Chart, Job, Span, simulate
+from rack.levels.timing.tasks import Part, Unit
+from rack.tools.console.answer import Failure
+from rack.tools.timing.charts.panel import Count, Panel
+from rack.tools.timing.charts.patterns import Detail, lanes_of, patterns
+
+SLICES = 10
+"""Fewest slices of the slowest task over which patterns are counted."""
+MOST_FRAMES = 24
+"""Most minor frames of a static schedule in a default chart."""
+MOST_CYCLES = 1_000_000
+"""Most cycles of all tasks that are simulated: a minute of work."""
+T = TypeVar("T", Span, Job)
+
+
+class Schedule:
+    """The schedule of the tasks with a budget; there must be at least one.
+
+    `process_ns` are times of X by board, one a cycle, in turn; other boards take the budget's.
+    Raises `Failure` for a board in `process_ns` without a budget.
+    """
+
+    def __init__(self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]) -> None:
+        timing = rack_timing(config, layout)
+        self.tasks = timing.tasks
+        self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
+        # The frames of a static schedule up to the last that differs from those before it.
+        alike = [found.frames[0] for found in core_frames(timing)]
+        self.shown_ns = min(max(alike) + 1, MOST_FRAMES) * self.frame_ns if alike else None
+        self.switch_ns = round(config.timing.context_switch_ms * 1e6)
+        self._variants = {name: self._variant(name, times) for name, times in process_ns.items()}
+
+    def on_cores_of(self, layout: Layout) -> None:
+        """Move the tasks to the cores that a run obtained."""
+        of_run = {task.name: task.core for task in layout.tasks}
+        self.tasks = tuple(replace(task, core=of_run.get(task.name, task.core)) for task in self.tasks)
+
+    @property
+    def shortest_ns(self) -> int:
+        """The shortest part of any task."""
+        return min((part.time_ns for task in self.tasks for part in task.parts), default=1)
+
+    def panel(self, start_ns: int, end_ns: int) -> Panel:
+        """Return the panel of a window."""
+        # The schedule repeats with the least common multiple of all slices; with phases, from the second time on.
+        cycles = [len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks]
+        period = lcm(*cycles, *(task.period_ns for task in self.tasks))
+        has_phases = any(task.phase_ns for task in self.tasks)
+        skipped = max(0, start_ns // period - has_phases) * period
+        longest = max(task.period_ns for task in self.tasks)
+        counted_ns = SLICES * longest
+        until = max(end_ns - skipped, counted_ns + longest)
+        if (jobs := sum(until // task.period_ns for task in self.tasks)) > MOST_CYCLES:
+            why = f"{SLICES} slices of the slowest task, {longest * 1e-6:g} ms each, hold {jobs} cycles of all"
+            raise Failure(f"no schedule: {why}; at most {MOST_CYCLES} are simulated", 2)
+        chart = simulate(self.tasks, until, self.switch_ns, self._variants)
+        lanes = lanes_of(self.tasks)
+        detail = Detail(gap_ns=2 * self.switch_ns)
+        return Panel(
+            kind="schedule",
+            chart=_later(chart.window(start_ns - skipped, end_ns - skipped), skipped),
+            lanes=lanes,
+            patterns={lane.name: patterns(chart, lane, (0, counted_ns), detail) for lane in lanes},
+            counts={task.name: Count.of(chart, task.name, 0, counted_ns) for task in self.tasks},
+            frame_ns=self.frame_ns,
+        )
+
+    def _variant(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
+        executors = {task.name: task for task in self.tasks if task.role == "executor"}
+        if board not in executors:
+            raise Failure(f"--process {board}: no board of that name has a budget; boards: {', '.join(executors)}", 2)
+        parts = [part for part in executors[board].parts if part.unit is not Unit.PROCESS]
+        at = sum(part.unit is not Unit.WRITE for part in parts)
+        return [(*parts[:at], Part(Unit.PROCESS, time), *parts[at:]) for time in times_ns]
+
+
+def _later(chart: Chart, by_ns: int) -> Chart:
+    """Return a chart moved to a later time."""
+
+    def moved(entry: T, *names: str) -> T:
+        times = {name: getattr(entry, name) for name in names}
+        return replace(entry, **{name: time_ns + by_ns for name, time_ns in times.items() if time_ns is not None})
+
+    spans = tuple(moved(span, "start_ns", "end_ns", "release_ns") for span in chart.spans)
+    jobs = tuple(moved(job, "release_ns", "deadline_ns", "end_ns") for job in chart.jobs)
+    return Chart(chart.start_ns + by_ns, chart.end_ns + by_ns, spans, jobs)
