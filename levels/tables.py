@@ -5,7 +5,6 @@ An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` bui
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rack.levels.errors import LevelError
+from rack.levels.references import module_and_name
 
 # No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them stay finite.
 # pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
@@ -65,13 +65,13 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
 
 def named_class(reference: str, base: type[T]) -> type[T]:
     """Return the class that "package.module:Class" names. Raises `ValueError`: it is missing, or no whole `base`."""
-    module, _, name = reference.partition(":")
     try:
-        found = getattr(importlib.import_module(module), name, None)
-    except (Exception, SystemExit) as error:  # importing a user's module may raise anything
-        raise ValueError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+        module, name = module_and_name(reference)
+    except LookupError as error:
+        raise ValueError(str(error)) from error
+    found = getattr(module, name, None)
     if found is None:
-        raise ValueError(f"module '{module}' has no class '{name}'")
+        raise ValueError(f"module '{module.__name__}' has no class '{name}'")
     if not (isinstance(found, type) and issubclass(found, base)):
         raise ValueError(f"'{name}' is not a subclass of {base.__module__}.{base.__name__}")
     if inspect.isabstract(found):

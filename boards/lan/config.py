@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
@@ -10,6 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, 
 
 from rack.backplane.message import MessageType
 from rack.boards.lan.endpoint import Endpoint, proper
+from rack.levels.references import module_and_name
 from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
@@ -55,13 +55,10 @@ class ImportConfig(Table):
 
     def message_type(self) -> MessageType:
         """Return the message type. Raises `LookupError` with the reason if there is none."""
-        module, _, name = self.type.partition(":")
-        try:
-            found = getattr(importlib.import_module(module), name, None)
-        except (Exception, SystemExit) as error:  # a user's module may raise anything while it is imported
-            raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+        module, name = module_and_name(self.type)
+        found = getattr(module, name, None)
         if not isinstance(found, MessageType):
-            raise LookupError(f"module '{module}' has no message type '{name}'")
+            raise LookupError(f"module '{module.__name__}' has no message type '{name}'")
         return found
 
 
