@@ -124,7 +124,7 @@ def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
 
             return partial(show_status, names[0] if names else None, as_json)
         case "report", [folder]:
-            from rack.tools.commands.answers import show_report
+            from rack.tools.timing.analysis.stored import show_report
 
             return partial(show_report, folder, as_json)
     return None

@@ -1,11 +1,10 @@
-"""Answers of `rack list`, `rack status` and `rack report`, apart from their options: parsing those takes longer."""
+"""Answers of `rack list` and `rack status`, apart from their options: parsing those takes longer."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rack.tools.console.answer import Failure, print_answer, print_json
 
@@ -83,31 +82,3 @@ def _only_rack() -> str:
         names = ", ".join(running)
         raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
     return running[0]
-
-
-def show_report(run: str | Path, as_json: bool) -> None:
-    """Print the report of a run: the one in its folder if that is still right, otherwise a new one."""
-    from rack.tools.timing.analysis.stored import stored_report
-
-    report = stored_report(Path(run))
-    if report is None:
-        from rack.tools.timing.analysis.report import write_report
-
-        report = write_report(Path(run))
-    print_report(*report, as_json)
-
-
-def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no recording, `text`."""
-    if as_json:
-        print_json(data)
-        return
-    from rack.tools.console.tables import console
-
-    terminal = console()
-    if terminal.is_terminal and data["folder"] is not None:
-        from rack.tools.timing.analysis.report_markdown import show
-
-        show(data, terminal)
-    else:
-        print(text)

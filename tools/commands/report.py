@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from rack.tools.commands.answers import print_report, show_report
 from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.timing.analysis.stored import print_report, show_report
 
 Against = Annotated[
     Path | None, typer.Option(metavar="RUN", help="another run: find the first tick at which the two diverge")

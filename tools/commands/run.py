@@ -125,8 +125,8 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> None:
     """Make the report and print it; a recording that cannot be read does not fail the run."""
-    from rack.tools.commands.answers import print_report
     from rack.tools.timing.analysis.report import unrecorded, write_report
+    from rack.tools.timing.analysis.stored import print_report
 
     report: tuple[dict[str, Any], str] | None = None
     try:

@@ -15,6 +15,8 @@ from rack.backplane.process import STOPPED, processor_ns, readable, state_of
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
+VIEW = "rack.tools.viewer.sink:ViewSink"
+"""What shows a recording, by name: recording itself needs none of it."""
 BEGUN = "recording"
 """Printed by the recorder when it has attached."""
 ATTACH_S = 30.0
@@ -47,7 +49,7 @@ class RecorderProcess:
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rack.tools.recording.recorder"],
+            [sys.executable, "-m", "rack.tools.recording.recorder", VIEW],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._complaints,

@@ -1,7 +1,7 @@
 """The recorder process, `python -m rack.tools.recording.recorder`.
 
-Its stdin names rack and folder, and closes when the run is over. It prints "recording" once it has attached;
-every other line is a message for the user.
+Its argument names the class of the view, "package.module:Class". Its stdin names rack and folder, and closes when the
+run is over. It prints "recording" once it has attached; every other line is a message for the user.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
+
+from rack.levels.references import module_and_name
 
 if TYPE_CHECKING:
     from rack.backplane.segment import Segment
@@ -35,7 +37,7 @@ def main() -> None:
     from rack.tools.recording.recorder_process import UNWRITABLE
 
     # It takes half a second. A thread begins with it while the rack is being launched.
-    Thread(target=_import_viewer, daemon=True).start()
+    Thread(target=_import_view, daemon=True).start()
     line = sys.stdin.readline()
     if not line:
         return
@@ -58,16 +60,16 @@ def main() -> None:
         os._exit(UNWRITABLE)
 
 
-def _import_viewer() -> None:
+def _import_view() -> None:
     # If it is not there, opening the view says so.
-    with suppress(ImportError):
-        import rack.tools.viewer.sink  # noqa: F401
+    with suppress(LookupError):
+        module_and_name(sys.argv[1])
 
 
 def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
-    from rack.tools.viewer.sink import ViewSink
-
-    return ViewSink(segment, folder, port)
+    module, name = module_and_name(sys.argv[1])
+    sink: Sink = getattr(module, name)(segment, folder, port)
+    return sink
 
 
 def _tell(text: str) -> None:

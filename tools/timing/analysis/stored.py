@@ -1,4 +1,6 @@
-"""The report that a run's folder holds already: right as long as it is newer than the recording and this program."""
+"""A report as `rack report` and `rack run` print it: the one in the run's folder as long as that is newer than the
+recording and this program.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from rack.tools.console.answer import print_json
 
 FILES = ("report.json", "report.md")
 RECORDED = ("config.toml", "cycles.parquet", "signals.parquet", "events.jsonl")
@@ -34,3 +38,29 @@ def _changed_ns() -> Iterator[int]:
     for floor in ("backplane", "levels", "boards", "tools"):
         for path, _, names in os.walk(PROGRAM / floor):
             yield from (Path(path, name).stat().st_mtime_ns for name in names if name.endswith(".py"))
+
+
+def show_report(run: str | Path, as_json: bool) -> None:
+    """Print the report of a run: the one in its folder if that is still right, otherwise a new one."""
+    report = stored_report(Path(run))
+    if report is None:
+        from rack.tools.timing.analysis.report import write_report
+
+        report = write_report(Path(run))
+    print_report(*report, as_json)
+
+
+def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no recording, `text`."""
+    if as_json:
+        print_json(data)
+        return
+    from rack.tools.console.tables import console
+
+    terminal = console()
+    if terminal.is_terminal and data["folder"] is not None:
+        from rack.tools.timing.analysis.report_markdown import show
+
+        show(data, terminal)
+    else:
+        print(text)
