@@ -265,9 +265,16 @@ class ArmDriver(Executor):
 
     def _show(self, status: Message, shown: SteadyStatus) -> None:
         """Fill the steady fields."""
-        status.echo, status.holding, status.stopped, cut, kept, status.braked = shown[:6]
-        status.demand, clipped, status.touches, status.violations, status.pushed = shown[6:11]
-        status.clipped = clipped + cut
+        kept = shown.kept
+        status.echo = shown.command
+        status.holding = shown.holding
+        status.stopped = shown.stopped
+        status.braked = shown.braked
+        status.demand = shown.demand
+        status.clipped = shown.clipped + shown.cut
+        status.touches = shown.touches
+        status.violations = shown.violations
+        status.pushed = shown.pushed
         if shown.fault:
             status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, shown.fault
         elif shown.error:

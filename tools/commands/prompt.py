@@ -38,7 +38,7 @@ def prompt(rack: RackName, board: HostName = None, script: Script = None) -> Non
     reads messages, `program` is the board's program, which may offer more names. Whatever happens here, the real-time
     side is not delayed. The prompt can be left and opened again while the rack runs.
 
-    Exit status: 0 it was left; 1 there is no such rack, the board is in use, or the script failed; 2 usage.
+    Exit status: 0 prompt closed; 1 there is no such rack, the board is in use, or the script failed; 2 usage.
 
     \b
     Examples:
