@@ -21,7 +21,9 @@ Out = Annotated[Path, typer.Option(metavar="DIR", help="folder of the page; one 
 Only = Annotated[
     list[str], typer.Option("--only", metavar="SECTION", help='only this section, as in 3.4 or "abstract"; repeatable')
 ]
-Again = Annotated[bool, typer.Option("--again", help="repeat finished experiments: of the sections of --only, or of all")]
+Again = Annotated[
+    bool, typer.Option("--again", help="repeat finished experiments: of the sections of --only, or of all")
+]
 Share = Annotated[
     bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
 ]

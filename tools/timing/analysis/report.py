@@ -15,9 +15,6 @@ from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
 from rack.levels.messages import SCENE, TASK_STATUS
-from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
-from rack.levels.systems.hand.messages import HAND_STATUS
-from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
     communication_ns,
@@ -40,6 +37,11 @@ from rack.tools.timing.analysis.report_markdown import markdown
 from rack.tools.timing.measured_response import system_response
 
 Report = dict[str, Any]
+DRIVING = ("servo_status", "arm_status")
+HAND_STATUS = "hand_status"
+WRENCH = "wrench"
+FORCE_STATUS = "force_status"
+"""Messages by name, as recordings hold them: to report on them takes no level that only other racks have."""
 FALLING_M_S = 0.05
 """Speed from which an object falls: a grip that slips, or fingers that lower it, are slower."""
 BOUNCE = 2
@@ -276,7 +278,7 @@ def _rounded(value: float) -> float:
 
 def _hand(recording: Recording, config: RackConfig) -> Report | None:
     """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or None."""
-    mailbox = _mailbox_of(recording, HAND_STATUS.name)
+    mailbox = _mailbox_of(recording, HAND_STATUS)
     if mailbox is None or config.robot is None or config.robot.hand is None:
         return None
     tension, force = recording.signal(mailbox, "tension"), recording.signal(mailbox, "force")
@@ -296,7 +298,7 @@ def _hand(recording: Recording, config: RackConfig) -> Report | None:
 
 def _force(recording: Recording) -> Report | None:
     """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N, or None."""
-    wrench, status = _mailbox_of(recording, WRENCH.name), _mailbox_of(recording, FORCE_STATUS.name)
+    wrench, status = _mailbox_of(recording, WRENCH), _mailbox_of(recording, FORCE_STATUS)
     if wrench is None:
         return None
     halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)

@@ -14,10 +14,14 @@ from rich.console import Console
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import RECORD
 from rack.boards.config import load
+from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
+from rack.levels.systems.hand.messages import HAND_STATUS
+from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.levels.timing.equations import response_ticks
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis import report as report_module
 from rack.tools.timing.analysis.report import report_of, task_times, write_report
 from rack.tools.timing.analysis.report_markdown import markdown, show
 from rack.tools.timing.measured_response import system_response
@@ -27,6 +31,12 @@ from tests.shared_runs import slow_run
 TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
 MS = 1_000_000
 PARTS = ("min", "p50", "p99", "p99_9", "max")
+
+
+def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for() -> None:
+    assert report_module.DRIVING == DRIVING
+    for kind in (FORCE_STATUS, WRENCH, HAND_STATUS):
+        assert getattr(report_module, kind.name.upper()) == kind.name
 
 
 class Watchful(Display):
