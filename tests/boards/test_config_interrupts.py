@@ -71,8 +71,10 @@ def test_a_plan_is_sent_at_the_end_of_its_slice(small: Path) -> None:
     assert plan.interrupt.slots == (layout.task("lower").slot,)
 
 
-def test_operators_mailboxes_stay_as_they_are_under_a_default(small: Path) -> None:
-    assert {box.protocol for box in layout_of(small).mailboxes if box.writer == "clock"} <= {"time-slice"}
+def test_operators_mailboxes_stay_as_they_are_under_a_default() -> None:
+    layout = wire(load("nasrem", [INTERRUPT]))
+    assert layout.mailbox("primitive.command").protocol == "interrupt"
+    assert {box.protocol for box in layout.mailboxes if box.writer == "clock"} == {"time-slice"}
 
 
 def test_the_protocol_passes_where_determinism_is_demanded(small: Path) -> None:
