@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import count
@@ -42,6 +43,14 @@ _NUMBERS = count()
 
 
 _NO_TURN = pytest.StashKey[str]()
+
+
+def pytest_configure() -> None:
+    """Give commands that tests start their signals back: under nohup, or in a script's background, some are ignored."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            # Handled, and not the default: the session itself outlives them still. Programs do not inherit a handler.
+            signal.signal(number, lambda number, frame: None)
 
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)

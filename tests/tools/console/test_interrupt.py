@@ -132,3 +132,17 @@ def test_a_terminal_that_is_gone_ends_a_run_in_order(small: Path, rack_name: str
     # Ended in order, and not by the bound of the wait for that: nobody has heard that there was no time.
     assert '"SIGHUP received"' in log.read_text()
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]
+
+
+def test_under_nohup_a_run_outlives_its_terminal_and_ends_by_other_signals(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    before = signal.signal(HUP, signal.SIG_IGN)
+    try:
+        run = Run(small, rack_name, tmp_path / "run", "cycle", (HUP, TERM))
+    finally:
+        signal.signal(HUP, before)
+    status, said = run.ended()
+    assert status == 128 + TERM
+    assert run.leaves_nothing()
+    assert "SIGTERM received" in said + (tmp_path / "run" / "events.jsonl").read_text()
