@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib import import_module
+from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 from rack.tools.console.interrupt import INTERRUPT, Interrupted
@@ -72,7 +73,14 @@ def main() -> None:
     # First of all: importing what a command needs takes longer than many a command.
     INTERRUPT.catch()
     try:
-        run_commands()
+        try:
+            run_commands()
+        except OSError:
+            # Of stdout, if that fails once more.
+            _flush("\n")
+            raise
+        finally:
+            _flush()
         # After a short answer. What it imported need not be taken apart: that would be another tenth of its time.
         os._exit(0)
     except Interrupted:
@@ -93,7 +101,7 @@ def run_commands() -> None:
             _print(answer)
         else:
             with _head_start(arguments) as crate:
-                commands()(prog_name="rack", obj=crate)
+                sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
     except Failure as failure:
         fail(str(failure), failure.status)
     except OSError as error:
@@ -101,6 +109,10 @@ def run_commands() -> None:
             raise
         fail(f"{shown(str(error.filename))}: {error.strerror}", 2 if error.errno in USAGE else 1)
     except Exception as error:
+        # The parser's own, of a wrong usage; it is not imported for this.
+        if hasattr(error, "show"):
+            error.show(usage := StringIO())
+            fail(usage.getvalue().rstrip(), 2)
         status = _status(error)
         if status is None:
             raise
@@ -135,14 +147,21 @@ def _print(answer: Callable[[], None]) -> None:
     gc.disable()
     try:
         answer()
-        if sys.stdout is not None:  # closed by the caller
-            sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader has seen enough; what is still buffered must not be written when the interpreter ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.exit(1)
     finally:
         gc.enable()
+
+
+def _flush(text: str = "") -> None:
+    """Print what is still buffered, and this."""
+    try:
+        print(end=text, flush=True)
+    except OSError as error:
+        # Once more, when the interpreter ends, it would be a traceback.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        # A reader that has seen enough needs no message.
+        if error.errno != errno.EPIPE:
+            print(f"stdout: {error.strerror}", file=sys.stderr)
+        sys.exit(1)
 
 
 def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
+from pathlib import Path
 
 import pytest
 
+from rack.tools.cli import COMMANDS as ALL
 from tests.processes import RACK
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
@@ -47,6 +50,63 @@ def test_no_run_lasts_for_ever_or_less_than_nothing(seconds: str) -> None:
     done = rack("run", "fig2", "--lockstep", "--no-record", "--seconds", seconds)
     assert (done.returncode, done.stdout) == (2, "")
     assert "Invalid value for '--seconds'" in done.stderr
+
+
+@pytest.mark.parametrize("command", [name for name, _, _ in ALL])
+def test_a_usage_error_of_any_command_is_a_document_under_json(command: str) -> None:
+    done = rack(command, "--bogus", "--json")
+    assert done.returncode == 2
+    lines = json.loads(done.stdout)["error"]
+    assert lines == done.stderr.splitlines()
+    assert lines[-1].startswith("Error: No such option: --")
+    assert rack(command, "--bogus").stdout == ""
+
+
+def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
+    """Return command lines that print: the help of each command, and answers of all ways of printing them."""
+    run = ("run", str(small), "--set", f"name={rack_name}", "--seconds", "0.1", "--no-record")
+    answers = [("check", "fig2"), ("check", "fig2", "--json"), ("list",), ("list", "--json"), ("status", "--json"), run]
+    return [*((name, "--help") for name, _, _ in ALL), *answers, (*run, "--json")]
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_that_cannot_be_printed_is_one_line(small: Path, rack_name: str, unbuffered: str) -> None:
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    for arguments in outputs(small, rack_name):
+        with Path("/dev/full").open("wb") as full:
+            done = subprocess.run(
+                [*RACK, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, timeout=BOUND_S
+            )
+        *before, last = done.stderr.splitlines()
+        assert (done.returncode, last) == (1, "stdout: No space left on device"), arguments
+        assert "Traceback" not in done.stderr
+        # Of a usage error there is a reason, too.
+        assert not before or arguments[0] == "status"
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_has_seen_enough_hears_of_no_error(small: Path, rack_name: str, unbuffered: str) -> None:
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    for arguments in outputs(small, rack_name)[-7:]:
+        reader, writer = os.pipe()
+        os.close(reader)
+        try:
+            done = subprocess.run(
+                [*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True, env=environment, timeout=BOUND_S
+            )
+        finally:
+            os.close(writer)
+        assert done.returncode == 1, arguments
+        assert not done.stderr or done.stderr.startswith("RACK is missing")
+
+
+def test_with_stdout_closed_commands_do_what_they_do(small: Path, rack_name: str) -> None:
+    for arguments in outputs(small, rack_name)[-7:]:
+        # Python itself closes what the shell has closed before it starts.
+        line = ["sh", "-c", '"$@" >&-', "sh", *RACK, *arguments]
+        done = subprocess.run(line, stderr=subprocess.PIPE, text=True, timeout=BOUND_S)
+        missing = arguments[0] == "status"
+        assert (done.returncode, len(done.stderr.splitlines())) == ((2, 1) if missing else (0, 0)), done.stderr
 
 
 @pytest.mark.parametrize("command", ["status", "stop", "record", "estop", "command", "inject"])
