@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from contextlib import suppress
 
 from rack.backplane import semaphores
@@ -52,12 +53,12 @@ def _remove(segment: Segment) -> bool:
         removal.close()
 
 
-def remove_own(rack: str | None = None) -> None:
-    """Remove the racks launched by this process, or one of them, in any state."""
+def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
+    """Remove the racks launched by this process or by one that it has `killed`, or one of them, in any state."""
     for name in racks() if rack is None else [rack]:
         with suppress(SegmentError):
             segment = Segment.open(name)
-            if segment.launcher_is_alive and segment.launcher == os.getpid():
+            if segment.launcher in killed or (segment.launcher_is_alive and segment.launcher == os.getpid()):
                 semaphores.unlink_all(name)
                 unlink(name)
             segment.close()

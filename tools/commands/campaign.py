@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 INJECTIONS = 3
 SIZES = 10
 FAULTLESS_S = 60.0
+NO_TIME = "no time for the report: 'rack campaign' with --out {} goes on from here"
 MOST = 100_000
 """Faults of a kind, kills or sizes of one campaign."""
 
@@ -88,7 +89,6 @@ def campaign(
     from rack.tools.console.interrupt import INTERRUPT
     from rack.tools.console.progress import progress_for
     from rack.tools.faults.campaigns.campaign import ORDER, Campaign, Order
-    from rack.tools.faults.campaigns.workers import INTERRUPT_S
     from rack.tools.live.folder import folder_of
 
     if lockstep and realtime:
@@ -115,7 +115,7 @@ def campaign(
     )
     goes_on, started = out is not None and (out / ORDER).is_file(), time.monotonic()
     folder = out if out is not None and goes_on else folder_of(out, "campaign")
-    with INTERRUPT.orderly(bound_s=INTERRUPT_S):
+    with INTERRUPT.orderly(unfinished=NO_TIME.format(folder)):
         with progress_for(silent=as_json) as progress:
             work = Campaign(order, folder, progress)
             results = work.run()
@@ -125,8 +125,7 @@ def campaign(
 
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
-    """Write campaign.json, campaign.md and campaign.png; return the first two."""
-    from rack.tools.faults.campaigns.plot import plot
+    """Write campaign.json, campaign.md and, unless interrupted, campaign.png; return the first two."""
     from rack.tools.faults.campaigns.report import document, markdown
 
     work.folder.mkdir(parents=True, exist_ok=True)
@@ -134,5 +133,9 @@ def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, o
     text = markdown(report)
     (work.folder / "campaign.json").write_text(json.dumps(report, indent=2) + "\n")
     (work.folder / "campaign.md").write_text(text)
-    plot(report, work.folder / "campaign.png")
+    # An interrupted campaign has no time for it.
+    if not results.is_interrupted:
+        from rack.tools.faults.campaigns.plot import plot
+
+        plot(report, work.folder / "campaign.png")
     return report, text

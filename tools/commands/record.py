@@ -23,8 +23,6 @@ from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 from rack.tools.viewer.sink import FILE, ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
-MERGE_S = 60.0
-"""Time to put recordings on one time line after Ctrl-C; a second one ends it at once."""
 Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
 With = Annotated[
     list[str],
@@ -101,11 +99,13 @@ def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:
         raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)
     folders = [folder / name for name in names]
     unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' makes it"
-    with INTERRUPT.orderly(unfinished=unfinished, bound_s=MERGE_S):
+    with INTERRUPT.orderly(unfinished=unfinished):
         with ExitStack() as stack:
             begun = (_begin(rack, into, notes) for rack, into in zip(racks, folders, strict=True))
             recorders = [stack.enter_context(recorder) for recorder in begun]
             _follow(recorders, unfinished)
+        if INTERRUPT.number:
+            return [*notes, unfinished]
         try:
             return [*notes, *merge(folders, folder / FILE)]
         except Failure as failure:
@@ -127,5 +127,5 @@ def _follow(recorders: Sequence[Recorder], unfinished: str) -> None:
             raise
 
     # A thread each: a rack on another machine, slow to answer, keeps none of the others waiting.
-    with INTERRUPT.orderly(stop, unfinished, MERGE_S), ThreadPoolExecutor(len(recorders)) as pool:
+    with INTERRUPT.orderly(stop, unfinished), ThreadPoolExecutor(len(recorders)) as pool:
         list(pool.map(follow, recorders))

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple, NoReturn
@@ -94,7 +95,8 @@ class Interrupt:
         """Kill this process's children, remove its racks, and end at once."""
         try:
             signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
-            for step in (_kill_family, _remove_racks, self._take_leave):
+            family = list(descendants(os.getpid(), os.getsid(0)))
+            for step in (partial(_kill, family), partial(_remove_racks, family), self._take_leave):
                 # A step that fails must not prevent the others, nor the end.
                 with suppress(Exception):
                     step()
@@ -135,10 +137,9 @@ def _leave_terminal() -> None:
                 os.close(nowhere)
 
 
-def _kill_family() -> None:
+def _kill(family: list[int]) -> None:
     """Kill every descendant in this session and wait for it; a viewer window has its own session and stays."""
-    family, ends = list(descendants(os.getpid(), os.getsid(0))), select.poll()
-    left = 0
+    ends, left = select.poll(), 0
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -165,8 +166,8 @@ def descendants(pid: int, session: int | None = None) -> Iterator[int]:
                 yield child
 
 
-def _remove_racks() -> None:
+def _remove_racks(killed: list[int]) -> None:
     # Looked up, not imported: in a handler a module may be half imported. Not loaded, it has made no racks.
     remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own", None)
     if remove_own is not None:
-        remove_own()
+        remove_own(killed=killed)

@@ -206,6 +206,8 @@ def test_only_the_own_racks_of_a_process_are_removed_by_it(spec: Layout, rack_na
     try:
         remove_own()
         assert left(spec.rack) == [shm_path(other.rack).name]
+        remove_own(killed=[Segment.open(other.rack).launcher])
+        assert left(spec.rack) == []
     finally:
         unlink(other.rack)
         own.close()

@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.processes import RACK, wait_until
+from rack.backplane.segment import SHM_FOLDER
+from tests.processes import RACK, children_of, named, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
 COMMAND = [*RACK, "campaign"]
+PROMPT_S = 15.0
+"""A tenth of it is usual; a campaign that waited for its trials took 30 s and more."""
+STALLING = """
+import os
+import time
+from pathlib import Path
+
+from two_levels import Upper
+
+
+class Stalling(Upper):
+    def self_test(self):
+        folder = Path(os.environ["CAMPAIGN"])
+        if (folder / "trials" / "nominal.json").exists():
+            (folder / f"stalls-{os.getpid()}").touch()
+            time.sleep(600)
+"""
 
 
 def campaign(config: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -107,6 +127,43 @@ def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_
     assert "Interrupted: results until then." in printed
     report = json.loads((out / "campaign.json").read_text())
     assert (report["interrupted"], report["summary"]["left_behind"]) == (True, 0)
+
+
+@pytest.mark.parametrize("numbers", [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT,) * 2])
+def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_before(
+    small: Path, write: Callable[[str, str], Path], tmp_path: Path, numbers: tuple[signal.Signals, ...]
+) -> None:
+    write("stalling.py", STALLING)
+    text = small.read_text().replace("python_path = [", f'python_path = ["{tmp_path}", ')
+    small.write_text(text.replace("two_levels:Upper", "stalling:Stalling"))
+    out = tmp_path / "campaign"
+    options = ["--lockstep", "--injections", "9", "--seconds", "9", "--kinds", "kill", "--out", str(out), "--json"]
+    process = subprocess.Popen(
+        [*COMMAND, str(small), *options],
+        cwd=ROOT,
+        env={**os.environ, "CAMPAIGN": str(out)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        wait_until(lambda: len(list(out.glob("stalls-*"))) == len(os.sched_getaffinity(0)), BOUND_S)
+        racks = [f"camp-{worker}x" for worker in children_of(process.pid)]
+        for number in numbers:
+            process.send_signal(number)
+        printed, said = process.communicate(timeout=PROMPT_S)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 128 + numbers[0], said
+    assert [path.name for path in (out / "trials").glob("*.json")] == ["nominal.json"]
+    if len(numbers) == 1:
+        report = json.loads(printed)
+        assert (report["interrupted"], report["summary"]["trials"]) == (True, 0)
+        assert json.loads((out / "campaign.json").read_text()) == report
+    assert racks
+    wait_until(lambda: not [name for name in racks if named(name)])
+    assert not [path.name for path in SHM_FOLDER.iterdir() if any(name in path.name for name in racks)]
 
 
 @pytest.mark.parametrize(

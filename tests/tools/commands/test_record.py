@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from rack.tools.timing.analysis.report import write_report
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import ViewerWindow
 from tests.boards.lan.racks import configs, ring_texts
-from tests.processes import RACK
+from tests.processes import RACK, wait_until
 from tests.tools.machines import A, B, recorded
 
 WATCHED = """
@@ -89,6 +91,34 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(rack_name: str, 
     true_ns = place.line.time_ns(np.array([place.own.epoch_ns]))[0]
     assert abs(place.times_ns(np.zeros(1, dtype=int), 0)[0] - true_ns) <= place.uncertainty_ns
     assert len(read(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
+    small: Path, rack_name: str, tmp_path: Path, number: signal.Signals, count: int
+) -> None:
+    names, folder = [f"{rack_name}-{nth}" for nth in range(count)], tmp_path / "run"
+    folders = [folder / name for name in names] if count > 1 else [folder]
+    others = [word for name in names[1:] for word in ("--with", name)]
+    with ExitStack() as stack:
+        racks = [stack.enter_context(Rack(load(small, [f"name={name}", "clock.mode=realtime"]))) for name in names]
+        for rack in racks:
+            rack.start()
+        command = [*RACK, "record", names[0], *others, "--out", str(folder), "--json"]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        recorder = stack.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes))
+        stack.callback(recorder.kill)
+        wait_until(lambda: all((each / "run.rrd").is_file() for each in folders), WATCHDOG_S)
+        recorder.send_signal(number)
+        out, said = recorder.communicate(timeout=WATCHDOG_S)
+    assert recorder.returncode == 128 + number, said
+    notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' makes it"] if count > 1 else []
+    assert json.loads(out)["notes"] == notes
+    assert (folder / "run.rrd").exists() == (count == 1)
+    for each in folders:
+        assert write_report(each)[0]["tasks"]["lower"]["traced"] > 0
+        assert not (each / "recorder.spool").exists()
 
 
 def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path) -> None:

@@ -169,6 +169,8 @@ class Campaign:
     def _run_faultless(self, results: Results) -> None:
         """Run without faults, alone or under load, for as long as ordered."""
         for place, is_loaded in enumerate(self.order.loads if self.order.faultless_s else ()):
+            if INTERRUPT.number:
+                return
             with ExitStack() as stack:
                 under = stack.enter_context(load()) if is_loaded else ""
                 runs = list(self._calm(place, under))

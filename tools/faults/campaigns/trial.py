@@ -19,7 +19,6 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import BoardError, ConfigError
 from rack.boards.events import Event, Outcome
-from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import ArmEnd, Killed, Strike, arm_of, is_late, levels_of, strikes
@@ -131,7 +130,6 @@ class Trial:
     levels: str = ""
     is_late: bool = False
     moving: tuple[str, ...] = ()
-    is_interrupted: bool = False
     again: Outcome | None = None
 
 
@@ -174,7 +172,6 @@ def run_trial(config: RackConfig, plan: Plan, rack_name: str, ticks: int, second
         levels=levels,
         is_late=late,
         moving=tuple(motion.body for motion in config.scene.motion),
-        is_interrupted=INTERRUPT.number != 0,
         again=again,
     )
 
@@ -204,6 +201,4 @@ def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> Non
 
 
 def _why_stop(too_long: bool, deadline: float) -> str:
-    if INTERRUPT.number:
-        return "the campaign was interrupted"
     return "the trial takes too long" if too_long or time.monotonic() > deadline else ""

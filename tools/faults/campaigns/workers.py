@@ -25,8 +25,6 @@ from rack.tools.faults.campaigns.trial import run_trial
 
 LOOK_S = 0.2
 """Longest time until a campaign that waits for its trials notices an interrupt."""
-INTERRUPT_S = 30.0
-"""Time to finish after Ctrl-C: a report of hours of trials is worth more than 2 s. A second signal ends it at once."""
 
 
 @dataclass(frozen=True)
@@ -46,41 +44,36 @@ class Workers:
         self._config = config
         self._cores = sorted(os.sched_getaffinity(0))
         self._lines: list[Connection] = []
-        self._is_stopped = False
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> Workers:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if error[0] is not None:
-            self._stop()
+        self._stop()
         for line in self._lines:
             line.close()
         for process in self._processes:
             process.wait()
 
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
-        """Make trials and yield each that is done and has its file; trials that Ctrl-C cuts short leave none.
+        """Make trials and yield each that is done and has its file; a signal ends those in progress, which leave none.
 
         Trials that are `alone` have the machine for themselves. Others get one core each: boards that share a core hand
         messages to each other sooner.
         """
         waiting, busy = list(jobs), dict[Any, TrialJob]()
         most = 1 if alone else len(self._cores)
-        while waiting or busy:
+        while (waiting or busy) and not INTERRUPT.number:
             for place, line in enumerate(self._some(min(most, len(waiting) + len(busy)))):
-                if line not in busy and waiting and not INTERRUPT.number:
+                if line not in busy and waiting:
                     busy[line] = waiting.pop(0)
                     line.send((busy[line], set(self._cores) if alone else {self._cores[place]}))
-            if not busy:
-                return
             ready: list[Any] = wait(list(busy), LOOK_S)
             for line in ready:
                 yield self._done(line, busy.pop(line))
-            if INTERRUPT.number:
-                waiting.clear()
-                self._stop()
+        if busy:
+            self._stop()
 
     def _done(self, line: Any, job: TrialJob) -> TrialJob:
         try:
@@ -92,11 +85,9 @@ class Workers:
         return job
 
     def _stop(self) -> None:
-        """Stop the trials that are being made, once: a worker that is asked twice would leave its rack as it is."""
-        if not self._is_stopped:
-            self._is_stopped = True
-            for process in self._processes:
-                process.terminate()
+        """End the workers. What is left of a trial in progress is of no use: its rack is removed, not stopped."""
+        for process in self._processes:
+            process.terminate()
 
     def _some(self, count: int) -> list[Connection]:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -124,15 +115,14 @@ def main() -> None:
     INTERRUPT.catch()
     line, parent = Connection(int(sys.argv[1])), int(sys.argv[2])
     die_with_parent(parent)
-    with INTERRUPT.orderly(bound_s=INTERRUPT_S), suppress(EOFError):
+    with suppress(EOFError):
         config = line.recv()
         while True:
             job, cores = line.recv()
             os.sched_setaffinity(0, cores)
             try:
                 trial = run_trial(config, job.plan, f"camp-{os.getpid()}x", job.ticks, job.seconds)
-                if not trial.is_interrupted:
-                    keep(Judged.of(trial), job.path)
+                keep(Judged.of(trial), job.path)
             except Exception as error:  # whatever it is, the campaign must hear of it
                 line.send(f"{type(error).__name__}: {error}")
             else:
