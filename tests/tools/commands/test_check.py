@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import budgets, load
+from rack.boards.config.files import names
 from rack.levels.timing.forecast import Forecast
 from rack.tools.commands.check import inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
@@ -20,6 +21,8 @@ from tests.tools.command_line import rack
 
 FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
 FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")
+FAILING = ("fig3", "fig4-overload")
+"""Configs that show what does not fit."""
 ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 
 
@@ -51,6 +54,19 @@ def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
     assert (done.returncode, failures(done)) == (0, [])
     assert "to make it fit" not in done.stdout
     assert "not counted (set one in the config, or use --from RUN): upper" in done.stdout
+
+
+@pytest.mark.parametrize("name", [name for name in names() if name not in FAILING])
+def test_a_shipped_rack_passes_its_own_check(name: str) -> None:
+    done = check(name)
+    assert (done.returncode, failures(done), done.stderr) == (0, [], "")
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_the_figures_of_overload_fail_their_check(name: str) -> None:
+    done = check(name)
+    assert done.returncode == 1
+    assert failures(done)
 
 
 def test_a_rack_that_fails_shows_where_and_which_changes_help(small: Path) -> None:
