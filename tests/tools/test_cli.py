@@ -72,7 +72,7 @@ def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_output_that_cannot_be_printed_is_one_line(small: Path, rack_name: str, unbuffered: str) -> None:
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    for arguments in outputs(small, rack_name):
+    for arguments in outputs(small, rack_name)[-7 if unbuffered else 0 :]:
         with Path("/dev/full").open("wb") as full:
             done = subprocess.run(
                 [*RACK, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, timeout=BOUND_S
