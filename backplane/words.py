@@ -147,6 +147,7 @@ class Box(IntEnum):
     TAKEN = 8  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
     VOID = 9  # of what comes from another rack, while that is lost: its writer counts as lost. See `switch`
     KEPT = 10  # the same, for racks that go on: its information does not grow too old. See `switch`
+    POSITION = 11  # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
 
 
 class Slot(IntEnum):

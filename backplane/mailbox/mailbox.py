@@ -21,7 +21,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
-from rack.backplane.mailbox.slots import Slots, claim, pid_of
+from rack.backplane.mailbox.slots import Slots, claim, epoch_of, pid_of
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
@@ -93,9 +93,9 @@ class Writer:
             raise MailboxError(f"mailbox '{name}' has a writer already, process {pid}; permitted: one")
         box = self._slots.box
         box[Box.WRITER_PID] = os.getpid()
-        box[Box.EPOCH] += 1
+        box[Box.EPOCH] = epoch = epoch_of(box[Box.EPOCH] + 1)
         # One store: no reader sees half a claim.
-        box[Box.CLAIMANT] = claim(box[Box.EPOCH], os.getpid())
+        box[Box.CLAIMANT] = claim(epoch, os.getpid())
         self._slots.resume(box[Box.CLAIMANT])
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:

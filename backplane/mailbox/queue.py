@@ -13,6 +13,9 @@ The reader's position is in shared memory before its level processes, so a messa
 happens: a reader killed in a cycle has taken the messages of that cycle, and its successor continues after them. The
 other order would read them twice, and a message that makes its reader fail would make every successor fail too. A
 level that must know whether a message was acted on compares its id with the one that the reader's status echoes.
+A successor reads the position from a word in the queue's head, in which it is multiplied by 3: an AN code, since no
+multiple of 3 is one bit away from another. The mailbox alone would not do: if its newest message is damaged, the one
+before it holds an older position. If it is the word that is damaged, the mailbox is whole.
 
 A lost, damaged or forged message is counted, and the order goes on with the next one.
 
@@ -41,7 +44,7 @@ TAKEN = MessageType(
     ),
 )
 # Plain integers for the hot path.
-_HEAD, _REFUSED, _SENT = int(Box.HEAD), int(Box.REFUSED), int(Box.SENT)
+_HEAD, _REFUSED, _SENT, _POSITION = int(Box.HEAD), int(Box.REFUSED), int(Box.SENT), int(Box.POSITION)
 _EPOCH, _VISIBLE = int(Slot.EPOCH), int(Slot.VISIBLE_AT)
 _PUT_POSITION = Struct("@2q").pack_into
 ALL = 1 << 62
@@ -150,7 +153,7 @@ class QueueReader(Reader):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
-        self.taken = _last_position(segment, name)
+        self.taken = self._last_position(segment)
         self._farthest = self.spec.delay + self.spec.every
         # The value of a reading without a new message, until there is one.
         if self.taken and self._obtain(self.taken):
@@ -184,6 +187,11 @@ class QueueReader(Reader):
             return self._unchanged
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
+    def _last_position(self, segment: Segment) -> int:
+        written = int(Reader(segment, taken_name(self.spec.name)).peek().value.taken)
+        taken, rest = divmod(self._box[_POSITION], 3)
+        return written if rest else max(written, taken)
+
     def _sees(self, serial: int, last: int, tick: int) -> bool:
         """Say whether a message may be read, or is not there to wait for; no good one is visible that far ahead."""
         if serial > last:
@@ -195,6 +203,7 @@ class QueueReader(Reader):
         newest = self.taken
         while self._sees(newest + 1, last, tick):
             newest += 1
+        self._box[_POSITION] = 3 * self.taken
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
@@ -223,8 +232,3 @@ class QueueReader(Reader):
     def close(self) -> None:
         """Release the claim."""
         self._position.close()
-
-
-def _last_position(segment: Segment, name: str) -> int:
-    reading = Reader(segment, taken_name(name)).peek()
-    return int(reading.value.taken) if reading.is_there else 0

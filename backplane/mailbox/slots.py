@@ -101,7 +101,8 @@ class Slots:
 
     def resume(self, signature: int) -> None:
         """Continue after the newest published message, as a writer."""
-        head = whole = self.box[Box.HEAD]
+        # Without the sign: a flipped one is no reason to fail.
+        head = whole = self.box[Box.HEAD] & (UNSIGNED >> 1)
         # A serial may have been lost: the chain continues from the newest message that is in its slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):
             whole -= 1

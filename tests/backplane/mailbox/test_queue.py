@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Iterator
+from itertools import product
+
 import pytest
 
-from rack.backplane.address_map import SLOT_HEAD_SIZE
+from rack.backplane.address_map import SLOT_HEAD_SIZE, slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
@@ -231,3 +236,43 @@ def test_a_head_out_of_range_costs_a_reader_no_more_than_its_slots(make_bus: Mak
     reader.slots.box[Box.HEAD] = reader.slots.box[Box.SENT] = 1 << 50
     assert ids(reader.read(1)) == [1]
     assert reader.taken <= 16
+
+
+def take_three(segment: Segment) -> None:
+    """Take messages 1 and 2 in one cycle and 3 in the next, as a reader that is then killed."""
+    reader = open_reader(segment, NAME)
+    assert isinstance(reader, QueueReader)
+    assert [ids(reader.take(1, 2)), ids(reader.take(2, 1))] == [[1, 2], [3]]
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def bookkeeping(segment: Segment) -> Iterator[int]:
+    """Yield the addresses of the heads of a queue, of its position, and of the slots in use of both."""
+    for name, serials in ((NAME, range(1, 6)), (taken_name(NAME), range(1, 3))):
+        start = segment.map.mailboxes[name]
+        yield from range(start, start + 8 * len(Box))
+        for serial in serials:
+            message = message_address(segment, serial, name)
+            # The position is part of its message.
+            size = SLOT_HEAD_SIZE if name == NAME else slot_stride(segment.layout.mailbox(name))
+            yield from range(message - SLOT_HEAD_SIZE, message - SLOT_HEAD_SIZE + size)
+
+
+def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(make_bus: MakeBus) -> None:
+    segment = make_bus(*queue(8))
+    writer = open_writer(segment, NAME)
+    assert isinstance(writer, QueueWriter)
+    send(writer, 0, 1, 2, 3, 4, 5)
+    assert exit_status(fork(lambda: take_three(segment))) == -signal.SIGKILL
+    before = bytes(segment.bytes)
+    for address, bit in product(bookkeeping(segment), range(8)):
+        segment.bytes[:] = before
+        segment.bytes[address] ^= 1 << bit
+        reader = open_reader(segment, NAME)
+        assert isinstance(reader, QueueReader)
+        found = [*ids(reader.take(3, 1)), *ids(reader.read(4))]
+        damaged, counted = f"bit {bit} at {address}", reader.statistics.bad_reads
+        reader.close()
+        assert found == [serial for serial in (4, 5) if serial in found], damaged
+        # What is not counted as lost is still in the queue, to be shown again by the next message.
+        assert len(found) + counted + max(0, 5 - reader.taken) >= 2, damaged
