@@ -86,7 +86,7 @@ class Segment:
             if isinstance(error, FileExistsError):
                 why = "already has a segment: it is running, or was killed; see 'rack list', 'rack clean'"
                 raise SegmentError(f"rack '{layout.rack}' {why}") from None
-            raise SegmentError(f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}") from None
+            raise no_room(layout.rack, f"{size} bytes of shared memory", error) from None
         return segment
 
     def _take_name(self) -> None:
@@ -252,6 +252,14 @@ def unlink(rack: str) -> None:
         return
     except posix_ipc.PermissionsError:
         raise SegmentError(f"rack '{rack}' belongs to another user: only that user may remove it") from None
+
+
+def no_room(rack: str, needed: str, error: OSError) -> SegmentError:
+    """Return the error of a rack whose shared memory cannot be obtained."""
+    found = os.statvfs(SHM_FOLDER)
+    size, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
+    room = f"{SHM_FOLDER} has {size} bytes, {free} of them free; in a container --shm-size enlarges it"
+    return SegmentError(f"rack '{rack}': {needed}: {error.strerror}: {room}")
 
 
 def shm_path(rack: str) -> Path:

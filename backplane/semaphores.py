@@ -14,11 +14,13 @@ import ctypes
 import time
 from collections.abc import Sequence
 from functools import partial
+from mmap import PAGESIZE
 
 import posix_ipc
 
+from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
-from rack.backplane.segment import PREFIX, SHM_FOLDER
+from rack.backplane.segment import PREFIX, SHM_FOLDER, no_room
 
 _libc = ctypes.CDLL(None)
 _sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait
@@ -87,11 +89,21 @@ def names(layout: Layout) -> list[str]:
 
 
 def create(layout: Layout) -> None:
-    """Make every semaphore of a rack, replacing those left by a killed rack of that name."""
-    for name in names(layout):
+    """Make every semaphore of a rack, replacing those left by a killed rack of that name.
+
+    Raises `SegmentError` when one is another user's or memory is short.
+    """
+    every = names(layout)
+    for name in every:
         _unlink(name)
         initial = 1 if name.startswith(_name(layout.rack, "lock", "")) else 0
-        posix_ipc.Semaphore(name, posix_ipc.O_CREX, mode=0o600, initial_value=initial).close()
+        try:
+            posix_ipc.Semaphore(name, posix_ipc.O_CREX, mode=0o600, initial_value=initial).close()
+        except posix_ipc.ExistentialError:
+            why = "belongs to another user: only that user may remove it; choose another name for the rack"
+            raise SegmentError(f"rack '{layout.rack}': semaphore {SHM_FOLDER}/sem.{name[1:]} {why}") from None
+        except OSError as error:
+            raise no_room(layout.rack, f"{len(every)} semaphores of {PAGESIZE} bytes", error) from None
 
 
 def open_all(layout: Layout) -> None:
@@ -143,5 +155,6 @@ def _name(rack: str, *parts: str) -> str:
 def _unlink(name: str) -> None:
     try:
         posix_ipc.unlink_semaphore(name)
-    except posix_ipc.ExistentialError:
+    except (posix_ipc.ExistentialError, posix_ipc.PermissionsError):
+        # There is none, or it is another user's, who alone may remove it.
         return

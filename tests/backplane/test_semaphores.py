@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,12 +12,13 @@ import pytest
 from rack.backplane import semaphores
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
+from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.segment import SHM_FOLDER, Segment
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, forked, wait_until
+from tests.processes import FORKS, exit_status, fork, forked, wait_until
 
 FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
 """From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the wall clock."""
@@ -71,6 +73,19 @@ def test_removing_names_twice_is_no_error(bus: Segment) -> None:
     semaphores.unlink(bus.layout)
     semaphores.unlink_all(bus.rack)
     assert named(bus.rack) == 0
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+@pytest.mark.filterwarnings(FORKS)
+def test_another_users_semaphore_of_that_name_is_named_and_left_alone(bus: Segment) -> None:
+    def create() -> None:
+        os.setuid(65_533)
+        with pytest.raises(SegmentError, match=rf"semaphore /dev/shm/sem.*{bus.rack}.*belongs to another user"):
+            semaphores.create(bus.layout)
+        semaphores.unlink_all(bus.rack)
+
+    assert exit_status(fork(create)) == 0
+    assert named(bus.rack) == 5
 
 
 def test_a_wait_lasts_as_long_as_it_says(bus: Segment) -> None:

@@ -104,6 +104,19 @@ def test_another_users_rack_is_left_alone(spec: Layout) -> None:
     assert spec.rack in racks()
 
 
+@as_root
+def test_another_users_semaphore_does_not_keep_a_dead_rack(spec: Layout) -> None:
+    semaphores.create(spec)
+
+    def leave_and_clean() -> None:
+        os.setuid(STRANGER)
+        assert exit_status(fork(lambda: Segment.create(spec, "").close())) == 0
+        assert spec.rack in clean()[0]
+
+    assert exit_status(fork(leave_and_clean)) == 0
+    assert len(left(spec.rack)) == len(semaphores.names(spec))
+
+
 def test_clean_names_racks_removed_and_in_use(spec: Layout, rack_name: str) -> None:
     leave_dead(spec)
     live = Segment.create(layout(f"{rack_name}-live"), "")
