@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import SegmentError
@@ -21,7 +23,7 @@ from rack.boards.config.schema import RackConfig
 
 @dataclass(frozen=True)
 class Holder:
-    """A rack that occupies a core, and its tasks there."""
+    """A rack that occupies a core, and its tasks there. Of another user's `launcher` is one of the boards."""
 
     rack: str
     launcher: int
@@ -41,12 +43,28 @@ def holders(own: str) -> dict[int, Holder]:
         try:
             segment = Segment.attach(name)
         except SegmentError:
+            # Another user's, or of another version: its processes still show what it occupies.
+            found = {**_seen(name), **found}
             continue
         if segment.launcher_is_alive and not segment.words[System.LOCKSTEP]:
             for core, tasks in _held(segment).items():
                 found.setdefault(core, Holder(name, segment.launcher, tuple(tasks)))
         segment.close()
     return found
+
+
+def _seen(rack: str) -> dict[int, Holder]:
+    held: dict[int, Holder] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        pid = int(folder.name)
+        with suppress(OSError):  # it has ended meanwhile
+            # The kernel keeps 15 characters: see `process.name_process`.
+            name = (folder / "comm").read_text().strip()
+            if name.startswith(f"{rack}:"[:15]) and os.sched_getscheduler(pid) == os.SCHED_FIFO:
+                for core in os.sched_getaffinity(pid):
+                    others = held[core].tasks if core in held else ()
+                    held[core] = Holder(rack, pid, (*others, name.removeprefix(f"{rack}:")))
+    return held
 
 
 def _held(segment: Segment) -> dict[int, list[str]]:

@@ -12,10 +12,11 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate.neighbours import holders
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_fifo, needs_two_cores
-from tests.processes import RACK
+from tests.processes import FORKS, RACK, exit_status, fork
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
@@ -56,6 +57,17 @@ def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, "board.wave.core=0")) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
     assert ready[0].startswith(f"core 0, requested by wave: rack '{first.config.name}'")
+
+
+@needs_fifo
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+@pytest.mark.filterwarnings(FORKS)
+def test_a_core_held_by_another_users_rack_is_seen(first: Rack) -> None:
+    def look() -> bool:
+        os.setuid(65_533)
+        return str(holders("another").get(0)).startswith(f"rack '{first.config.name}' (process ")
+
+    assert exit_status(fork(look)) == 0
 
 
 @needs_fifo
