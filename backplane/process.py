@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
+import re
 import select
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from resource import RLIMIT_NOFILE, RLIMIT_NPROC, getrlimit
 from time import process_time_ns
 
 from rack.backplane.layout import TaskSpec
@@ -113,6 +116,24 @@ def cores_kept_awake() -> Iterator[str]:
         except OSError as error:
             refusal = f"idle cores sleep, since {LATENCY_REQUEST} cannot be opened: {error.strerror}"
         yield refusal
+
+
+def mapped_and_locked(pid: int) -> tuple[int, int]:
+    """Return the bytes of memory that a process has mapped, and those locked; 0 when there is no process."""
+    found: list[str] = []
+    with suppress(FileNotFoundError, ProcessLookupError):
+        found = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())
+    mapped, locked = (int(kib) << 10 for kib in found or "00")
+    return mapped, locked
+
+
+def refusal(error: OSError) -> str:
+    """Return why the system refused a process or a file, with the limit that is reached."""
+    limits = {errno.EAGAIN: ("processes", "u", RLIMIT_NPROC), errno.EMFILE: ("open files", "n", RLIMIT_NOFILE)}
+    if error.errno not in limits:
+        return str(error)
+    what, option, limit = limits[error.errno]
+    return f"{error.strerror}: at most {getrlimit(limit)[0]} {what} are permitted (ulimit -{option})"
 
 
 def set_priority(priority: int) -> bool:

@@ -91,6 +91,7 @@ def main() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
+    from rack.backplane.process import refusal
     from rack.boards.errors import shown
     from rack.tools.console.answer import Failure, fail
 
@@ -106,7 +107,9 @@ def run_commands() -> None:
         fail(str(failure), failure.status)
     except OSError as error:
         if error.filename is None:
-            raise
+            if error.errno not in (errno.EAGAIN, errno.EMFILE):
+                raise
+            fail(refusal(error), 1)
         fail(f"{shown(str(error.filename))}: {error.strerror}", 2 if error.errno in USAGE else 1)
     except Exception as error:
         # The parser's own, of a wrong usage; it is not imported for this.
@@ -168,9 +171,9 @@ def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | 
     """Start the crate of `rack run`, which imports on the other core what takes longest; no other command has one."""
     if arguments[:1] != ["run"] or len(arguments) == 1 or "--help" in arguments or COMPLETION in os.environ:
         return nullcontext()
-    from rack.boards.crate.line import NO_WINDOWS, CrateLine
+    from rack.boards.crate.line import NO_WINDOWS, SINGLE_THREADED, CrateLine
 
-    os.environ.update(NO_WINDOWS)
+    os.environ.update(SINGLE_THREADED | NO_WINDOWS)
     return CrateLine()
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
@@ -16,7 +17,7 @@ from pydantic import ValidationError
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
-from rack.backplane.process import cores_kept_awake
+from rack.backplane.process import cores_kept_awake, mapped_and_locked
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
@@ -46,11 +47,15 @@ SILENT_S = 30.0
 """Simulated time without a status after which the level that ends the run counts as dead; at least 8 of its cycles."""
 AHEAD_S = KEPT_S / 2
 """Simulated time by which lockstep may run ahead of a recorder: half of the time that the rings retain."""
-PERMIT = (
-    "To allow it, add the line '@GROUP - rtprio 99' for one of your groups to /etc/security/limits.conf and log in "
-    "again (ulimit -r shows the limit), or grant CAP_SYS_NICE"
+_PERMIT = (
+    "To allow it, add the line '@GROUP - {}' for one of your groups to /etc/security/limits.conf and log in "
+    "again (ulimit -{} shows the limit), or grant {}"
 )
+PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
 """How a user obtains real-time priorities."""
+PERMIT_LOCK = _PERMIT.format("memlock unlimited", "l", "CAP_IPC_LOCK")
+FILES = 32
+"""Files that a process of a rack may have open, beside one for each other process and each mailbox that it writes."""
 
 T = TypeVar("T", bound=Table)
 
@@ -156,6 +161,7 @@ class Resolved:
         refused = self._refused(segment)
         found = [*shared_out(self.config), *network_notes(self.config)]
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
+        found += self._unlocked(segment)
         if self.clock(None).keeps_awake:
             with cores_kept_awake() as refusal:
                 found.append(f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}')
@@ -169,7 +175,25 @@ class Resolved:
         if self.config.clock.on_no_realtime == "refuse" and (refused := self._refused(segment)):
             raise LaunchError(f'{refused}, and clock.on_no_realtime is "refuse". {PERMIT}')
 
+    def check_files(self) -> None:
+        """Raise `LaunchError` if the system permits too few open files for this rack."""
+        needed = FILES + len(self.layout.processes) + len(self.layout.mailboxes)
+        if 0 <= (allowed := getrlimit(RLIMIT_NOFILE)[0]) < needed:
+            why = f"at most {allowed} open files are permitted (ulimit -n); the rack needs {needed}"
+            raise LaunchError(f"rack '{self.config.name}': {why}")
+
+    def _unlocked(self, segment: Segment) -> list[str]:
+        memory = {t.name: mapped_and_locked(segment.block(t.name)[Block.PID]) for t in self.layout.tasks}
+        unlocked = {name: mapped for name, (mapped, locked) in memory.items() if not locked}
+        if not unlocked or self.config.clock.mode == "lockstep":
+            return []
+        limit = f"the limit is {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())}"
+        return [f"memory not locked for {', '.join(unlocked)}: {limit}; page faults may delay cycles. {PERMIT_LOCK}"]
+
     def _refused(self, segment: Segment) -> str:
+        if self.config.clock.mode == "lockstep":
+            # It has no deadlines to miss.
+            return ""
         refused = [t.name for t in self.layout.tasks if t.priority and not segment.block(t.name)[Block.PRIORITY]]
         return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
 

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from rack.backplane import semaphores
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
-from rack.backplane.process import set_priority
+from rack.backplane.process import refusal, set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.classes import find_class
@@ -31,6 +31,7 @@ from rack.boards.crate.requests import (
     CellConfig,
     Ended,
     Forked,
+    ForkFailed,
     HogWiring,
     Open,
     Opened,
@@ -48,6 +49,8 @@ from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
+HOST_PROCESSES = 4
+"""Processes beside those of the layout: Rack, crate, clock, recorder."""
 LEAVE_S = 0.5
 """Time for boards to end by themselves after the launcher has gone."""
 
@@ -129,7 +132,14 @@ class Crate:
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         assert self._segment is not None, "the Rack opens the segment first"
         crate = os.getpid()
-        pid = os.fork()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
+            needed = f"the rack needs {len(self._segment.layout.processes) + HOST_PROCESSES}"
+            with suppress(OSError):
+                self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {refusal(error)}; {needed}"))
+            return
         if pid == 0:
             self._line.close()
             # The only exit of the child: the crate's own code must not run twice.

@@ -38,6 +38,7 @@ from rack.boards.crate.requests import (
     CellConfig,
     Ended,
     Forked,
+    ForkFailed,
     HogWiring,
     Open,
     PowerOff,
@@ -130,6 +131,7 @@ class Rack:
         crate.send(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
         plan = resolve(self.config)
         self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
+        plan.check_files()
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
         self._set_words()
@@ -265,6 +267,11 @@ class Rack:
 
     def _receive(self) -> None:
         message = self._line.receive()
+        if isinstance(message, ForkFailed):
+            if self.segment.words[System.STATE] == Run.STARTING:
+                raise LaunchError(message.why)
+            self._journal.add("printed", "", message.why)
+            message = message.end
         match message:
             case Forked(name, pid):
                 self._pids[name] = pid

@@ -107,3 +107,11 @@ class Ended:
     status: int
     seen_ns: int
     tick: int
+
+
+@dataclass(frozen=True)
+class ForkFailed:
+    """The system refused a process: a board has ended before it began."""
+
+    end: Ended
+    why: str

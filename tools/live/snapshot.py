@@ -178,7 +178,8 @@ class RackMonitor:
         """Return a warning when tasks were refused their real-time priority."""
         blocks = {task.name: self._segment.block(task.name) for task in self._segment.layout.tasks if task.priority}
         refused = [name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]]
-        is_up = self._segment.words[System.STATE] != Run.STARTING
+        words = self._segment.words
+        is_up = words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]
         return [f"NO REAL-TIME PRIORITY: {', '.join(refused)}"] if refused and is_up else []
 
     def _row(self, task: TaskSpec) -> TaskRow:

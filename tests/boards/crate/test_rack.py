@@ -3,19 +3,40 @@
 from __future__ import annotations
 
 import gc
+import mmap
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.lines import UtilityLines
-from rack.backplane.segment import Segment, racks, shm_path
+from rack.backplane.segment import Segment, racks, shm_path, unlink
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards import Rack
+from rack.boards.config.resolved import resolve
+from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import descriptors
+from tests.machine import needs_fifo
+from tests.processes import FORKS, RACK, descriptors, exit_status, forked, named, wait_until
+
+ROOT = Path(__file__).resolve().parents[3]
+BOUND_S = 60
+SMALL = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=$0 tmpfs /dev/shm && exec "$@"')
+"""A command in a /dev/shm of its own, of the size that comes next."""
+USER = ("setpriv", "--reuid=65532", "--inh-caps=+dac_override", "--ambient-caps=+dac_override")
+"""A command as a user who may have no more processes than is permitted, and can read the interpreter all the same."""
+PLAIN_ROOT = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "--inh-caps=-sys_nice,-ipc_lock")
+"""A command without the rights to real-time priorities and to locked memory."""
+as_root = pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="needs root and util-linux")
 
 
 def run(rack: Rack, seconds: float | None = None) -> Outcome:
@@ -172,3 +193,108 @@ def test_a_board_that_cannot_have_its_core_is_reported(config: MakeConfig) -> No
     rack = Rack(config("board.watch.core=1000"))
     with rack:
         assert "core 1000 is not available" in text_of(rack.events, "ready")
+
+
+def run_limited(
+    config: RackConfig, folder: Path, *limits: str, seconds: str = "0.1"
+) -> subprocess.CompletedProcess[str]:
+    """Run a rack by the command line, under these limits."""
+    path = folder / "limited.toml"
+    path.write_text(config.text())
+    command = [*limits, *RACK, "run", str(path), "--seconds", seconds, "--no-record", "--share"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("limits", "why"),
+    [
+        (("prlimit", "--nofile=8"), r"Too many open files: at most 8 open files are permitted \(ulimit -n\)"),
+        (
+            ("prlimit", "--nofile=20"),
+            r"rack '.*': at most 20 open files are permitted \(ulimit -n\); the rack needs 3\d",
+        ),
+        (("prlimit", "--nproc=1", *USER), r"Resource .* unavailable: at most 1 processes are permitted \(ulimit -u\)"),
+        (
+            ("prlimit", "--nproc=2", *USER),
+            r"board 'wave' cannot be forked: Resource .* at most 2 processes are permitted .*; the rack needs 6",
+        ),
+        (
+            ("prlimit", "--nproc=4", *USER),
+            r"board 'clock' cannot be forked: Resource .* at most 4 processes are permitted .*; the rack needs 6",
+        ),
+        (
+            (*SMALL, "half"),
+            r"rack '.*': \d+ bytes of shared memory: No space left .*: /dev/shm has \d+ bytes, \d+ of .*",
+        ),
+        ((*SMALL, "all"), r"rack '.*': 4 semaphores of 4096 bytes: No space left .*: /dev/shm has \d+ bytes, 0 of .*"),
+    ],
+)
+def test_a_limit_of_the_system_is_one_line_with_its_value(
+    config: MakeConfig, tmp_path: Path, limits: tuple[str, ...], why: str
+) -> None:
+    plain = config(text=PLAIN)
+    segment = Segment.create(resolve(plain).layout, plain.text())
+    size = len(segment.bytes)
+    unlink(segment.rack)
+    segment.close()
+    sizes = {"half": str(size // mmap.PAGESIZE // 2 * mmap.PAGESIZE), "all": str(size)}
+    done = run_limited(plain, tmp_path, *(sizes.get(word, word) for word in limits))
+    assert done.returncode == 1
+    assert re.fullmatch(why, done.stderr.strip())
+    assert not done.stdout
+
+
+@as_root
+def test_memory_that_could_not_be_locked_is_said_with_its_limit(config: MakeConfig, tmp_path: Path) -> None:
+    real_time = config("clock.mode=realtime", text=PLAIN)
+    done = run_limited(real_time, tmp_path, "prlimit", f"--memlock={8 << 20}", *PLAIN_ROOT)
+    assert done.stdout.count("memory not locked for wave, watch: the limit is 8388608 bytes, a board maps ") == 1
+    assert "memory not locked" not in run_limited(real_time, tmp_path).stdout
+
+
+@as_root
+@needs_fifo
+def test_lockstep_has_no_deadlines_to_warn_of(config: MakeConfig, tmp_path: Path) -> None:
+    lockstep = config("board.wave.priority=5", "clock.on_no_realtime=refuse", text=PLAIN)
+    done = run_limited(lockstep, tmp_path, "prlimit", f"--memlock={8 << 20}", *PLAIN_ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not re.search("SCHED_FIFO|missed deadlines|NO REAL-TIME|not locked", done.stdout)
+
+
+@as_root
+@pytest.mark.filterwarnings(FORKS)
+def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(
+    config: MakeConfig, tmp_path: Path, rack_name: str
+) -> None:
+    plain, out = config("clock.mode=realtime", text=PLAIN), tmp_path / "out"
+
+    def run_long() -> None:
+        done = run_limited(plain, tmp_path, "prlimit", "--nproc=5", *USER, seconds="60")
+        out.write_text(f"{done.returncode} {done.stdout}")
+
+    def occupy() -> None:
+        os.setuid(65_532)
+        time.sleep(BOUND_S)
+
+    with ExitStack() as stack:
+        runner = stack.enter_context(forked(run_long))
+        wait_until(lambda: named(f"{rack_name}:clock"))
+        # More than the board that dies leaves room for.
+        for _ in range(3):
+            stack.enter_context(forked(occupy))
+        wait_until(lambda: users_processes(65_532) >= 8)
+        os.kill(named(f"{rack_name}:wave")[0], signal.SIGKILL)
+        assert exit_status(runner) == 0
+    assert out.read_text().startswith("1 ")
+    # The kernel keeps only the first letters of either name.
+    assert re.search("printed: board '(wave|watch)' cannot be forked: Resource temp", out.read_text())
+
+
+def users_processes(uid: int) -> int:
+    """Return how many processes a user has."""
+    count = 0
+    for status in Path("/proc").glob("[0-9]*/status"):
+        with suppress(OSError):
+            count += f"\nUid:\t{uid}\t" in status.read_text()
+    return count
