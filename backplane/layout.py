@@ -74,7 +74,8 @@ class InterruptSpec:
 class FieldSpec:
     """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
 
-    `fields` holds the fields of a group (a nested message), `values` the names (lower case) and numbers of an enum.
+    `fields` holds the fields of a group (a nested message), `values` the names (lower case) and numbers of an enum,
+    `length` the least and the greatest one of a vector, or magnitude of a number.
     """
 
     name: str
@@ -85,6 +86,7 @@ class FieldSpec:
     meaning: str
     fields: tuple[FieldSpec, ...] = ()
     values: tuple[tuple[str, int], ...] = ()
+    length: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ resolved type travel through a mailbox.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,8 @@ class Field:
     """One field of a message: numpy scalar type, shape, unit and meaning.
 
     `shape` mixes integers and symbolic sizes; `kind` is a numpy type string or, for a group of
-    fields, a nested `MessageType`. The unit of a number that stands for a name is its enum.
+    fields, a nested `MessageType`. The unit of a number that stands for a name is its enum. `length`: the least and the
+    greatest one that a vector, along its last axis, or the magnitude of a number may have.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Field:
     unit: str | type[IntEnum]
     meaning: str
     shape: tuple[int | str, ...] = ()
+    length: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,12 +92,12 @@ def command(name: str, version: int, *fields: Field) -> MessageType:
     return MessageType(name, version, (serial, *fields))
 
 
-def status(name: str, version: int, *fields: Field) -> MessageType:
-    """Return a status type: `fields` after echo, state, error code and reason."""
+def status(name: str, version: int, *fields: Field, errors: str | type[IntEnum] = "1") -> MessageType:
+    """Return a status type: `fields` after echo, state, error code, of the enum `errors` if it is one, and reason."""
     head = (
         Field("echo", "u4", "1", "serial of the command that this status answers"),
         Field("state", "u1", State, "idle, executing, done, error or holding"),
-        Field("error", "u2", "1", "error code of the level; 0: none"),
+        Field("error", "u2", errors, "error code of the level; 0: none"),
         Field("reason", f"S{REASON_BYTES}", "ASCII", "reason for the error or the hold, readable; empty: neither"),
     )
     return MessageType(name, version, (*head, *fields))
@@ -151,6 +154,17 @@ class Message:
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
+
+
+def fill_counts(record: Any, counts: Iterable[float]) -> None:
+    """Fill the fields of a record; an integer stays at the greatest that its field holds, however far others drive it."""
+    kinds = (kind for kind, *_ in record.dtype.fields.values())
+    record[...] = tuple(min(count, _greatest(kind)) for count, kind in zip(counts, kinds, strict=True))
+
+
+@cache
+def _greatest(kind: np.dtype) -> float:
+    return np.iinfo(kind).max if kind.kind in "iu" else np.inf
 
 
 _CLASSES: dict[np.dtype, type[Message]] = {}

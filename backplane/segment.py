@@ -274,7 +274,8 @@ def _shm_name(rack: str) -> str:
 def _field(entry: dict[str, Any]) -> FieldSpec:
     shape, fields = tuple(entry["shape"]), tuple(_field(f) for f in entry["fields"])
     values = tuple((name, number) for name, number in entry["values"])
-    return FieldSpec(**{**entry, "shape": shape, "fields": fields, "values": values})
+    length = entry.get("length") and tuple(entry["length"])
+    return FieldSpec(**{**entry, "shape": shape, "fields": fields, "values": values, "length": length})
 
 
 def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:

@@ -101,10 +101,15 @@ class HostReader:
 
 
 class ProperContent:
-    """Says whether a message holds only what its type permits: numbers that are not NaN, members of enums."""
+    """Says whether a message holds only what its type permits: finite numbers, lengths, members of enums, ASCII.
+
+    In an array of groups, those that are all zero are empty.
+    """
 
     def __init__(self, fields: tuple[FieldSpec, ...]) -> None:
         self._numbers = [field.name for field in fields if np.dtype(field.kind).kind == "f"]
+        self._texts = [field.name for field in fields if np.dtype(field.kind).kind == "S"]
+        self._lengths = [(field.name, field.length, bool(field.shape)) for field in fields if field.length]
         self._enums = [(field.name, [number for _, number in field.values]) for field in fields if field.values]
         self._groups = [(field.name, ProperContent(field.fields)) for field in fields if field.fields]
 
@@ -113,8 +118,21 @@ class ProperContent:
         return self._permits(message.record)
 
     def _permits(self, record: np.ndarray | np.void) -> bool:
-        if any(np.isnan(record[name]).any() for name in self._numbers):
+        if not all(np.isfinite(record[name]).all() for name in self._numbers):
+            return False
+        if not all(record[name].tobytes().isascii() for name in self._texts):
             return False
         if not all(np.isin(record[name], numbers).all() for name, numbers in self._enums):
             return False
-        return all(content._permits(record[name]) for name, content in self._groups)
+        if not all(_has_length(record[name], *limits) for name, *limits in self._lengths):
+            return False
+        groups = [(record[name], content) for name, content in self._groups]
+        return all(content._permits(group[group != np.zeros_like(group)]) for group, content in groups)
+
+
+def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:
+    sizes = np.abs(values)
+    if is_vector:
+        # Never overflows, unlike a sum of squares.
+        sizes = np.hypot.reduce(np.minimum(sizes, 2.0 * limits[1]), axis=-1)
+    return bool(((limits[0] <= sizes) & (sizes <= limits[1])).all())

@@ -339,6 +339,7 @@ def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec,
                 meaning=field.meaning,
                 fields=field_specs(field.kind, sizes) if isinstance(field.kind, MessageType) else (),
                 values=() if isinstance(field.unit, str) else tuple((n.name.lower(), int(n)) for n in field.unit),
+                length=field.length,
             )
         )
     return tuple(specs)

@@ -13,7 +13,7 @@ from pydantic import ValidationError, model_validator
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
-from rack.backplane.message import Field, MessageType
+from rack.backplane.message import Field, MessageType, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
@@ -30,7 +30,7 @@ ENTRY = MessageType(
     1,
     (
         Field("passed", "u4", "1", "messages passed to the other side"),
-        Field("refused", "u4", "1", "messages refused: damaged, forged, NaN, or not a member of an enum"),
+        Field("refused", "u4", "1", "messages refused: damaged, forged, or not what its type permits"),
         Field("overtaken", "u4", "1", "messages that a newer one overtook before the exchange"),
         Field("full", "u4", "1", "messages that the host board could not send, since too many waited"),
         Field("waiting", "u4", "1", "messages that wait for the next cycles"),
@@ -110,7 +110,8 @@ class EntryCount:
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
         age = NEVER if self.written == NEVER else tick - self.written
-        record[...] = (self.passed, self.refused, self.overtaken, self.full, self.waiting, self.arrived, age)
+        counts = self.passed, self.refused, self.overtaken, self.full, self.waiting, self.arrived, age
+        fill_counts(record, counts)
 
 
 class Crossing(Protocol):

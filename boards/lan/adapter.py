@@ -16,7 +16,7 @@ from typing import Any
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, MessageType, State
+from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
@@ -184,7 +184,7 @@ class LanAdapter(Adapter):
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
         if self._link is not None and not self._grid.is_lockstep:
-            status.flaws[...] = tuple(self._link.sealer.flaws.values())
+            fill_counts(status.flaws, self._link.sealer.flaws.values())
         status.reason = reason = self._trouble(tick)
         status.state = State.HOLDING if reason else State.EXECUTING
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rack.backplane.message import fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
@@ -251,7 +252,7 @@ class Clocks:
     def count(self, record: Any) -> None:
         """Write the counts into the group of a status."""
         answering = self.responder
-        record[...] = (self.taken, answering.answered, answering.withheld, answering.refused + self.refused)
+        fill_counts(record, (self.taken, answering.answered, answering.withheld, answering.refused + self.refused))
 
     def fill(self, out: Any, rack: str, tick: int) -> None:
         """Write what is known of a rack's clock into its mailbox: see `rack.levels.peer`."""

@@ -23,7 +23,7 @@ from rack.backplane.errors import OperatorTableError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.host_ring import ProperContent
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.message import Message
+from rack.backplane.message import Message, fill_counts
 from rack.backplane.operator_table import OperatorTable, Request, RequestClaim, RequestStage, RequestWord
 from rack.backplane.segment import VERSION, Segment
 from rack.backplane.watch.alarms import Alarm
@@ -172,7 +172,7 @@ class Desk:
     def fill(self, record: object) -> None:
         """Write its counts into the group of a status; in lockstep none, since they do not depend on ticks alone."""
         if not self._grid.is_lockstep:
-            record[...] = (self.count.answered, self.count.refused, self.count.dropped)  # type: ignore[index]
+            fill_counts(record, (self.count.answered, self.count.refused, self.count.dropped))
 
     def _checked(self, question: Question, right: Right) -> Asked | None:
         """Return a question with its parts; None if it is malformed, unsigned or oversized."""

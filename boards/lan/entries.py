@@ -9,7 +9,7 @@ from typing import Any
 from rack.backplane.mailbox.host_ring import ProperContent
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.slots import Slots, message_dtype
-from rack.backplane.message import Message
+from rack.backplane.message import Message, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, switch
 from rack.boards.lan.config import ExportConfig, ImportConfig
@@ -80,7 +80,7 @@ class Export:
 
     def fill(self, record: Any) -> None:
         """Write its counts into the group of a status."""
-        record[...] = (self.sent, self.serial)
+        fill_counts(record, (self.sent, self.serial))
 
 
 class Import:
@@ -210,4 +210,4 @@ class Import:
         age = NEVER if self._basis is None else tick - self._basis
         age_s = -1.0 if age == NEVER else age * self._grid.tick_s
         order, launch = self._order, NONE if self._grid.is_lockstep else self._order.launch
-        record[...] = (*self.count.values, launch, order.number, order.serial, age, age_s)
+        fill_counts(record, (*self.count.values, launch, order.number, order.serial, age, age_s))

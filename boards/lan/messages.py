@@ -23,7 +23,7 @@ IMPORT = MessageType(
         Field("disordered", "u4", "1", "messages that came after a later one, and were not passed"),
         Field("repeated", "u4", "1", "messages that came twice"),
         Field("late", "u4", "1", "messages older than max_age_ms when they came"),
-        Field("refused", "u4", "1", "messages refused: malformed, unsigned, oversized, NaN, or of another type"),
+        Field("refused", "u4", "1", "messages refused: malformed, unsigned, oversized, or not what its type permits"),
         Field("strange", "u4", "1", "messages of a launch that is over, or not there"),
         Field("overtaken", "u4", "1", "messages that a newer one overtook before the exchange"),
         Field("launch", "i8", "1", "number of the launch that wrote the newest message taken; 0: none, or in lockstep"),

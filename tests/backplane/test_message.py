@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.errors import MailboxError
-from rack.backplane.message import REASON_BYTES, Field, Message, MessageType, State, command, status
+from rack.backplane.message import REASON_BYTES, Field, Message, MessageType, State, command, fill_counts, status
 
 POSE = MessageType("pose", 1, (Field("position", "f8", "m", "", (3,)), Field("valid", "u1", "1", "")))
 TRACK = MessageType(
@@ -128,3 +128,14 @@ def test_commands_begin_with_their_serial_and_statuses_with_the_answer() -> None
     answer.state, answer.reason = State.ERROR, "x" * 500
     assert State(answer.state) is State.ERROR
     assert len(answer.reason) == REASON_BYTES
+
+
+def test_counts_stay_at_the_greatest_number_of_their_fields() -> None:
+    fields = (Field("few", "u2", "1", ""), Field("many", "u4", "1", ""), Field("tick", "i8", "tick", ""))
+    message = Message(MessageType("counts", 1, (*fields, Field("age_s", "f8", "s", ""))).dtype({}))
+    fill_counts(message.record, (1 << 70, 1 << 32, 1 << 63, 1e30))
+    assert message.record.tolist() == ((1 << 16) - 1, (1 << 32) - 1, (1 << 63) - 1, 1e30)
+    fill_counts(message.record, (7, 8, -1, -1.0))
+    assert message.record.tolist() == (7, 8, -1, -1.0)
+    fill_counts(message.record[["many"]], (1 << 32,))
+    assert (message.few, message.many) == (7, (1 << 32) - 1)

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rack.backplane.message import Message, MessageType, State
+from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.levels.level import Executor, Input, LevelContext, MadePorts, Output, Ports, Reading
 from rack.levels.messages import TASK_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
@@ -85,7 +85,7 @@ class Coordinator(Executor):
         for arm in self._table.arms:
             self._order(arm, held, getattr(write, f"order_{arm}"))
         self._agreement.write_to(write.progress)
-        write.progress.moves = self._moves
+        fill_counts(write.progress.record[["moves"]], (self._moves,))
         self._report(readings, waits, write.status)
 
     def _recall(self, read: Ports) -> None:
@@ -165,7 +165,7 @@ class Coordinator(Executor):
         status.reason = agreement.reason if is_over else waits if status.state == State.HOLDING else ""
         status.action, status.actions = agreement.step, len(self._steps)
         done, moves = self._moves_of_step(readings)
-        status.moves_done, status.moves = self._moves + done, self._moves + moves
+        fill_counts(status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves))
         if self._operated.standing is Operation.HOLD:
             self._operated.done()
         self._operated.report(status)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from rack.backplane.message import Message, MessageType, State
+from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.levels.errors import ProgramError
 from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
 from rack.levels.messages import WORLD_MODEL, Error
@@ -236,7 +236,8 @@ class OrderedTaskExecutor(TaskExecutor):
         elif (report.program, report.echo) != (taken.program, taken.order):
             report.moves_done = report.moves = 0
         super()._report(plan, waits, write)
-        status.echo, status.action, status.actions = echo, self._orders_done, self._orders_begun
+        status.echo = echo
+        fill_counts(status.record[["action", "actions"]], (self._orders_done, self._orders_begun))
         status.moves_done, status.moves = self._moves
         report.program, report.echo, report.response = taken.program, taken.order, taken.response
         report.state, report.error, report.halted = status.state, taken.error, self._halted

@@ -97,6 +97,7 @@ CELL_REPORT = status(
     Field("moves", "u2", "1", "elemental moves of the order; 0 before it begins"),
     Field("halted", "u1", "1", "1: moves were withdrawn, the arm is held until it begins another order"),
     OPERATED,
+    errors=Error,
 )
 
 CELL_REQUEST = MessageType(

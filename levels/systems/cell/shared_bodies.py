@@ -24,6 +24,9 @@ from rack.levels.algebra import Array
 MOST_SHARED = 4
 """Bodies that one rack shares, at most: the message has the same layout in every rack."""
 NAME_BYTES = 40
+MOST_CLAIMS = (1 << 32) - 1
+FARTHEST_M = 1e3
+"""From the origin: the simulation gives up bodies that are farther away than it can count."""
 
 SHARED_BODY = MessageType(
     "shared_body",
@@ -33,8 +36,8 @@ SHARED_BODY = MessageType(
         Field("claim", "u4", "1", "number of the claim that stands, as far as this rack knows; 0: none yet"),
         Field("owner", f"S{NAME_BYTES}", "ASCII", "rack whose claim that is: its simulation moves the body"),
         Field("touched", "u1", "1", "1: the gripper of this rack touches it"),
-        Field("position", "f8", "m", "body origin in this rack's simulation", (3,)),
-        Field("quaternion", "f8", "1", "body orientation, likewise", (4,)),
+        Field("position", "f8", "m", "body origin in this rack's simulation", (3,), (0.0, FARTHEST_M)),
+        Field("quaternion", "f8", "1", "body orientation, likewise", (4,), (0.999, 1.001)),
     ),
 )
 
@@ -73,7 +76,7 @@ class SharedBody:
     def touch(self, touches: bool) -> None:
         """Claim the body if this rack's gripper begins to touch it."""
         if touches and not self.is_touched and self.claim.owner != self.rack:
-            self.claim = Claim(self.claim.number + 1, self.rack)
+            self.claim = Claim(min(self.claim.number + 1, MOST_CLAIMS), self.rack)
         self.is_touched = touches
 
     def hear(self, message: Message) -> Array | None:

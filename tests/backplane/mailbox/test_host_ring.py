@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.host_ring import HostReader, HostWriter, ProperContent
-from rack.backplane.message import Message
+from rack.backplane.message import Field, Message, MessageType
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from tests.backplane.bus import NAME, mailbox, message_address
@@ -90,12 +90,33 @@ def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(se
     assert (reader.overtaken, reader.refused) == (13, 0)
 
 
-def test_numbers_that_are_nan_and_unknown_members_of_enums_are_improper() -> None:
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_and_unknown_members_of_enums_are_improper(value: float) -> None:
     check, message = ProperContent(field_specs(NUMBER, {})), Message(NUMBER.dtype({}))
     assert check(message)
-    message.value = np.inf
+    message.value = np.finfo(float).max
     assert check(message)
     message.colour = 2
     assert not check(message)
-    message.colour, message.value = 1, np.nan
+    message.colour, message.value = 1, value
+    assert not check(message)
+
+
+def test_lengths_beyond_those_declared_and_text_that_is_not_ascii_are_improper_and_empty_groups_are_not() -> None:
+    turn = Field("turn", "f8", "1", "unit", (2,), (0.9, 1.1))
+    one = MessageType("one", 1, (Field("name", "S4", "ASCII", "its name"), turn))
+    kind = MessageType("all", 1, (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))))
+    check, message = ProperContent(field_specs(kind, {})), Message(kind.dtype({}))
+    assert check(message)
+    for far, is_proper in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
+        message.far = far
+        assert check(message) is is_proper
+    first = message.ones[0]
+    first["name"] = b"a"
+    assert not check(message)
+    big = np.finfo(float).max
+    for turned, is_proper in (((0.6, 0.8), True), ((1.0, 0.8), False), ((big, big), False), ((0.0, -1.0), True)):
+        first["turn"] = turned
+        assert check(message) is is_proper
+    first["name"] = b"\xff"
     assert not check(message)

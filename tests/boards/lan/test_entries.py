@@ -152,6 +152,13 @@ def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> 
     assert importing.read(16) == (NEW, 4, False)
 
 
+def test_a_number_of_any_size_leaves_the_count_of_what_is_missing_at_its_greatest(importing: Importing) -> None:
+    for number in (1, 1 << 32, (1 << 62) - 1):
+        importing.send(number, written=2)
+        importing.cycle(8)
+    assert (importing.status.import_other["taken"], importing.status.import_other["missing"]) == (3, (1 << 32) - 1)
+
+
 def test_a_lost_rack_is_lost_at_once_until_its_first_message_after_that(importing: Importing) -> None:
     importing.send(1, written=2)
     importing.cycle(8)

@@ -279,3 +279,13 @@ def test_an_arm_that_still_touches_a_body_does_not_claim_it_back() -> None:
     body.touch(False)
     body.touch(True)
     assert body.claim == Claim(3, b"alpha")
+
+
+def test_a_claim_after_the_greatest_number_is_that_number_again() -> None:
+    message, body = Message(SHARED_BODIES.dtype({})), SharedBody(b"part", b"one")
+    greatest = (1 << 32) - 1
+    message.bodies[0]["name"], message.bodies[0]["owner"], message.bodies[0]["claim"] = b"part", b"two", greatest
+    body.hear(message)
+    body.touch(True)
+    body.show(message.bodies[0], np.zeros(7))
+    assert (message.bodies[0]["claim"], message.bodies[0]["owner"]) == (greatest, b"one")
