@@ -157,7 +157,7 @@ class Message:
 
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
-    """Fill the fields of a record; an integer stays at the greatest that its field holds, however far others drive it."""
+    """Fill the fields of a record; an integer stays at the greatest that its field holds, whoever drives it."""
     kinds = (kind for kind, *_ in record.dtype.fields.values())
     record[...] = tuple(min(count, _greatest(kind)) for count, kind in zip(counts, kinds, strict=True))
 

@@ -80,7 +80,7 @@ def pin(core: int) -> None:
 
 LATENCY_REQUEST = Path("/dev/cpu_dma_latency")
 """Device that takes the longest permitted wake-up time of a core, us, while it is open."""
-_PR_SET_NAME, _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 15, 1, 29
+_PR_SET_NAME, _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK, _PR_SET_CHILD_SUBREAPER = 15, 1, 29, 36
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -157,3 +157,14 @@ def die_with_parent(parent: int) -> None:
     # The parent may have ended between fork and prctl.
     if os.getppid() != parent:
         os._exit(1)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of descendants whose own parents have ended, whatever their sessions."""
+    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def children_of(parent: int) -> set[int]:
+    """Return the children of a process, those that have ended and are not reaped included."""
+    pids = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")]
+    return {pid for pid in pids if _stat(pid)[1:2] == [str(parent)]}

@@ -22,11 +22,12 @@ from multiprocessing.connection import Connection
 from rack.backplane import semaphores
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
-from rack.backplane.process import refusal, set_priority
+from rack.backplane.process import adopt_orphans, children_of, refusal, set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.classes import find_class
 from rack.boards.crate.line import received
+from rack.boards.crate.output import HostOutput
 from rack.boards.crate.requests import (
     CellConfig,
     Ended,
@@ -51,6 +52,10 @@ from rack.levels.level import Executor, Planner
 
 HOST_PROCESSES = 4
 """Processes beside those of the layout: Rack, crate, clock, recorder."""
+REST_MS = 10
+"""Time between two reads of what host boards print: one that prints without end waits, and delays no other."""
+ORPHANS_S = 1.0
+"""Longest wait for the end of what a host board has started."""
 LEAVE_S = 0.5
 """Time for boards to end by themselves after the launcher has gone."""
 
@@ -64,6 +69,8 @@ class Crate:
         self._segment: Segment | None = None
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._preloaded: set[str] = set()
+        self._outputs: dict[str, HostOutput] = {}
+        self._resting: list[HostOutput] = []
         self._poll = select.poll()
         self._poll.register(line, select.POLLIN)
         # The line alone does not show that the launcher is gone: a process that it forked may hold its end open.
@@ -73,9 +80,17 @@ class Crate:
     def run(self) -> None:
         """Serve the Rack until it is gone, then make sure that no board is left."""
         while True:
-            for fd, _ in self._poll.poll():
+            ready = self._poll.poll(REST_MS if self._resting else None)
+            while not ready and self._resting:
+                self._poll.register(self._resting.pop().reader, select.POLLIN)
+            printing = {output.reader: output for output in self._outputs.values()}
+            for fd, _ in ready:
                 if fd in self._boards:
                     self._reap(fd)
+                elif fd in printing:
+                    printing[fd].pass_on()
+                    self._poll.unregister(fd)
+                    self._resting.append(printing[fd])
                 elif fd == self._launcher or (request := received(self._line)) is None:
                     self._leave()
                     return
@@ -97,7 +112,8 @@ class Crate:
             case PowerOn(name, ClockWiring() as clock):
                 self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
             case PowerOn(name, HostWiring() as host):
-                self._fork(name, lambda segment: run_host_board(segment, host, self._attention))
+                output = self._output(name)
+                self._fork(name, lambda segment: run_host_board(segment, host, self._attention, output.writer))
             case PowerOn(name, HogWiring(entry)):
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
@@ -129,6 +145,13 @@ class Crate:
             self._preloaded.add(reference)
         return True
 
+    def _output(self, name: str) -> HostOutput:
+        """Return what a host board prints into, in all its processes."""
+        if name not in self._outputs:
+            self._outputs[name] = output = HostOutput(name)
+            self._poll.register(output.reader, select.POLLIN)
+        return self._outputs[name]
+
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         assert self._segment is not None, "the Rack opens the segment first"
         crate = os.getpid()
@@ -151,7 +174,9 @@ class Crate:
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
         self._poll.register(pidfd, select.POLLIN)
-        self._line.send(Forked(name, pid))
+        # The Rack may have closed the line meanwhile: the crate must live to end its boards.
+        with suppress(OSError):
+            self._line.send(Forked(name, pid))
 
     def _reap(self, pidfd: int) -> None:
         seen_ns = time.monotonic_ns()
@@ -159,13 +184,23 @@ class Crate:
         tick = self._mark_lost(name)
         self._poll.unregister(pidfd)
         os.close(pidfd)
-        if self._is_host(name):
-            # Whatever it has started: a host board leads a process group, which lasts until its leader is reaped.
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(pid, signal.SIGKILL)
         _, status = os.waitpid(pid, 0)
+        if self._is_host(name):
+            self._end_orphans()
+            self._outputs[name].pass_on(is_over=True)
         with suppress(OSError):
             self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
+
+    def _end_orphans(self) -> None:
+        """End whatever a host board has started, in any session: with its end it has become a child of the crate."""
+        deadline = time.monotonic() + ORPHANS_S
+        while time.monotonic() < deadline:
+            orphans = children_of(os.getpid()) - {pid for _, pid in self._boards.values()}
+            if not orphans:
+                return
+            for pid in orphans:
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, os.WNOHANG)
 
     def _mark_lost(self, name: str) -> int:
         """Mark a board as lost on the backplane, for the clock and the other boards; return the tick."""
@@ -201,6 +236,9 @@ class Crate:
         """End after the Rack: boards notice that it is gone and end; those that take too long are killed."""
         self._poll.unregister(self._line)
         self._poll.unregister(self._launcher)
+        for output in self._outputs.values():
+            if output not in self._resting:
+                self._poll.unregister(output.reader)
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
@@ -230,5 +268,6 @@ def main() -> None:
     # Ctrl-C reaches every process of the group, but the Rack decides how the run ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    adopt_orphans()
     line, attention = (int(fd) for fd in sys.argv[1:])
     Crate(Connection(line), attention).run()

@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Self
 
+from rack.boards.crate.output import lines_of
 from rack.boards.errors import LaunchError
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -67,9 +68,9 @@ class CrateLine:
     def printed(self) -> list[str]:
         """Return the lines printed by boards since the last call."""
         data = os.pread(self._printed, 1 << 20, self._read_to)
-        whole = data[: data.rfind(b"\n") + 1]
-        self._read_to += len(whole)
-        return whole.decode(errors="replace").splitlines()
+        whole = lines_of(data)
+        self._read_to += sum(map(len, whole))
+        return [line for part in whole for line in part.decode(errors="replace").splitlines()]
 
     def send(self, request: object) -> None:
         """Send a request to the crate. Raises `LaunchError`, with its output, if it is gone."""

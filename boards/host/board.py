@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 from rack.backplane.errors import MailboxError
+from rack.backplane.process import adopt_orphans
 from rack.backplane.segment import Segment
 from rack.boards.classes import find_class
 from rack.boards.errors import LONGEST_REASON, one_line
@@ -25,13 +26,16 @@ FAILED = 1
 """Exit status of a host board whose program raised an exception."""
 
 
-def run_host_board(segment: Segment, wiring: HostWiring, attention: int) -> int:
-    """Run a host board's program; return the exit status of its process.
+def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output: int) -> int:
+    """Run a host board's program, which prints to `output`; return the exit status of its process.
 
-    The process leads a session of its own: the crate ends with it whatever it has started. `attention` is an eventfd on
-    which the Rack waits.
+    The process leads a session of its own, and what its children leave behind becomes its own child, then the crate's,
+    which ends it. `attention` is an eventfd on which the Rack waits.
     """
     os.setsid()
+    adopt_orphans()
+    os.dup2(output, 1)
+    os.dup2(output, 2)
     # The crate ignores it. A program that is ended leaves its `with` and `finally` blocks, as at sys.exit.
     signal.signal(signal.SIGTERM, _leave)
     bus = _opened(segment, wiring)

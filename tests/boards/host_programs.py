@@ -97,6 +97,37 @@ class Deaf(Host):
                 continue
 
 
+class Escaping(Host):
+    """Leaves a daemon behind, in a session of its own, which keeps SIGTERM out."""
+
+    def run(self, bus: Bus) -> None:
+        """Fork twice, and wait; the daemon prints its id."""
+        child = os.fork()
+        if child == 0:
+            if os.fork() == 0:
+                os.setsid()
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
+                os.write(1, f"daemon {os.getpid()}\n".encode())
+                time.sleep(60)
+            os._exit(0)
+        os.waitpid(child, 0)
+        super().run(bus)
+
+
+class Printing(Host):
+    """Prints without end, `length` bytes a line; the first that prints `once` prints them without a newline, once."""
+
+    def run(self, bus: Bus) -> None:
+        """Print."""
+        text = "x" * self.context.params["length"]
+        if self.context.params.get("once"):
+            os.write(1, text.encode())
+            bus.send("numbers", value=1.0)
+            super().run(bus)
+        while not bus.is_over:
+            os.write(1, f"{text}\n".encode())
+
+
 class Improper(Host):
     """Sends what no number may hold, then a proper one."""
 

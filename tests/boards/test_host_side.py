@@ -19,7 +19,7 @@ from rack.boards.config import resolve
 from rack.boards.host.bus import HostBus
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.host_programs import Failing
-from tests.processes import BOUND_S, wait_until
+from tests.processes import BOUND_S, runs, wait_until
 
 HOSTED = f"""{CLOCK}
 [board.bridge]
@@ -149,6 +149,46 @@ def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_i
     with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=HOSTED)) as rack:
         rack.start()
         watch(rack, lambda: status(rack.segment, "adder").sum > 0)
+
+
+def daemons(rack: Rack) -> list[int]:
+    """Return the processes that the program has left behind, by what they printed."""
+    return [int(event.text.split()[1]) for event in rack.events if event.text.startswith("daemon ")]
+
+
+@pytest.mark.parametrize("ends_first", [False, True])
+def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(config: MakeConfig, ends_first: bool) -> None:
+    with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Escaping", text=HOSTED)) as rack:
+        rack.start()
+        wait_until(lambda: rack.watch(0.01) and bool(daemons(rack)))
+        (daemon,) = daemons(rack)
+        if ends_first:
+            os.kill(rack.segment.block("program")[Block.PID], signal.SIGKILL)
+            wait_until(lambda: rack.watch(0.01) and "died" in codes(rack, "program"))
+            assert not runs(daemon)
+            # The rack is left while the board is being started again.
+    assert not runs(daemon)
+
+
+def test_output_without_end_is_cut_and_counted_and_hides_no_other_board(config: MakeConfig) -> None:
+    text = others(loud="Printing", long="Printing", failed="Failing")
+    settings = ["clock.mode=realtime", "board.bridge.ends_run=false", "host.program.program=host_programs:Console"]
+    settings += ["host.loud.params.length=10", "host.long.params={ length = 3000000, once = true }"]
+
+    def printed(word: str) -> list[str]:
+        return [event.text for event in rack.events if event.kind == "printed" and word in event.text]
+
+    with Rack(config(*settings, text=text)) as rack:
+        rack.start()
+        watch(
+            rack,
+            lambda: len(printed("dropped")) > 3 and printed("'failed': ValueError") and len(printed("xx" * 99)) > 2999,
+        )
+        memory = os.fstat(rack._line._printed).st_size
+    assert printed("host board 'loud': ")[0].endswith(" lines dropped so far; a run keeps the first 10000")
+    assert len([line for line in printed("x") if line == "x" * 10]) == 10_000
+    assert {len(line) for line in printed("xx" * 99)} == {1000}
+    assert memory < 5_000_000
 
 
 def test_a_stopped_program_is_found_killed_and_started_again(config: MakeConfig) -> None:

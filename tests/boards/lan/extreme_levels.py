@@ -18,7 +18,7 @@ Case = tuple[str, bytes, bool]
 
 
 class Extremes(Executor):
-    """Writes each case of `params.cases`, a number of cycles and the bytes in hexadecimal, then the last one for ever."""
+    """Writes each case of `params.cases`, a number of cycles and bytes in hexadecimal, then the last one for ever."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
