@@ -124,7 +124,7 @@ class ProperContent:
             return False
         if not all(np.isin(record[name], numbers).all() for name, numbers in self._enums):
             return False
-        if not all(_has_length(record[name], *limits) for name, *limits in self._lengths):
+        if not all(_has_length(record[name], limits, is_vector) for name, limits, is_vector in self._lengths):
             return False
         groups = [(record[name], content) for name, content in self._groups]
         return all(content._permits(group[group != np.zeros_like(group)]) for group, content in groups)
