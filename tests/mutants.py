@@ -107,15 +107,20 @@ MUTANTS = (
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))
 
 
-def mutated(folder: Path, patches: Sequence[tuple[str, str, str]]) -> None:
+def mutated(folder: Path, patches: Sequence[tuple[str, str, str]], copied: Sequence[str] = COPIED) -> None:
     """Copy the tree and patch it. Raises `LookupError` for a patch that applies no more."""
-    for name in COPIED:
+    for name in copied:
         shutil.copytree(ROOT / name, folder / "rack" / name, ignore=shutil.ignore_patterns("__pycache__"))
     for file, old, new in patches:
         text = (folder / "rack" / file).read_text()
         if old not in text:
             raise LookupError(f"{file}: no longer holds {old.strip()!r}; mend the mutant in tests/mutants.py")
         (folder / "rack" / file).write_text(text.replace(old, new))
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment in which a tree in `folder` runs. Code that is compiled for the copy goes with it."""
+    return {**os.environ, "PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
 
 
 def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
@@ -129,8 +134,7 @@ def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
         text=True,
         timeout=BOUND_S,
         check=False,
-        # Code that is compiled for the copy goes with it.
-        env={**os.environ, "PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder / "cache")},
+        env=environment(folder),
     )
     return done.returncode, done.stdout + done.stderr
 
