@@ -90,7 +90,7 @@ class BoundCase:
     @property
     def period(self) -> int:
         """Ticks from one release of the task to the next; a planner has several in its time slice."""
-        return 1 if self.board == CLOCK else self.layout.task(self.board).every
+        return self.layout.task(self.board).every
 
     @property
     def write(self) -> int:

@@ -66,6 +66,12 @@ def test_a_fault_must_be_detected_within(
     assert bound(config, fault, reader) == ticks
 
 
+def test_a_slow_planner_is_detected_after_its_slice_and_one_release(config: MakeConfig) -> None:
+    # Half as fast: a slice of four cycles of two ticks, and one such cycle.
+    fault = {"kind": "planner-slow", "board": "wave.planner"}
+    assert bound(config, fault, None, "board.wave.rate_hz=200") == 4 * 2 + 2
+
+
 @pytest.mark.parametrize(("kind", "ticks"), [("actuator-off", 13), ("actuator-saturated", 30)])
 def test_a_motor_of_a_fast_board_is_detected_within_a_time(config: MakeConfig, kind: str, ticks: int) -> None:
     rates = [f"board.{name}.rate_hz=1000" for name in ("wave", "watch", "driven")]

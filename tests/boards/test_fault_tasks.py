@@ -1,4 +1,4 @@
-"""The hog: it takes a core when its fault begins, and not before."""
+"""Faults of one task: the hog takes a core when its fault begins, and not before; what computing time costs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import time
 
 import pytest
 
-from rack.backplane.fault_table import FaultTable, Injection
+from rack.backplane.clock.system_clock import SystemClock
+from rack.backplane.fault_table import Entry, FaultTable, Injection
 from rack.backplane.process import processor_ns
+from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.faults.kind import KINDS
-from rack.boards.faults.tasks import take_core
+from rack.boards.faults.tasks import ExtraComputing, LoadStep, overrun, slow_plan, take_core
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.machine import needs_fifo
@@ -33,3 +35,40 @@ def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: Make
         assert processor_ns(pid) < 0.5 * (time.monotonic() - begun) * 1e9
         segment.words[System.STATE] = Run.STOPPED
         assert exit_status(pid) == 0
+
+
+def load(segment: Segment, kind: str, until: LoadStep, *parameters: float) -> ExtraComputing:
+    """Return extra computing time of a task of three ticks, whose plans have two cycles."""
+    entry = FaultTable(segment).add(Injection(KINDS[kind].number, 0, tick=0, seed=5, parameters=parameters))
+    return ExtraComputing(entry, task("level", every=3, within_cycles=2), SystemClock(segment), until)
+
+
+def test_extra_computing_takes_the_time_that_its_step_asks_for(make_bus: MakeBus) -> None:  # noqa: F811
+    ends: list[int] = []
+
+    def step(of: ExtraComputing, tick: int, now: int) -> int:
+        ends.append(now + tick * 1_000_000)
+        return ends[-1]
+
+    extra = load(make_bus(task("level")), "overrun", step, 1.0)
+    begun = time.monotonic_ns()
+    extra.burn(20)
+    assert time.monotonic_ns() >= ends[0] >= begun + 20_000_000
+    assert (extra.entry[Entry.COUNT], extra.entry[Entry.STRUCK_TICK]) == (1, 20)
+
+
+def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus: MakeBus) -> None:  # noqa: F811
+    segment = make_bus(task("level"))
+    segment.words[System.PERIOD_NS] = period = 2_500_000
+    segment.words[System.EPOCH_NS] = epoch = 1_000_000_000
+    assert overrun(load(segment, "overrun", overrun, 2.0, 0.0), 4, 77) == 77 + 2 * 3 * period
+    random = load(segment, "overrun", overrun, 2.0, 1.0)
+    drawn = [overrun(random, tick, 0) for tick in range(50)]
+    assert drawn == [overrun(random, tick, 0) for tick in range(50)]
+    assert 0 <= min(drawn) < max(drawn) <= 2 * 3 * period
+    assert len(set(drawn)) == 50
+    late = load(segment, "planner-slow", slow_plan, 2.0)
+    slice_end = epoch + (4 + 3 * 2) * period
+    assert slow_plan(late, 4, 0) == slice_end + 2 * 3 * period
+    # One that is beyond its slice already has them added.
+    assert slow_plan(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period

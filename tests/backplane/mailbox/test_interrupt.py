@@ -78,6 +78,14 @@ def test_a_message_shows_at_the_first_release_after_its_service(make_bus: MakeBu
     assert board.readers["first"].read(1).verdict is Verdict.OLD
 
 
+def test_a_message_written_in_the_tick_in_which_it_is_due_is_late(make_bus: MakeBus) -> None:
+    # Sent 0.5 ms after the second tick that follows the release, and visible from the third on.
+    segment = make_bus(*boxes(every=4, sent_ns=2 * CLOCK_NS + 500_000), *tasks())
+    writer = InterruptWriter(segment, "first.point")
+    assert [writer.is_in_time(8, now) for now in (None, 8, 10, 11, 12)] == [True, True, True, False, False]
+    assert [writer.visible_at(8, now) for now in (None, 8, 10, 11, 12)] == [11, 11, 11, 12, 13]
+
+
 def test_one_that_is_served_across_a_release_shows_at_the_next(make_bus: MakeBus) -> None:
     # Each takes 0.9 ms: from 0.5 ms on the handler is done at 1.4, 2.3 and 3.2 ms, with a release at 2.5.
     board = Board(make_bus(*boxes(service_ns=900_000), *tasks()))

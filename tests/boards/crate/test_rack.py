@@ -26,7 +26,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.machine import needs_fifo
-from tests.processes import FORKS, RACK, descriptors, exit_status, forked, named, wait_until
+from tests.processes import FORKS, RACK, descriptors, exit_status, forked, named, parent_of, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
@@ -129,6 +129,23 @@ def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -
             pass
     assert rack.outcome is not None
     assert rack.outcome.cause == "stopped"
+
+
+def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(config: MakeConfig) -> None:
+    with Rack(config("clock.mode=realtime")) as rack:
+        rack.start()
+        words, block = rack.segment.words, rack.segment.block("wave")
+        wait_until(lambda: words[System.TICK] > 20)
+        before = words[System.TICK]
+        os.kill(parent_of(block[Block.PID]), signal.SIGKILL)
+        deadline = time.monotonic() + BOUND_S
+        while rack.watch(0.5):
+            assert time.monotonic() < deadline
+        # No stop was asked for, so none has a tick.
+        assert words[System.STOP_TICK] == 0
+        assert rack.outcome is not None
+        # The clock may outlive the crate by a moment, in which it begins further ticks.
+        assert before + 1 <= rack.outcome.ticks <= words[System.TICK] + 1
 
 
 def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConfig) -> None:

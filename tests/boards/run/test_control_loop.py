@@ -162,6 +162,20 @@ def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
     assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.MISSED)] == [5, 3, 8, 0]
 
 
+@pytest.mark.parametrize(("now", "trouble"), [(5, Flag.SKIPPED), (10, Flag.SKIPPED | Flag.MISSED)])
+def test_a_release_without_a_plan_is_traced_after_skipped_ones(bench: MakeBench, now: int, trouble: Flag) -> None:
+    rack = bench("board.wave.params.plan_every=4")
+    planner = rack.task("wave.planner")
+    planner.cycle(0)
+    # Its slice is four ticks: at tick 10 that of the release at 5 is over.
+    planner.next_cycle.skipped = 1
+    rack.to(now)
+    planner.cycle(5)
+    assert rack.flags("wave.planner") == [Flag(0), trouble]
+    block = rack.segment.block("wave.planner")
+    assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.SKIPPED)] == [2, 1, 5, 1]
+
+
 def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
     rack = bench()
     writer = open_writer(rack.segment, "wave.status")

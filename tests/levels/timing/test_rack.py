@@ -8,7 +8,7 @@ import pytest
 
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import BoardTiming, RackTiming, spanned
-from rack.levels.timing.tasks import Budget, TimedTask
+from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 from rack.levels.timing.verdicts import verdicts
 
 MS = 1_000_000
@@ -142,3 +142,31 @@ def test_boards_without_a_budget_are_named_and_not_judged() -> None:
     forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
     assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
     assert any(note.endswith(": top, a") for note in forecast.notes)
+
+
+def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
+    assert FIGURE_3.budget is not None
+    silent = replace(FIGURE_3, name="silent", budget=replace(FIGURE_3.budget, plan_ns=0), core=2, planner_core=2)
+    plain = replace(silent, name="plain", has_planner=False, core=3)
+    notes = Forecast.of(rack(FIGURE_3, silent, plain, board("unknown", 4))).notes
+    assert [note for note in notes if note.startswith("planner not judged")] == [
+        "planner not judged, no plan_ms in the budget: silent"
+    ]
+    assert not any("planner not judged" in note for note in Forecast.of(rack(FIGURE_3, plain)).notes)
+
+
+def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
+    fast = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, (Part(Unit.PROCESS, MS // 10),))
+    counted = replace(rack(FIGURE_3), clock=fast)
+    ordinary = replace(FIGURE_3, planner_priority=70)
+    assert Forecast.of(replace(counted, boards={"level": ordinary})).notes == ()
+    notes = Forecast.of(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
+    expected = ("in lockstep", "times are of the wall clock: speed 2", "cores are those of the config")
+    assert len(notes) == len(expected)
+    assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
+    # Without a budget there is nothing to say about times.
+    bare = Forecast.of(replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False).notes
+    assert [note.partition(" ")[0] for note in bare] == ["no", "the"]
+    # Two ordinary tasks that compute share a core; one has it to itself.
+    both = replace(FIGURE_3, priority=0, planner_priority=0)
+    assert "ordinary scheduling" in Forecast.of(replace(counted, boards={"level": both})).notes[-1]

@@ -1,0 +1,152 @@
+"""The system controller at a tick: boards that are lost and come back, and what it then demands of the arm."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.backplane.clock.driver import RealtimeDriver
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import State
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import AlarmWriter, alarm_ring
+from rack.backplane.words import Block, Demand, System, TaskState
+from rack.boards import Rack
+from rack.boards.faults.config import FaultConfig
+from rack.boards.run.system_controller import EndOfRun, SystemController
+from rack.boards.wiring import ClockWiring
+from rack.levels.messages import TASK_STATUS
+from tests.backplane.bus import task
+from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.boards.conftest import MakeConfig
+from tests.tools.faults.test_ending import box
+
+RESTART_TICKS = 200
+"""Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
+
+
+@pytest.mark.parametrize("tick", [0, 1])
+def test_a_board_that_dies_at_the_first_ticks_comes_back(config: MakeConfig, tick: int) -> None:
+    fault = FaultConfig.model_validate({"kind": "kill", "board": "wave", "tick": tick})
+    with Rack(config().model_copy(update={"fault": (fault,)})) as rack:
+        outcome = rack.run(1.0)
+    assert (outcome.cause, outcome.worked) == ("time over", True)
+    back = [event for event in rack.events if event.code == "rejoined"]
+    assert [(event.board, event.tick) for event in back] == [("wave", tick + RESTART_TICKS)]
+
+
+def wiring(**changed: object) -> ClockWiring:
+    """Return a clock's wiring in real time, without a stop."""
+    plain: dict[str, object] = {
+        "lockstep": False,
+        "period_ns": 2_500_000,
+        "stop_tick": 0,
+        "ends_run": None,
+        "linger": 10,
+        "silent": 40,
+        "history": 100,
+        "core": 0,
+        "priority": 0,
+        "keeps_awake": False,
+        "restart_ticks": 20,
+        "on_loss": {"left": Demand.STOP, "right": Demand.BRAKE},
+    }
+    return ClockWiring(**{**plain, **changed})  # type: ignore[arg-type]  # by name, as above
+
+
+class Controlled:
+    """A system controller of two boards, cycled by the test."""
+
+    def __init__(self, segment: Segment, **changed: object) -> None:
+        self.words = segment.words
+        self.words[System.PERIOD_NS] = 2_500_000
+        self.alarms = alarm_ring(segment, "clock")
+        self.driver = RealtimeDriver(segment, lambda tick: None, AlarmWriter(segment, "clock"))
+        self.blocks = {name: segment.block(name) for name in ("left", "right")}
+        for block in self.blocks.values():
+            block[Block.STATE] = TaskState.RUNNING
+        self.controller = SystemController(segment, wiring(**changed), self.driver)
+
+    def lose(self, name: str, tick: int) -> None:
+        """Lose a board, as the Rack notes it."""
+        block = self.blocks[name]
+        block[Block.LOST], block[Block.STATE] = 1 + tick, TaskState.STARTING
+        self.words[System.LOSSES] += 1
+
+    def demand(self, tick: int) -> Demand:
+        """Return the demand on the arm after the clock's work at a tick."""
+        self.controller.begin(tick)
+        return Demand(self.words[System.DEMAND])
+
+
+BOARDS = task("left"), task("right", slot=3)
+
+
+def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> None:  # noqa: F811
+    rack = Controlled(make_bus(*BOARDS))
+    assert rack.demand(0) is Demand.NONE
+    rack.lose("left", 3)
+    assert rack.demand(3) is Demand.STOP
+    rack.lose("right", 5)
+    assert rack.demand(5) is Demand.BRAKE
+    rack.blocks["right"][Block.STATE] = TaskState.READY
+    assert rack.demand(7) is Demand.STOP
+    rack.blocks["left"][Block.STATE] = TaskState.READY
+    assert rack.demand(9) is Demand.NONE
+    # Rejoined after two ticks, and after six.
+    values = rack.alarms.drain().rows["value"].tolist()
+    assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
+
+
+def test_the_emergency_stop_engages_brakes_until_it_is_released(make_bus: MakeBus) -> None:  # noqa: F811
+    rack = Controlled(make_bus(*BOARDS))
+    assert rack.demand(0) is Demand.NONE
+    rack.words[System.EMERGENCY_STOP] = 1
+    assert rack.demand(1) is Demand.BRAKE
+    rack.words[System.EMERGENCY_STOP] = 0
+    assert rack.demand(2) is Demand.NONE
+
+
+def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come_to_rest(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    rack = Controlled(make_bus(*BOARDS))
+    rack.lose("left", 3)
+    rack.blocks["left"][Block.STATE] = TaskState.GIVEN_UP
+    assert rack.demand(4) is Demand.BRAKE
+    assert (rack.words[System.EMERGENCY_STOP], rack.words[System.STOP_TICK]) == (1, 14)
+    # A second one does not put the end off, nor does time.
+    rack.lose("right", 6)
+    rack.blocks["right"][Block.STATE] = TaskState.GIVEN_UP
+    rack.demand(7)
+    assert rack.words[System.STOP_TICK] == 14
+
+
+def ends_at(segment: Segment, state: State, written: int, until: int, **changed: object) -> list[int | None]:
+    """Return when the run ends, as known at each tick, after one status of the level that ends it."""
+    over = EndOfRun(segment, wiring(ends_run="task.status", **changed))
+    found = []
+    for tick in range(until):
+        if tick == written:
+            writer = open_writer(segment, "task.status")
+            writer.message.state = state
+            writer.write(tick)
+        found.append(over(tick))
+    return found
+
+
+@pytest.mark.parametrize("state", [State.DONE, State.ERROR])
+def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State) -> None:  # noqa: F811
+    found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), state, 5, 12)
+    # Visible at 6, seen at 7 as of the tick before; ten ticks of rest.
+    assert found == [None] * 7 + [16] * 5
+
+
+def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:  # noqa: F811
+    found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), State.EXECUTING, 5, 60)
+    # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
+    assert found == [None] * 47 + [56] * 13
+
+
+def test_a_run_of_given_length_ends_there_whatever_its_task_does(make_bus: MakeBus) -> None:  # noqa: F811
+    found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99)
+    assert found == [99] * 12

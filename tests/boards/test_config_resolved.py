@@ -1,0 +1,61 @@
+"""A resolved rack: what its launch has to say, and when it is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, Demand
+from rack.boards.config.resolved import Resolved, resolve
+from rack.boards.errors import LaunchError
+from tests.boards.conftest import MakeConfig
+
+REFUSED = "SCHED_FIFO refused, ordinary scheduling for wave"
+
+
+@pytest.fixture
+def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
+    """A rack of which one board wants a real-time priority, and its memory."""
+    plan = resolve(config("clock.mode=realtime", "clock.on_no_realtime=refuse", "board.wave.priority=50"))
+    segment = Segment.create(plan.layout, "")
+    yield plan, segment
+    unlink(segment.rack)
+    segment.close()
+
+
+def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
+    memory: tuple[Resolved, Segment],
+) -> None:
+    plan, segment = memory
+    for task in plan.layout.tasks:
+        segment.block(task.name)[Block.PRIORITY] = task.priority
+    plan.check_realtime(segment)
+    assert not [note for note in plan.notes(segment) if "SCHED_FIFO" in note]
+    segment.block("wave")[Block.PRIORITY] = 0
+    (note,) = [note for note in plan.notes(segment) if "SCHED_FIFO" in note]
+    assert note.startswith(f"{REFUSED}; missed deadlines are likely")
+    with pytest.raises(LaunchError, match=REFUSED):
+        plan.check_realtime(segment)
+
+
+def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
+    plan = resolve(config("supervision.lockstep_restart_s=0.25"))
+    clock = plan.clock(0.5)
+    # A tick of 2.5 ms.
+    assert resolve(config("clock.mode=realtime", "clock.speed=2")).clock(None).period_ns == 1_250_000
+    assert (clock.period_ns, clock.stop_tick, clock.restart_ticks, clock.linger) == (2_500_000, 200, 100, 200)
+    assert (clock.lockstep, clock.keeps_awake, clock.ends_run) == (True, False, "watch.status")
+    assert set(clock.on_loss) == {"wave", "watch"}
+    assert all(isinstance(demand, Demand) for demand in clock.on_loss.values())
+    assert plan.clock(None).stop_tick == 0
+    assert plan.clock(1e-9).stop_tick == 1
+
+
+def test_a_launch_says_whether_idle_cores_are_held_awake(memory: tuple[Resolved, Segment], config: MakeConfig) -> None:
+    plan, segment = memory
+    assert not [note for note in plan.notes(segment) if "idle_cores" in note]
+    awake = resolve(config("clock.mode=realtime", "clock.idle_cores=awake"))
+    (note,) = [note for note in awake.notes(segment) if "idle_cores" in note]
+    assert note.startswith('clock.idle_cores = "awake": ')

@@ -1,0 +1,108 @@
+"""What is read from a rack's memory at the end of a run: the levels' last states, the arm, the faults that struck."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import MessageType, State
+from rack.backplane.segment import Segment
+from rack.boards.config.layout import field_specs
+from rack.boards.faults.kind import KINDS
+from rack.levels.messages import ARM_STATE, SERVO_STATUS, TASK_STATUS, Error
+from rack.tools.faults.ending import AT_REST, EXTERNAL, Killed, arm_of, is_late, levels_of, strikes
+from tests.backplane.bus import mailbox, task
+from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+
+SIZES = {"joints": 2, "state": 3}
+JOINTS = ("shoulder", "elbow")
+TASKS = task("task"), task("servo", slot=3), task("arm", slot=4)
+
+
+def box(message: MessageType, name: str) -> MailboxSpec:
+    """Return the spec of a board's mailbox."""
+    return replace(
+        mailbox(name=name, writer=name.partition(".")[0]),
+        readers=(),
+        message=message.name,
+        version=message.version,
+        size=message.dtype(SIZES).itemsize,
+        fields=field_specs(message, SIZES),
+    )
+
+
+BOXES = box(TASK_STATUS, "task.status"), box(SERVO_STATUS, "servo.status"), box(ARM_STATE, "arm.state")
+
+
+def write(segment: Segment, name: str, **fields: object) -> None:
+    """Write a message of these fields; the other fields are 0."""
+    writer = open_writer(segment, name)
+    for field, value in fields.items():
+        setattr(writer.message, field, value)
+    writer.write(0)
+
+
+def test_the_last_states_of_levels_are_told_with_their_reasons(make_bus: MakeBus) -> None:  # noqa: F811
+    segment = make_bus(*BOXES, *TASKS)
+    assert levels_of(segment) == ""
+    write(segment, "arm.state", tick=1)
+    write(segment, "task.status", state=State.ERROR, reason="no path")
+    assert levels_of(segment) == "task error (no path)"
+    write(segment, "servo.status", state=State.EXECUTING)
+    assert levels_of(segment) == "task error (no path), servo executing"
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "late"),
+    [
+        (State.ERROR, Error.TOO_LATE, True),
+        (State.ERROR, Error.NO_PATH, False),
+        (State.EXECUTING, Error.TOO_LATE, False),
+    ],
+)
+def test_only_a_level_that_gave_up_for_its_time_is_late(
+    make_bus: MakeBus,  # noqa: F811
+    state: State,
+    error: Error,
+    late: bool,
+) -> None:
+    segment = make_bus(*BOXES, *TASKS)
+    assert not is_late(segment)
+    write(segment, "servo.status", state=State.EXECUTING, error=Error.NONE)
+    write(segment, "task.status", state=state, error=error)
+    assert is_late(segment) is late
+
+
+@pytest.mark.parametrize(("speed", "rests"), [(0.5 * AT_REST, True), (-0.5 * AT_REST, True), (-2 * AT_REST, False)])
+def test_the_arm_is_as_its_board_last_reported_it(make_bus: MakeBus, speed: float, rests: bool) -> None:  # noqa: F811
+    segment = make_bus(*BOXES, *TASKS)
+    still = arm_of(segment)
+    assert (still.violations, still.touches, still.is_at_rest) == (0, 0, True)
+    write(segment, "servo.status", violations=3, touches=2, velocity=(0.0, speed))
+    end = arm_of(segment)
+    assert (end.violations, end.touches, end.is_at_rest) == (3, 2, rests)
+
+
+def test_strikes_are_the_table_s_and_kills_from_outside_come_last(make_bus: MakeBus) -> None:  # noqa: F811
+    segment = make_bus(*BOXES, *TASKS)
+    table = FaultTable(segment)
+    bias, mute = KINDS["sensor-bias"], KINDS["mute"]
+    joint = tuple(1.0 if p.name == "joint" else 0.25 for p in bias.parameters)
+    injected = Injection(bias.number, 1, tick=40, ticks=400, seed=7, parameters=joint)
+    begun, waits = table.add(injected), table.add(Injection(mute.number, 0, mailbox=0, tick=90))
+    begun.words[Entry.STAGE] = Stage.ACTIVE
+    begun.acted(43)
+    first, second, last = strikes(segment, JOINTS, [Killed("task", 60, 5_000)])
+    assert (first.kind, first.board, first.began, first.tick, first.count) == ("sensor-bias", "servo", 40, 43, 1)
+    assert (first.joint, first.mailboxes) == ("elbow", ("servo.status",))
+    assert first.injection is not None
+    assert (first.injection.seed, first.injection.parameters) == (7, joint)
+    # It waits, so it has not begun.
+    assert (second.kind, second.began, second.tick, second.count) == ("mute", -1, -1, 0)
+    assert (second.fault, second.joint) == (waits.index, "")
+    assert (last.fault, last.kind, last.board, last.began, last.ends, last.tick) == (-1, EXTERNAL, "task", 60, 60, 60)
+    assert last.mailboxes == ("task.status",)
