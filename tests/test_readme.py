@@ -73,6 +73,16 @@ def test_every_file_that_the_pages_link_to_exists() -> None:
     assert not [f"{page.name}: {link}" for page, link in links if not (page.parent / link).exists()]
 
 
+def test_the_map_names_every_room_and_no_other() -> None:
+    root = README.parent
+    table = (root / "ARCHITECTURE.md").read_text().partition("## Rooms")[2].partition("## ")[0]
+    heads = [row.split("|")[1] for row in table.splitlines() if row.startswith("| [")]
+    named = {room.rstrip("/") for head in heads for room in re.findall(r"\[([\w/]+)\]", head)}
+    floors = ("backplane", "boards", "levels", "tools")
+    rooms = {str(path.parent.relative_to(root)) for floor in floors for path in (root / floor).rglob("__init__.py")}
+    assert named == rooms
+
+
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
     script = re.search(r"```python\n(from rack\.boards.*?)```", README.read_text(), re.DOTALL)
     assert script
