@@ -55,7 +55,7 @@ class HostReader:
         self._is_proper = ProperContent(spec.fields)
         self.refused = 0
         """Messages refused: damaged, forged, or improper."""
-        self.overtaken = 0
+        self.superseded = 0
         """Messages that a newer one overtook before it was taken."""
 
     @property
@@ -78,7 +78,7 @@ class HostReader:
         head, oldest = self._box[_HEAD], self._box[_TAKEN] + 1
         # Only a writer that does not keep to the rules overwrites what waits.
         serial = max(oldest, head - self.spec.depth + SPARE)
-        self.overtaken += serial - oldest
+        self.superseded += serial - oldest
         self._box[_TAKEN] = serial
         return self._fetched(serial)
 
@@ -88,7 +88,7 @@ class HostReader:
         self._box[_TAKEN] = head
         for back in range(min(waiting, most)):
             if (message := self._fetched(head - back)) is not None:
-                self.overtaken += waiting - back - 1
+                self.superseded += waiting - back - 1
                 return message
         return None
 

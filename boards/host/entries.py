@@ -31,7 +31,7 @@ ENTRY = MessageType(
     (
         Field("passed", "u4", "1", "messages passed to the other side"),
         Field("refused", "u4", "1", "messages refused: damaged, forged, or not what its type permits"),
-        Field("overtaken", "u4", "1", "messages that a newer one overtook before the exchange"),
+        Field("superseded", "u4", "1", "messages that a newer one overtook before the exchange"),
         Field("full", "u4", "1", "messages that the host board could not send, since too many waited"),
         Field("waiting", "u4", "1", "messages that wait for the next cycles"),
         Field("arrived", "i8", "tick", "tick at which the newest message reached the other side; -1: none yet"),
@@ -89,7 +89,7 @@ class EntryCount:
 
     passed: int = 0
     refused: int = 0
-    overtaken: int = 0
+    superseded: int = 0
     full: int = 0
     waiting: int = 0
     arrived: int = NEVER
@@ -98,7 +98,7 @@ class EntryCount:
     def resume(self, record: Any, tick: int) -> None:
         """Continue with the counts in the status of an earlier cycle."""
         age = int(record["age"])
-        for name in ("passed", "refused", "overtaken", "full", "waiting", "arrived"):
+        for name in ("passed", "refused", "superseded", "full", "waiting", "arrived"):
             setattr(self, name, int(record[name]))
         self.written = NEVER if age == NEVER else tick - age
 
@@ -110,7 +110,7 @@ class EntryCount:
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
         age = NEVER if self.written == NEVER else tick - self.written
-        counts = self.passed, self.refused, self.overtaken, self.full, self.waiting, self.arrived, age
+        counts = self.passed, self.refused, self.superseded, self.full, self.waiting, self.arrived, age
         fill_counts(record, counts)
 
 
@@ -126,7 +126,7 @@ class Inward:
 
     def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._ring, self._port, self._table, self._count = HostReader(segment, table.source), port, table, count
-        self._refused, self._overtaken = count.refused, count.overtaken
+        self._refused, self._superseded = count.refused, count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
@@ -142,7 +142,7 @@ class Inward:
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.passes(tick, ring.written)
-        count.refused, count.overtaken = self._refused + ring.refused, self._overtaken + ring.overtaken
+        count.refused, count.superseded = self._refused + ring.refused, self._superseded + ring.superseded
         count.full, count.waiting = ring.full, ring.waiting
 
 

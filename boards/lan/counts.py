@@ -23,8 +23,8 @@ class ImportCount:
     repeated: int = 0
     late: int = 0
     refused: int = 0
-    strange: int = 0
-    overtaken: int = 0
+    unknown_launch: int = 0
+    superseded: int = 0
 
     @property
     def values(self) -> tuple[int, ...]:

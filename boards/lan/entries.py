@@ -23,7 +23,7 @@ from rack.boards.lan.peers import NONE, PeerRack
 
 NEVER = -1
 LARGEST = 1 << 62
-"""Greater than every number of a launch, serial or message: what is not was made up."""
+"""Greater than every number of a launch, serial or message: larger values are forged."""
 
 
 class Export:
@@ -139,7 +139,7 @@ class Import:
         for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
             head = self._opened(arrived)
             if head is not None and self._is_due(head, arrived, came, tick) and self._is_next(head, arrived.payload):
-                self.count.overtaken += newest is not None
+                self.count.superseded += newest is not None
                 newest = head
         if newest is None:
             return
@@ -175,7 +175,7 @@ class Import:
         # Its age decides: until the clocks have been compared it may be too old.
         is_due = self._is_present(head) and self._peer.offset_ns is not None
         if is_strange:
-            self.count.strange += 1
+            self.count.unknown_launch += 1
         elif not is_due:
             self._early.append((came, arrived))
             if len(self._early) > 1:
@@ -190,9 +190,9 @@ class Import:
         head = self._opened(arrived)
         if head is not None and self._is_present(head):
             # It has come, so it is not missing.
-            self.count.overtaken += self._order.admits(head)
+            self.count.superseded += self._order.admits(head)
         else:
-            self.count.strange += 1
+            self.count.unknown_launch += 1
 
     def _is_next(self, head: Envelope, payload: bytes) -> bool:
         """Say whether a message is good and the newest so far, and if so keep its content."""

@@ -87,7 +87,7 @@ def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: M
         outcome = rack.run()
         assert (outcome.cause, status(rack.segment, "adder").sum) == ("task done", 50 * 51 / 2)
         entry = status(rack.segment).numbers
-        assert (entry["passed"], entry["refused"], entry["overtaken"]) == (50, 0, 0)
+        assert (entry["passed"], entry["refused"], entry["superseded"]) == (50, 0, 0)
         assert 0 <= entry["arrived"] < outcome.ticks
     assert "died" not in codes(rack, "program")
 

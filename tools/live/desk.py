@@ -34,7 +34,7 @@ SILENT_S = 5.0
 NOTE_S = 1.5
 """Time after which a wait is explained on stderr."""
 
-Fate = Literal["waiting", "given", "taken", "done", "refused", "overtaken"]
+Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Reply:
             "taken": f", taken up at tick {self.taken_up}",
             "done": f", taken up at tick {self.taken_up}, done at tick {self.done}",
             "refused": f", refused at tick {self.taken_up}: {self.objection}",
-            "overtaken": ", overtaken by a newer command",
+            "superseded": ", superseded by a newer command",
         }
         return f"command {self.serial} to '{self.level}', {self.text}: given at tick {self.given}{ends[self.fate]}"
 
@@ -201,7 +201,7 @@ class Replies:
         if self.reply.fate == "taken" and (late := mine & (answers == Answer.REFUSED)).any():
             self._refuse(rows[int(np.argmax(late))])
         if self.reply.fate in ("given", "taken") and (orders > self.reply.serial).any():
-            self.reply = replace(self.reply, fate="overtaken")
+            self.reply = replace(self.reply, fate="superseded")
         return self.reply
 
     def _take_up(self, row: np.void) -> None:

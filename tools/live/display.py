@@ -48,7 +48,7 @@ DROPPED = ("tick", "sched", "slot", "cycles", "Hz", "restarts", "core", "exec ms
 STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green", "holding": "yellow", "awaited": "yellow"}
 COUNTED = {
     **dict.fromkeys(("missed", "skipped"), "red"),
-    **dict.fromkeys(("restarts", "refused", "full", "missing", "late", "strange", "losses"), "yellow"),
+    **dict.fromkeys(("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses"), "yellow"),
 }
 """Colours of counts above 0."""
 HELD = "bold yellow"

@@ -37,7 +37,7 @@ class EntryRow:
     source: str
     passed: int
     refused: int
-    overtaken: int
+    superseded: int
     full: int
     waiting: int
     age_ms: float | None
@@ -76,7 +76,7 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
                 EntryRow(
                     entry=f"{mailbox.partition('.')[0]}.{entry}",
                     source=source,
-                    **{name: int(counts[name]) for name in ("passed", "refused", "overtaken", "full", "waiting")},
+                    **{name: int(counts[name]) for name in ("passed", "refused", "superseded", "full", "waiting")},
                     age_ms=None if age < 0 else age * tick_ms,
                 )
             )

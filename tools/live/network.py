@@ -12,7 +12,7 @@ from rack.levels.peer import Presence, peer_port
 
 BOARD = "lan"
 STATUS = f"{BOARD}.status"
-COUNTS = ("taken", "missing", "disordered", "repeated", "late", "refused", "strange", "overtaken")
+COUNTS = ("taken", "missing", "disordered", "repeated", "late", "refused", "unknown_launch", "superseded")
 """What is counted of an import: see `rack.boards.lan.messages.IMPORT`."""
 
 
@@ -41,8 +41,8 @@ class ImportRow:
     repeated: int
     late: int
     refused: int
-    strange: int
-    overtaken: int
+    unknown_launch: int
+    superseded: int
     age_ticks: int | None
     age_s: float | None
 

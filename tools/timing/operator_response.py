@@ -25,7 +25,7 @@ from rack.tools.recording.recording import Recording
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Fate = Literal["acted on", "refused", "overtaken", "run over"]
+Fate = Literal["acted on", "refused", "superseded", "run over"]
 MEASURED, GRID, SUM, BOUND = "#0072b2", "#009e73", "#e69f00", "#d55e00"
 """Colours of Okabe and Ito's palette, distinguishable to colour-blind readers."""
 BINS = 20
@@ -206,7 +206,7 @@ def _follow(command: AnsweredCommand, given_ns: int, statuses: _Statuses) -> Ans
         return command
     first = int(np.argmax(serial >= command.serial))
     if serial[first] != command.serial:
-        return replace(command, fate="overtaken")
+        return replace(command, fate="superseded")
     wall_ms = round((int(statuses.stamp_ns[first]) - given_ns) * 1e-6, 6)
     return replace(command, acts=int(statuses.tick[first]), fate="acted on", wall_ms=wall_ms)
 

@@ -60,7 +60,7 @@ def test_the_newest_overtakes_the_others(segment: Segment) -> None:
         send(writer, number)
     message = reader.take_newest(most=8)
     assert message is not None
-    assert (message.id, reader.overtaken, reader.waiting) == (3, 2, 0)
+    assert (message.id, reader.superseded, reader.waiting) == (3, 2, 0)
     assert reader.take_newest(most=8) is None
 
 
@@ -87,7 +87,7 @@ def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(se
         writer.write(tick=number)
     found = taken(reader)
     assert found == list(range(14, 21))
-    assert (reader.overtaken, reader.refused) == (13, 0)
+    assert (reader.superseded, reader.refused) == (13, 0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -48,8 +48,8 @@ class Counts(NamedTuple):
     repeated: int
     late: int
     refused: int
-    strange: int
-    overtaken: int
+    unknown_launch: int
+    superseded: int
     presence: Presence
     launches: int
     losses: int
@@ -58,7 +58,7 @@ class Counts(NamedTuple):
     @property
     def accounted(self) -> int:
         """Messages up to the newest of which it is known what became of them."""
-        return self.taken + self.missing + self.late + self.overtaken
+        return self.taken + self.missing + self.late + self.superseded
 
 
 class LabRack:
@@ -150,7 +150,7 @@ def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(lab: Lab, ra
     for rack, first in zip(racks, before, strict=True):
         now = rack.counts()
         assert (now.missing, now.losses, now.launches) == (first.missing, first.losses, first.launches)
-        assert (now.refused, now.strange, now.repeated, now.disordered) == (0, 0, 0, 0)
+        assert (now.refused, now.unknown_launch, now.repeated, now.disordered) == (0, 0, 0, 0)
         # All that were sent until the newest that was taken.
         assert now.number - first.number == now.accounted - first.accounted
         assert rack.heard()[1] == 0

@@ -132,7 +132,7 @@ def test_the_newest_of_several_is_passed(importing: Importing) -> None:
         importing.send(number, written=number)
     importing.cycle(8)
     assert importing.read(16) == (NEW, 5, False)
-    assert importing.counts() == {"taken": 1, "missing": 1, "disordered": 1, "repeated": 2, "overtaken": 1}
+    assert importing.counts() == {"taken": 1, "missing": 1, "disordered": 1, "repeated": 2, "superseded": 1}
     assert importing.read(17)[0] is OLD
 
 
@@ -223,7 +223,7 @@ def test_a_restarted_adapter_continues_and_takes_nothing_twice(importing: Import
     importing.send(4, written=4)
     importing.cycle(24)
     assert importing.read(32) == (NEW, 4, False)
-    assert importing.counts() == {"taken": 2, "overtaken": 1, "repeated": 1, "missing": 1}
+    assert importing.counts() == {"taken": 2, "superseded": 1, "repeated": 1, "missing": 1}
     assert importing.status.import_other["serial"] == 4
 
 
@@ -263,7 +263,7 @@ def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(importin
     importing.send(902, written=38)
     importing.cycle(40)
     assert importing.read(48) == (OLD, 5, False)
-    assert importing.counts() == {"taken": 2, "strange": 2}
+    assert importing.counts() == {"taken": 2, "unknown_launch": 2}
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
@@ -271,11 +271,11 @@ def test_messages_of_a_launch_whose_token_never_comes_are_bounded_and_forgotten(
     for number in range(1, 100):
         importing.send(number, written=4, launch=NEXT)
     importing.cycle(8)
-    assert importing.counts() == {"strange": 98}
+    assert importing.counts() == {"unknown_launch": 98}
     importing.cycle(8 + MAX_AGE + 8)
-    assert importing.counts() == {"strange": 99}
+    assert importing.counts() == {"unknown_launch": 99}
     importing.cycle(8 + MAX_AGE + 16)
-    assert importing.counts() == {"strange": 99}
+    assert importing.counts() == {"unknown_launch": 99}
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)

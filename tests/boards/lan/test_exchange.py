@@ -104,7 +104,7 @@ def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Pa
                 a = attached(names[0])
                 wait_until(lambda: newest(b, "echo.status").count > 0)
                 entry = newest(b, "lan.status").import_other.copy()
-                assert (entry["missing"], entry["repeated"], entry["strange"]) == (0, 0, 0)
+                assert (entry["missing"], entry["repeated"], entry["unknown_launch"]) == (0, 0, 0)
                 assert entry["age"] >= 0
 
                 kill_adapter(b)
@@ -199,7 +199,7 @@ max_age_ms = 1000
             rack.watch(0.01)
             # The clocks are not compared, so the calm messages wait, and the next one overtakes each.
             entry = newest(rack.segment, "lan.status")
-            return entry.import_other["refused"] > 20 * UNREAD and entry.import_calm["overtaken"] > 10
+            return entry.import_other["refused"] > 20 * UNREAD and entry.import_calm["superseded"] > 10
 
         wait_until(goes_on)
         rows = written(rack.segment, "lan.status")

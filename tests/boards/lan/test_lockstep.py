@@ -57,7 +57,9 @@ def test_three_racks_repeat_whatever_the_order_of_launches_and_the_load(names: l
         counts = one.last["lan.status"]["import_other"]
         # In its first cycle an adapter finds nothing to export.
         assert counts["taken"] == 49
-        assert not any(counts[name] for name in ("missing", "repeated", "late", "refused", "strange", "overtaken"))
+        assert not any(
+            counts[name] for name in ("missing", "repeated", "late", "refused", "unknown_launch", "superseded")
+        )
         assert one.last["echo.status"]["total"] == sum(range(48))
         assert one.last["echo.status"]["lost"] == 0
 
@@ -84,7 +86,7 @@ def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(names: list[
     assert other.last["lan.status"]["import_other"]["missing"] == 0
     # It takes what was sent while it was away, of which the newest counts.
     assert struck.last["lan.status"]["import_other"]["missing"] == 0
-    assert struck.last["lan.status"]["import_other"]["overtaken"] > 0
+    assert struck.last["lan.status"]["import_other"]["superseded"] > 0
 
 
 def test_a_killed_rack_is_given_up_and_the_others_go_on(names: list[str], tmp_path: Path) -> None:

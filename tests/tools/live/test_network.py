@@ -31,8 +31,8 @@ COUNTS = {
     "repeated": 2,
     "late": 3,
     "refused": 4,
-    "strange": 5,
-    "overtaken": 6,
+    "unknown_launch": 5,
+    "superseded": 6,
 }
 
 

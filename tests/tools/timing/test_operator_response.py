@@ -64,9 +64,9 @@ def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Pat
         CommandConfig(level="upper", what="resume", tick=398),
     ]
     response = measured(config(), tmp_path / "run", *given)
-    assert [command.fate for command in response.commands] == ["refused", "overtaken", "acted on", "run over"]
+    assert [command.fate for command in response.commands] == ["refused", "superseded", "acted on", "run over"]
     assert len(response.measured) == 1
-    assert "not measured: 1 to upper (refused), 2 to upper (overtaken), 4 to upper (run over)" in response.text()
+    assert "not measured: 1 to upper (refused), 2 to upper (superseded), 4 to upper (run over)" in response.text()
 
 
 def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorResponse) -> None:

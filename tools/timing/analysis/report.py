@@ -50,7 +50,7 @@ SETTLE = 20
 """Samples after a fall in which the object comes to rest: at first it sinks into what it landed on, or bounces."""
 LEAST_M = 0.005
 """Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part along."""
-ENTRY_COUNTS = ("passed", "refused", "overtaken", "full", "waiting")
+ENTRY_COUNTS = ("passed", "refused", "superseded", "full", "waiting")
 
 
 def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:

@@ -360,12 +360,12 @@ def _entries(entries: list[Report]) -> Iterator[str | Grid]:
     if not entries:
         return
     yield from ("", "## Bus adapters, ages in ms of simulated time", "")
-    counts = ("entry", "source", "passed", "refused", "overtaken", "full", "waiting")
+    counts = ("entry", "source", "passed", "refused", "superseded", "full", "waiting")
     rows = [
         [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
         for row in entries
     ]
-    yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("overtaken", "waiting", "source"))
+    yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("superseded", "waiting", "source"))
 
 
 def _network(network: Report | None) -> Iterator[str | Grid]:
@@ -379,7 +379,7 @@ def _network(network: Report | None) -> Iterator[str | Grid]:
             [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
             for row in imports
         ]
-        yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("disordered", "repeated", "overtaken", "source"))
+        yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("disordered", "repeated", "superseded", "source"))
     for row in network["exports"]:
         yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
     for row in network["peers"]:
