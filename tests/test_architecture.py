@@ -43,6 +43,7 @@ def packages(path: Path) -> set[str]:
     return {".".join(name.split(".")[: 1 + name.startswith("rack.")]) for name in imported(path)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floor", FLOORS)
 def test_imports_point_downward_only(floor: str) -> None:
     above = {f"rack.{name}" for name in FLOORS[FLOORS.index(floor) + 1 :]} | {"tests"}
@@ -67,6 +68,7 @@ def test_folders_form_no_circle() -> None:
         pytest.fail(" -> ".join(str(folder) for folder in reversed(error.args[1])))
 
 
+@pytest.mark.slow
 def test_no_import_is_relative() -> None:
     relative = {
         f"{path.relative_to(ROOT)}:{node.lineno}"
@@ -82,6 +84,7 @@ def test_no_file_grows_beyond_what_one_can_read() -> None:
     assert not long
 
 
+@pytest.mark.slow
 def test_no_two_classes_share_a_name() -> None:
     places = defaultdict(list)
     for path in SOURCES:
@@ -110,3 +113,14 @@ def test_every_folder_is_installed() -> None:
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     folders = {".".join(("rack", *path.parent.relative_to(ROOT).parts)) for path in SOURCES} | {"rack.configs"}
     assert set(listed) == folders
+
+
+def test_every_room_has_quick_tests() -> None:
+    quick: defaultdict[Path, list[str]] = defaultdict(list)
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        nodes = ast.parse(path.read_text()).body
+        is_slow = any(isinstance(node, ast.Assign) and "mark.slow" in ast.unparse(node) for node in nodes)
+        tests = [node for node in nodes if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+        marks = {test.name: " ".join(map(ast.unparse, test.decorator_list)) for test in tests}
+        quick[path.parent] += [name for name, found in marks.items() if not is_slow and "mark.slow" not in found]
+    assert not [str(folder.relative_to(ROOT)) for folder, names in quick.items() if not names]

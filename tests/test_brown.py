@@ -56,6 +56,7 @@ def run(script: Path) -> Ran:
     return ran(script)
 
 
+@pytest.mark.slow
 def test_the_law_is_replaced_on_two_boards_in_motion_without_a_step(run: Ran) -> None:
     assert run.values("shoulder.status", "reason", 1200, 1201).tolist() == [b"", b"modified by pd"]
     assert np.abs(run.values("arm.status", "target_velocity", 1200, 1200)).max() > 0.5
@@ -77,5 +78,6 @@ def test_a_silent_general_machine_is_bridged_then_the_arm_holds_and_goes_on(run:
     assert not run.values("arm.status", "braked", 1400, 1999).any()
 
 
+@pytest.mark.slow
 def test_a_run_repeats_bit_for_bit(run: Ran, script: Path) -> None:
     assert ran(script).digest == run.digest

@@ -54,6 +54,7 @@ def test_both_arms_reach_the_place_between_them(arm: str) -> None:
     assert ik.solutions(pose(HAND_OVER, pointing(DOWN, 0.0)).raised(0.1), found.home, free)
 
 
+@pytest.mark.slow
 def test_the_k1607_with_its_hand_transfers_the_part() -> None:
     actions: list[dict[str, Any]] = [{"do": "transfer", "object": "part", "to": list(HAND_OVER)}]
     rack = WholeRack("nasrem", "cell_k1607", actions)
@@ -136,6 +137,7 @@ def racks(name: str, folder: Path) -> list[RackConfig]:
     return [load(folder / f"{rack}.toml", ["clock.mode=lockstep"]) for rack in ("cell", "puma", "k1607")]
 
 
+@pytest.mark.slow
 def test_the_three_racks_begin_the_program_together(rack_name: str, tmp_path: Path) -> None:
     found = run_together(racks(rack_name, tmp_path), [4.0] * 3)
     assert [one.outcome.cause for one in found] == ["time over"] * 3, [one.texts for one in found]

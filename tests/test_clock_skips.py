@@ -13,6 +13,8 @@ from rack.boards.events import Event
 from rack.tools.faults.ending import strikes
 from rack.tools.faults.judge import Circumstances, FaultVerdict, judge
 
+pytestmark = pytest.mark.slow
+
 FIRST, APART = 101, 41
 """First fault, and ticks from one to the next: odd, so that the skips begin in every phase of the boards."""
 LENGTHS = (1, 2, 3, 4) * 4

@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
@@ -15,6 +16,8 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.levels.systems.hand.messages import GraspKind
 from tests.processes import wait_until
+
+pytestmark = pytest.mark.slow
 
 
 def test_an_order_of_the_workstation_comes_to_the_fingers_as_interrupts(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def commands(folder: Path) -> list[list[str]]:
     return [line.partition("#")[0].split() for line in lines]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FOLDERS)
 def test_example_runs_as_its_readme_says(name: str, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(EXAMPLES / name, tmp_path / name))

@@ -21,6 +21,7 @@ def here() -> dict[str, str]:
     return golden.machine()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", golden.RUNS)
 def test_a_shipped_rack_has_its_golden_digest(
     run: str, rack_name: str, known: dict[str, dict[str, str]], here: dict[str, str]

@@ -66,6 +66,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Recording]:
     return [Recording(folder / run) for run in ("first", "second")]
 
 
+@pytest.mark.slow
 def test_two_runs_have_one_digest(runs: list[Recording]) -> None:
     digests = {report_of(run)["digest"] for run in runs}
     assert len(digests) == 1
@@ -92,6 +93,7 @@ def test_report_says_what_the_tendons_did(runs: list[Recording]) -> None:
     assert 0 < hand["closed_cycles"] < 20
 
 
+@pytest.mark.slow
 def test_recording_shows_tensions_and_joints_by_finger(runs: list[Recording]) -> None:
     run, file = runs[0], runs[0].folder / "run.rrd"
     tension, wanted = run.signal("hand.status", "tension"), run.signal("hand.status", "wanted")

@@ -38,6 +38,7 @@ def run() -> Grasp:
     return ran()
 
 
+@pytest.mark.slow
 def test_all_loops_drive_the_hand_with_tensions_of_one_age(run: Grasp) -> None:
     commands = run.boxes["tendon.command"]
     sampled = commands["message"]["sampled"]
@@ -49,6 +50,7 @@ def test_all_loops_drive_the_hand_with_tensions_of_one_age(run: Grasp) -> None:
     assert GraspKind.CLOSE in run.boxes["grasp.status"]["message"]["kind"]
 
 
+@pytest.mark.slow
 def test_a_run_of_buffers_without_locks_repeats_bit_for_bit(run: Grasp) -> None:
     assert ran().digest == run.digest
 

@@ -36,6 +36,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]
     return folder / "run", write_report(folder / "run")[0]
 
 
+@pytest.mark.slow
 def test_the_arm_was_braked_while_each_block_was_lowered(run: tuple[Path, dict[str, Any]]) -> None:
     recording = Recording(run[0])
     ticks, current = (recording.signal("motion.status", field) for field in ("tick", "current"))

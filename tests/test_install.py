@@ -77,6 +77,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
+@pytest.mark.slow
 def test_the_wheel_runs_the_nasrem_rack_from_another_folder(installed: Path, tmp_path: Path) -> None:
     place = run(tmp_path, installed / "python", "-c", "import rack.boards.config.files as f; print(f.__file__)")
     assert place.startswith(str(installed.parent))
@@ -86,6 +87,7 @@ def test_the_wheel_runs_the_nasrem_rack_from_another_folder(installed: Path, tmp
     assert (report["worked"], report["simulated_s"]) == (True, 1.0)
 
 
+@pytest.mark.slow
 def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_path: Path) -> None:
     for package, file, text in (("tools", "numbers.py", "THREE = 3\n"), ("levels", "counter.py", LEVEL)):
         (tmp_path / package).mkdir()

@@ -51,6 +51,7 @@ def test_a_turn_that_does_not_come_is_an_error(tmp_path: Path, monkeypatch: pyte
         pass
 
 
+@pytest.mark.slow
 def test_waiting_for_a_turn_is_no_part_of_a_tests_time(tmp_path: Path) -> None:
     path = tmp_path / "test_nothing.py"
     path.write_text(TEST)

@@ -63,6 +63,7 @@ def table(run: Path, mailbox: str, *fields: str) -> list[np.ndarray]:
     return [time_s * 1e-3, *values]
 
 
+@pytest.mark.slow
 def test_the_force_is_kept_on_the_flat_and_after_an_edge_that_nobody_knows(run: Path) -> None:
     _, place, wrench, mode, current = table(run, "server.status", "place", "wrench", "mode", "current")
     wiping = (mode == Mode.FORCE) & (current == 5)

@@ -13,6 +13,8 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.crate.line import TUNABLES
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 9.0
 """Of `nasrem`: the plans, the way to the first object, the grasp, the way up with it."""
 BLAS, NUMPY = "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"

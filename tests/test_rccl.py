@@ -15,6 +15,8 @@ from rack.boards.config import load
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 6.0
 STALL = """
 [[fault]]

@@ -50,6 +50,7 @@ def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=55, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "status"), COMMANDS, ids=[" ".join(words) for words, _ in COMMANDS])
 def test_command_of_the_readme_works(words: list[str], status: int, tmp_path: Path) -> None:
     ended = rack(*words_of(words), folder=tmp_path)
@@ -83,6 +84,7 @@ def test_the_map_names_every_room_and_no_other() -> None:
     assert named == rooms
 
 
+@pytest.mark.slow
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
     script = re.search(r"```python\n(from rack\.boards.*?)```", README.read_text(), re.DOTALL)
     assert script
@@ -93,6 +95,7 @@ def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
     assert ended.stdout.startswith("time over 400 ")
 
 
+@pytest.mark.slow
 def test_a_run_reads_back_as_the_readme_has_it(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     nasrem_run(tmp_path_factory).rename(tmp_path / "run")
     block = re.search(r"```python\n(from pathlib.*?)```", README.read_text(), re.DOTALL)

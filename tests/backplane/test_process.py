@@ -68,6 +68,7 @@ def test_a_core_that_the_machine_lacks_is_an_error() -> None:
         kill(child)
 
 
+@pytest.mark.slow
 def test_cores_are_kept_awake_by_a_request_that_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     device = tmp_path / "cpu_dma_latency"
     device.touch()

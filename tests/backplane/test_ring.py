@@ -114,6 +114,7 @@ def hammer(segment: Segment) -> None:
         write(writer, 1)
 
 
+@pytest.mark.slow
 def test_every_row_is_whole_or_counted_while_a_writer_hammers(bus: Segment) -> None:
     ring, taken, lost = MailboxRing(bus, NAME), 0, 0
     writer = fork(lambda: hammer(bus))

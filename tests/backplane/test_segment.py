@@ -135,6 +135,7 @@ def test_another_users_segment_is_refused(make_bus: MakeBus) -> None:
     assert exit_status(fork(lambda: attach(f"owner {ANOTHER}"))) == 0
 
 
+@pytest.mark.slow
 def test_refused_attaches_leave_no_file_open(make_bus: MakeBus) -> None:
     segment = make_bus()
     segment.words[Head.VERSION] = VERSION + 1
@@ -144,6 +145,7 @@ def test_refused_attaches_leave_no_file_open(make_bus: MakeBus) -> None:
     assert descriptors() == before
 
 
+@pytest.mark.slow
 def test_a_closed_segment_leaves_no_file_open_and_stays_readable(make_bus: MakeBus) -> None:
     made, before = make_bus(), descriptors()
     found = Segment.attach(made.rack)
@@ -174,6 +176,7 @@ def test_a_limit_on_file_size_is_reported_at_creation(rack_name: str) -> None:
     assert rack_name not in racks()
 
 
+@pytest.mark.slow
 def test_failed_creations_leave_no_file_open(rack_name: str) -> None:
     before = descriptors()
     for _ in range(5):
@@ -181,6 +184,7 @@ def test_failed_creations_leave_no_file_open(rack_name: str) -> None:
     assert descriptors() == before
 
 
+@pytest.mark.slow
 def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str) -> None:
     spec, rng, complete = layout(rack_name, [mailbox(depth=4096)]), random.Random(1), 0
     for _ in range(40):

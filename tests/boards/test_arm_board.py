@@ -62,6 +62,7 @@ def test_joints_without_one_board_are_refused_in_one_line(config: MakeConfig, ca
     assert [(mistake.place, mistake.why) for mistake in refused.value.mistakes] == [(place, reason)]
 
 
+@pytest.mark.slow
 def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats(config: MakeConfig) -> None:
     killed = FaultConfig(kind="kill", board="servo_j3", tick=KILLED_AT)
     given = config(text=arm_rack(APART)).model_copy(update={"fault": (killed,)})

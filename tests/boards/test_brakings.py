@@ -44,6 +44,7 @@ def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end()
     assert braked_text(found) == told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stall", "count"), [(4, 0), (5, 4), (8, 4)])
 def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
     config: MakeConfig, stall: int, count: int
@@ -59,6 +60,7 @@ def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
         assert stall - 4 < braking.lasted_ms < stall - 4 + 6
 
 
+@pytest.mark.slow
 def test_patience_is_a_setting(config: MakeConfig) -> None:
     with Rack(config("robot.patience_ms=8", text=stalling(stall=6))) as rack:
         assert rack.run(0.9).brakings == ()
@@ -69,6 +71,7 @@ def test_patience_is_a_setting(config: MakeConfig) -> None:
 HELD = "held without a cause in sight"
 
 
+@pytest.mark.slow
 def test_a_run_held_by_brakes_has_failed_and_says_so(config: MakeConfig) -> None:
     with Rack(config(text=stalling(stall=400, period=600))) as rack:
         outcome = rack.run(0.65)
@@ -78,6 +81,7 @@ def test_a_run_held_by_brakes_has_failed_and_says_so(config: MakeConfig) -> None
     assert fault.endswith(" ms at tick 204: no torque (1)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sight", ["a fault", "an emergency stop"])
 def test_a_run_held_by_brakes_with_a_cause_in_sight_has_not_failed(config: MakeConfig, sight: str) -> None:
     killed = FaultConfig(kind="kill", board="swing", tick=101)
@@ -96,6 +100,7 @@ def test_a_run_held_by_brakes_with_a_cause_in_sight_has_not_failed(config: MakeC
     assert (outcome.cause, outcome.faults, outcome.worked) == ("time over", (), True)
 
 
+@pytest.mark.slow
 def test_brakes_that_were_never_released_have_held_the_run(config: MakeConfig) -> None:
     with Rack(config(text=stalling(stall=30, period=32))) as rack:
         outcome = rack.run(0.4)
@@ -106,6 +111,7 @@ def test_brakes_that_were_never_released_have_held_the_run(config: MakeConfig) -
     assert outcome.faults == (f"{HELD}, in 400 ms: {times}: {why} (1)",)
 
 
+@pytest.mark.slow
 def test_a_level_that_holds_to_the_end_for_more_than_5_s_has_held_the_run(config: MakeConfig) -> None:
     waiting = arm_rack(TOGETHER).replace("joint_levels:Swing", "joint_levels:Waiting")
     outcomes = []
@@ -116,6 +122,7 @@ def test_a_level_that_holds_to_the_end_for_more_than_5_s_has_held_the_run(config
     assert outcomes[1].faults == (f"level 'swing' held for 5100 ms {HELD[5:]}: it does not feel like it",)
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_1_and_the_report_counts(tmp_path: Path, rack_name: str) -> None:
     path = tmp_path / "arm.toml"
     path.write_text(stalling(stall=400, period=600))

@@ -111,6 +111,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("setting", "expected"), MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_is_reported_alone_with_place_value_and_what_is_permitted(
     small: Path, setting: str, expected: str
@@ -297,6 +298,7 @@ def test_a_users_own_level_declares_its_program(small: Path) -> None:
     assert [str(mistake) for mistake in found] == ["task.count[1] = -2: nothing to count; objects: none"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_the_shipped_racks_have_no_mistakes(name: str) -> None:
     assert resolve(load(name))

@@ -59,6 +59,7 @@ def general(place: str, known: Iterable[str]) -> str:
     return next(filter(fits, known), place)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
     known = reference(name)
@@ -72,6 +73,7 @@ def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
     assert {key for script in scripts for fault in script for key in fault} <= set(known)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_every_key_has_a_meaning_and_every_quantity_a_unit(name: str) -> None:
     for place, found in reference(name).items():
@@ -106,6 +108,7 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
         reference(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "found"),
     [

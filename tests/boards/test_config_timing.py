@@ -38,6 +38,7 @@ def test_budgets_survive_being_put_into_a_config(small: Path) -> None:
     assert budgets(loads(with_budgets(changed, {}).text())) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", ["budget", "transfer"])
 @pytest.mark.parametrize("key", ["exchange_ms", "update_ms"])
 def test_planner_times_without_a_planner_are_a_mistake(small: Path, table: str, key: str) -> None:

@@ -46,6 +46,7 @@ def forge(rack: Link, tick: int) -> None:
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reader_first", [False, True])
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -58,6 +59,7 @@ def test_without_a_fault_no_alarm_is_raised(
     assert not any(seen.is_lost for seen in rack.reader.seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reader_first", [False, True])
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -83,6 +85,7 @@ def test_a_fault_is_detected_within_its_bound_and_identified(
     assert len(found) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("kind", [*FAULTS, "masquerade"])
 def test_reads_with_a_fault_depend_on_ticks_alone(link: MakeLink, kind: str, rates: tuple[int, int]) -> None:
@@ -187,6 +190,7 @@ def test_every_damage_is_detected(link: MakeLink, bits: int) -> None:
     assert not any(seen.released >= 0 for seen in rack.reader.seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_babble_writes_the_given_number_of_messages_per_cycle(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol)

@@ -16,6 +16,8 @@ from tests.boards.conftest import MakeConfig
 from tests.boards.test_host_side import ENDS, HOSTED, codes, status, watch
 from tests.processes import wait_until
 
+pytestmark = pytest.mark.slow
+
 SECOND = (
     HOSTED
     + """

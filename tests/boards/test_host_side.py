@@ -82,6 +82,7 @@ def codes(rack: Rack, board: str) -> list[str]:
     return [event.code for event in rack.events if event.board == board]
 
 
+@pytest.mark.slow
 def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: MakeConfig) -> None:
     with Rack(config("host.program.params.count=50", "protocol.depth={ 'program.numbers' = 8 }", text=HOSTED)) as rack:
         outcome = rack.run()
@@ -92,6 +93,7 @@ def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: M
     assert "died" not in codes(rack, "program")
 
 
+@pytest.mark.slow
 def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_is_without_them(
     config: MakeConfig,
 ) -> None:
@@ -123,6 +125,7 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
         assert chains(alone.segment, ticks)["adder.status"] == found
 
 
+@pytest.mark.slow
 def test_a_flood_is_bounded_in_every_cycle_and_its_writer_is_refused(config: MakeConfig) -> None:
     settings = ("host.program.program=host_programs:Flooding", "board.bridge.params.pass.numbers.most=3")
     with Rack(config(*settings, text=HOSTED)) as rack:
@@ -134,6 +137,7 @@ def test_a_flood_is_bounded_in_every_cycle_and_its_writer_is_refused(config: Mak
         assert bridge[Block.MISSED] == rack.segment.block("adder")[Block.MISSED] == 0
 
 
+@pytest.mark.slow
 def test_what_is_improper_is_refused_at_the_bridge(config: MakeConfig) -> None:
     settings = ("host.program.program=host_programs:Improper", "board.bridge.params.pass.sum={ every = 3, phase = 1 }")
     with Rack(config(*settings, text=HOSTED)) as rack:
@@ -144,6 +148,7 @@ def test_what_is_improper_is_refused_at_the_bridge(config: MakeConfig) -> None:
         assert status(rack.segment).sum["passed"] == (rack.segment.block("bridge")[Block.CYCLES] + 1) // 3
 
 
+@pytest.mark.slow
 def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(config: MakeConfig) -> None:
     # The fixture checks that no process is left.
     with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=HOSTED)) as rack:
@@ -191,6 +196,7 @@ def test_output_without_end_is_cut_and_counted_and_hides_no_other_board(config: 
     assert memory < 5_000_000
 
 
+@pytest.mark.slow
 def test_a_stopped_program_is_found_killed_and_started_again(config: MakeConfig) -> None:
     text = HOSTED + '\n[[fault]]\nkind = "hang"\nboard = "program"\nwhen = "adder.status.last == 1"\n'
     with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=text)) as rack:
@@ -200,6 +206,7 @@ def test_a_stopped_program_is_found_killed_and_started_again(config: MakeConfig)
     assert "'program' is not responding: stopped by a signal" in [event.text for event in rack.events]
 
 
+@pytest.mark.slow
 def test_a_killed_bridge_goes_on_where_it_was(config: MakeConfig) -> None:
     text = HOSTED + '\n[[fault]]\nkind = "kill"\nboard = "bridge"\nwhen = "adder.status.last == 20"\n'
     with Rack(config("host.program.params.count=60", "supervision.lockstep_restart_s=0.1", text=text)) as rack:
@@ -222,6 +229,7 @@ def check_memory(bus: HostBus, segment: Segment) -> None:
             bus.words(address)
 
 
+@pytest.mark.slow
 def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConfig) -> None:
     found = config("host.program.program=host_programs:Console", "host.program.external=true", text=HOSTED)
     with Rack(found) as rack:

@@ -13,6 +13,8 @@ from rack.boards import Rack
 from tests.boards.conftest import MakeConfig
 from tests.processes import named, wait_until
 
+pytestmark = pytest.mark.slow
+
 needs_request = pytest.mark.skipif(not os.access(LATENCY_REQUEST, os.W_OK), reason="needs root, for the request")
 AWAKE = "clock.idle_cores=awake"
 

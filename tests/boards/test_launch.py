@@ -26,6 +26,7 @@ def refusal(rack: Rack) -> str:
     return str(error.value)
 
 
+@pytest.mark.slow
 def test_a_failed_self_test_is_the_launch_error(config: MakeConfig) -> None:
     rack = Rack(config("board.wave.params.trouble=refuse", text=PLAIN))
     assert refusal(rack) == "board 'wave': the wave is too high: 3 m; permitted: 2 m"
@@ -33,12 +34,14 @@ def test_a_failed_self_test_is_the_launch_error(config: MakeConfig) -> None:
     assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
 
 
+@pytest.mark.slow
 def test_a_planner_that_fails_its_self_test_holds_its_boards_sysfail(config: MakeConfig) -> None:
     rack = Rack(config("board.wave.planner=wave_levels:BadPlanner"))
     assert refusal(rack) == "board 'wave.planner': no gain is known: 0 of 3"
     assert 2 in UtilityLines(rack.segment).sysfail
 
 
+@pytest.mark.slow
 def test_a_level_that_cannot_be_made_is_reported_with_its_error(config: MakeConfig) -> None:
     rack = Rack(config("board.wave.params.final=NONE"))
     reason = refusal(rack)
@@ -47,10 +50,12 @@ def test_a_level_that_cannot_be_made_is_reported_with_its_error(config: MakeConf
     assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
 
 
+@pytest.mark.slow
 def test_a_board_that_exits_silently_fails_the_launch(config: MakeConfig) -> None:
     assert refusal(Rack(config("board.wave.params.trouble='leave early'"))) == "board 'wave' ended: exit status 0"
 
 
+@pytest.mark.slow
 def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
     settings = ("board.watch.executor=wave_levels:Endless",)
@@ -69,6 +74,7 @@ def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> Non
     assert rack.config.name not in racks()
 
 
+@pytest.mark.slow
 def test_a_level_is_preloaded_once_in_the_process_that_forks_its_boards(config: MakeConfig) -> None:
     reason = refusal(Rack(config("board.watch.executor=wave_levels:Preloaded", text=PLAIN)))
     preloaded, forked = re.findall(r"\[(\d+)\]", reason)
@@ -76,6 +82,7 @@ def test_a_level_is_preloaded_once_in_the_process_that_forks_its_boards(config: 
     assert int(preloaded) != os.getpid()
 
 
+@pytest.mark.slow
 def test_a_level_that_cannot_be_preloaded_fails_the_launch_in_one_line(config: MakeConfig) -> None:
     reason = refusal(Rack(config("board.watch.executor=wave_levels:Unpreloadable", text=PLAIN)))
     assert reason == "'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code"
@@ -89,6 +96,7 @@ def fifo(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_launch_reports_what_it_waits_for(
     config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,6 +114,7 @@ def test_a_launch_reports_what_it_waits_for(
         assert waits[0].startswith("preloading 'wave_levels:SlowlyPreloaded'")
 
 
+@pytest.mark.slow
 def test_a_preload_that_does_not_end_is_named(
     config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,6 +125,7 @@ def test_a_preload_that_does_not_end_is_named(
     assert reason.endswith("not done within 2 s")
 
 
+@pytest.mark.slow
 def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(config: MakeConfig) -> None:
     with CrateLine() as crate:
         with Rack(config(text=PLAIN), crate=crate) as rack:
@@ -128,6 +138,7 @@ def command_of(pid: int) -> bytes:
     return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["refuse", "leave early"])
 def test_failed_launches_leave_no_file_open_and_no_process_running(config: MakeConfig, trouble: str) -> None:
     children, before = children_of(os.getpid()), descriptors()
@@ -148,6 +159,7 @@ def test_a_config_that_cannot_be_wired_starts_no_process(config: MakeConfig, rac
     assert rack_name not in racks()
 
 
+@pytest.mark.slow
 def test_a_rack_may_be_closed_before_its_launch_and_twice_after(config: MakeConfig) -> None:
     rack = Rack(config())
     rack.close()

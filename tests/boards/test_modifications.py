@@ -116,6 +116,7 @@ def without(run: Callable[..., Ran]) -> Ran:
     return run("board.shoulder.params.modifications={}")
 
 
+@pytest.mark.slow
 def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(switched: Ran, without: Ran) -> None:
     for tick, reason in ((300, ""), (301, "modified by lean"), (400, "modified by lean"), (401, "")):
         assert switched.reason(tick) == reason
@@ -125,6 +126,7 @@ def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step
     assert np.abs(steps).max() < np.abs(in_motion).max() + LARGEST_STEP
 
 
+@pytest.mark.slow
 def test_a_run_with_its_switches_repeats_and_is_that_of_a_board_without_modifications_up_to_the_first(
     switched: Ran, without: Ran, run: Callable[..., Ran]
 ) -> None:

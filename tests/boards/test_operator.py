@@ -48,6 +48,7 @@ def first(rows: np.ndarray, serial: int) -> int:
     return int(rows["tick"][np.argmax(rows["message"]["operator"] >= serial)])
 
 
+@pytest.mark.slow
 def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(commanded: Callable[..., RackConfig]) -> None:
     _, events, boxes = run(commanded(HELD))
     given = boxes["upper.operator"]
@@ -68,11 +69,13 @@ def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(commande
     ]
 
 
+@pytest.mark.slow
 def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., RackConfig]) -> None:
     digests = [run(commanded(setting))[0].digest for setting in (HELD, HELD, "seed=0")]
     assert digests[0] == digests[1] != digests[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
 def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., RackConfig], protocol: str) -> None:
     config = commanded(HELD, f"protocol.default={protocol}")
@@ -82,6 +85,7 @@ def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., 
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
+@pytest.mark.slow
 def test_serials_rise_over_all_levels_in_order_of_issue(commanded: Callable[..., RackConfig]) -> None:
     setting = commands(
         "level='lower', what='hold', at=0.5",
@@ -96,6 +100,7 @@ def test_serials_rise_over_all_levels_in_order_of_issue(commanded: Callable[...,
     assert set(boxes["lower.status"]["message"]["order"].tolist()) == {0, 3}
 
 
+@pytest.mark.slow
 def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., RackConfig]) -> None:
     _, _, boxes = run(commanded(commands("level='upper', what='goto', home=true, tick=50")))
     last = boxes["upper.status"]["message"][-1]
@@ -104,6 +109,7 @@ def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., Rack
     assert not boxes["lower.status"]["message"]["operator"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", ["upper", "lower"])
 def test_a_restarted_board_continues_with_its_last_command(commanded: Callable[..., RackConfig], board: str) -> None:
     config = commanded(commands(f"level='{board}', what='hold', tick=50"))
@@ -115,6 +121,7 @@ def test_a_restarted_board_continues_with_its_last_command(commanded: Callable[.
     assert (last["order"], last["standing"]) == (1, Operation.HOLD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", ["upper", "lower"])
 def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     commanded: Callable[..., RackConfig], board: str
@@ -133,6 +140,7 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, Operation.HOLD, 1)
 
 
+@pytest.mark.slow
 def test_a_command_stays_in_force_when_the_next_one_is_refused(commanded: Callable[..., RackConfig]) -> None:
     # Both come within one cycle of the level.
     setting = commands("level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52")
@@ -141,6 +149,7 @@ def test_a_command_stays_in_force_when_the_next_one_is_refused(commanded: Callab
     assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, Operation.HOLD)
 
 
+@pytest.mark.slow
 def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
     commanded: Callable[..., RackConfig],
 ) -> None:
@@ -160,6 +169,7 @@ def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
     assert texts == ["modify twice on (command 1)", "modify twice off (command 3)"]
 
 
+@pytest.mark.slow
 def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:
     config = commanded(HELD)
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)})
@@ -169,6 +179,7 @@ def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackCo
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
+@pytest.mark.slow
 def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., RackConfig]) -> None:
     with Rack(commanded("clock.mode=realtime")) as rack:
         rack.start(20.0)
@@ -184,6 +195,7 @@ def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., Rac
         watch(rack, lambda: rack.segment.words[System.STATE] == Run.STOPPED)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("is_killed", [False, True])
 def test_a_command_is_issued_only_while_its_client_lives(commanded: Callable[..., RackConfig], is_killed: bool) -> None:
@@ -203,6 +215,7 @@ def test_a_command_is_issued_only_while_its_client_lives(commanded: Callable[...
         assert MailboxRing(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
 
 
+@pytest.mark.slow
 def test_commands_of_a_program_must_fit_the_rack(commanded: Callable[..., RackConfig]) -> None:
     with Rack(commanded()) as rack:
         with pytest.raises(ConfigError, match="what = \"halt\": should be 'hold', 'resume'"):

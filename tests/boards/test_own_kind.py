@@ -68,6 +68,7 @@ def test_a_value_that_a_users_own_enum_lacks_lists_those_it_has(config: MakeConf
         wire(config(fault('when = "wave.status.valve == ajar"'), text=GAUGED))
 
 
+@pytest.mark.slow
 def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
     with Rack(config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)) as rack:
         outcome = rack.run(1.0)
@@ -80,6 +81,7 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
     assert sum(event.kind == "fault" and "acted 20 time" in event.text for event in events) == 1
 
 
+@pytest.mark.slow
 def test_a_campaign_draws_and_judges_a_kind_of_a_users_own(tmp_path: Path) -> None:
     path, out = tmp_path / "gauge.toml", tmp_path / "campaign"
     path.write_text(GAUGED)

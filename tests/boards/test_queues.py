@@ -59,6 +59,7 @@ def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str
     return str(caught.value).splitlines()
 
 
+@pytest.mark.slow
 def test_a_slower_reader_gets_every_request_of_a_burst(config: MakeConfig) -> None:
     with Rack(config("board.upper.params.until=360", text=QUEUES)) as rack:
         rack.run(2.0)
@@ -66,6 +67,7 @@ def test_a_slower_reader_gets_every_request_of_a_burst(config: MakeConfig) -> No
         assert counts(rack, "lower") | {"taken": 27, "newest": 27, "repeated": 0, "missing": 0} == counts(rack, "lower")
 
 
+@pytest.mark.slow
 def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> None:
     faults = tuple(FaultConfig(kind="kill", board=board, tick=tick) for board, tick in (("upper", 97), ("lower", 501)))
     found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(update={"fault": faults})
@@ -79,6 +81,7 @@ def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> 
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
     depth = "protocol.depth={ 'upper.requests' = 7 }"
     runs = []
@@ -108,6 +111,7 @@ def kill_often(rack: Rack, board: str, times: int, rng: random.Random) -> None:
 REALTIME = ("clock.mode=realtime", "supervision.restarts=100", *FAST)
 
 
+@pytest.mark.slow
 def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(config: MakeConfig) -> None:
     with Rack(config(*REALTIME, "board.lower.params.most=8", text=QUEUES)) as rack:
         rack.start(60.0)
@@ -121,6 +125,7 @@ def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(
         assert found["repeated"] == counts(rack, "upper")["refused"] == 0
 
 
+@pytest.mark.slow
 def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfig) -> None:
     with Rack(config(*REALTIME, text=QUEUES)) as rack:
         rack.start(60.0)
@@ -149,6 +154,7 @@ def settle(rack: Rack, board: str) -> dict[str, int]:
     return counts(rack, board)
 
 
+@pytest.mark.slow
 def test_a_plan_may_be_a_queue(config: MakeConfig) -> None:
     digests = set()
     for _ in range(2):
@@ -159,6 +165,7 @@ def test_a_plan_may_be_a_queue(config: MakeConfig) -> None:
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> None:
     planner = ("board.lower.executor=queue_levels:Filed", "board.lower.planner=queue_levels:Filing")
     slow = ("board.lower.coupling=tight", "board.lower.rate_hz=50", "board.lower.within_cycles=30")
@@ -171,6 +178,7 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
     with Rack(config("protocol.mailbox={ 'wave.status' = 'queue' }", text=PLAIN)) as rack:
         rack.run(0.5)

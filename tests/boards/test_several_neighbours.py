@@ -40,6 +40,7 @@ def at(rows: np.ndarray, tick: int) -> np.void:
     return row
 
 
+@pytest.mark.slow
 def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(jointed: MakeConfig) -> None:
     digest, written = run(jointed())
     assert run(jointed())[0] == digest
@@ -51,6 +52,7 @@ def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(join
     assert not path["message"]["lost"].any()
 
 
+@pytest.mark.slow
 def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeConfig) -> None:
     written = run(jointed("board.joint2.rate_hz=100"))[1].messages
     # joint1 rests on the arm's cycle one tick before its own, joint2 on that before its last cycle at a multiple of 4.
@@ -62,6 +64,7 @@ def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeC
     assert at(written["arm.status"], 100)["basis"] == 100
 
 
+@pytest.mark.slow
 def test_a_reader_of_many_sees_which_of_them_is_lost(jointed: MakeConfig) -> None:
     kill = {"kind": "kill", "board": "joint2", "tick": 60}
     settings = ("supervision.lockstep_restart_s=0.2",)

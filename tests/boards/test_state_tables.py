@@ -38,6 +38,7 @@ def counter(config: MakeConfig, tmp_path: Path) -> MakeConfig:
     return lambda *settings: config(*settings, text=counting(tmp_path))
 
 
+@pytest.mark.slow
 def test_the_status_shows_the_row_that_fired(counter: MakeConfig) -> None:
     statuses, _ = counted(counter())
     assert statuses["count"][:14].tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 9, 8, 7, 6]
@@ -48,6 +49,7 @@ def test_the_status_shows_the_row_that_fired(counter: MakeConfig) -> None:
     assert set(statuses["state"].tolist()) == {State.EXECUTING}
 
 
+@pytest.mark.slow
 def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -> None:
     given = commands(SWAP, SWAP_BACK)
     (one, digest), (_, other) = counted(counter(given)), counted(counter(given))
@@ -58,6 +60,7 @@ def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -
     assert digest == other != counted(counter())[1]
 
 
+@pytest.mark.slow
 def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
     statuses, _ = counted(counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9)
     assert statuses["table"][-1] == b"slow"
@@ -66,6 +69,7 @@ def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
     assert set(statuses["count"][10:].tolist()) == {10}
 
 
+@pytest.mark.slow
 def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(counter: MakeConfig, tmp_path: Path) -> None:
     with Rack(counter(EDIT)) as rack:
         (tmp_path / "saw.toml").write_text(SAW.replace('name = "count up"', 'name = "up it goes"'))
@@ -79,6 +83,7 @@ def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(counter:
     assert np.abs(np.diff(statuses["count"])).max() == 1
 
 
+@pytest.mark.slow
 def test_an_operator_does_a_command_of_the_level_until_resume(counter: MakeConfig) -> None:
     statuses, _ = counted(counter(commands(RESET, RESUME)))
     assert statuses["fired"][5] == b"reset"
@@ -88,6 +93,7 @@ def test_an_operator_does_a_command_of_the_level_until_resume(counter: MakeConfi
     assert statuses["standing"][4:9].tolist() == [0, 6 + 1, 6 + 1, 6 + 1, 0]
 
 
+@pytest.mark.slow
 def test_an_operators_command_that_fails_is_refused_with_the_tables_reason(counter: MakeConfig, tmp_path: Path) -> None:
     given = counter(commands(RESET))
     text = SAW.replace('do = ["take", "set"]\nstatus = "done"', 'do = ["take"]\nstatus = "error"\nreason = "no way"')

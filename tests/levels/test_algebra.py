@@ -40,6 +40,7 @@ def test_a_solution_leaves_its_arguments_alone() -> None:
     assert np.array_equal(x, np.ones(6))
 
 
+@pytest.mark.slow
 def test_levels_call_nothing_whose_bits_depend_on_the_processor() -> None:
     found = [
         f"{path.relative_to(LEVELS)}:{node.lineno}: {ast.unparse(node)}"
@@ -50,6 +51,7 @@ def test_levels_call_nothing_whose_bits_depend_on_the_processor() -> None:
     assert not found
 
 
+@pytest.mark.slow
 def test_levels_multiply_no_arrays_with_an_operator() -> None:
     # Poses are joined with @, which MuJoCo does.
     found = [

@@ -146,6 +146,7 @@ def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bo
     return is_it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> None:
     rack = WholeRack(actions=[REACH, HOME])
@@ -170,6 +171,7 @@ def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> No
     assert rack.run_to_end(30.0).state == State.DONE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["elemental_move", "primitive", "task"])
 def test_a_restarted_board_holds_on(level: str) -> None:
     rack = WholeRack(actions=[REACH, HOME])
@@ -186,6 +188,7 @@ def test_a_restarted_board_holds_on(level: str) -> None:
     assert rack.run_to_end(30.0).state == State.DONE
 
 
+@pytest.mark.slow
 def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
@@ -204,6 +207,7 @@ def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> N
     assert rack.task.detour == 0
 
 
+@pytest.mark.slow
 def test_a_goto_takes_the_next_one_from_where_it_is() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
@@ -218,6 +222,7 @@ def test_a_goto_takes_the_next_one_from_where_it_is() -> None:
     assert rack.task.moves_done == rack.task.moves
 
 
+@pytest.mark.slow
 def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
     rack = WholeRack(actions=[TRANSFER, HOME])
     operator = Operator(rack)
@@ -233,6 +238,7 @@ def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
     assert np.abs(rack.read("world.model").position[0] - TRANSFER["to"]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_an_impossible_goto_is_refused_and_the_task_continues() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
@@ -245,6 +251,7 @@ def test_an_impossible_goto_is_refused_and_the_task_continues() -> None:
     assert rack.run_to_end(40.0).state == State.DONE
 
 
+@pytest.mark.slow
 def test_a_goto_continues_after_the_task_board_has_died() -> None:
     rack = WholeRack(actions=TOUR)
     operator = Operator(rack)
@@ -259,6 +266,7 @@ def test_a_goto_continues_after_the_task_board_has_died() -> None:
     assert rack.run_to_end(40.0).state == State.DONE
 
 
+@pytest.mark.slow
 def test_set_points_in_the_middle_of_a_transfer_do_not_hinder_it() -> None:
     rack = WholeRack(actions=[TRANSFER, HOME])
     operator = Operator(rack)

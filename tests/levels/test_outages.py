@@ -14,6 +14,8 @@ from tests.levels.box import Disturbance, SwapPairs, hold_back, lose_some, mute
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.whole_rack import WholeRack
 
+pytestmark = pytest.mark.slow
+
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 BLOCK1 = 0
 SECOND = 1_000_000_000 // CLOCK_NS

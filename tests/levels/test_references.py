@@ -33,6 +33,7 @@ def test_names_that_only_begin_like_a_moved_one_stay() -> None:
     assert current("rack.levels.hand.workstation:Workstation") == "rack.levels.systems.hand.workstation:Workstation"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_config_saved_before_is_wired_as_today(name: str) -> None:
     config = load(CONFIGS / f"{name}.toml" if "/" in name else name)
@@ -41,6 +42,7 @@ def test_a_config_saved_before_is_wired_as_today(name: str) -> None:
     assert wire(saved) == wire(config)
 
 
+@pytest.mark.slow
 def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
     config = load("rccl", [f"name={rack_name}", "clock.mode=lockstep"])
     saved, used = as_saved_before(config)

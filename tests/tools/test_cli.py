@@ -129,6 +129,7 @@ def test_bytes_that_are_no_text_are_refused() -> None:
     assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": not UTF-8\n')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "found"), [("rack che", "check"), ("rack check fig", "fig2\nfig3\nfig4\nfig4-overload")]
 )

@@ -73,6 +73,7 @@ def test_figure_5_has_one_line_for_boards_of_one_cycle(jointed: Path) -> None:
     assert [row.rpartition(" ms:")[0] for row in rows] == ["joint1 ... joint3, arm, 2.5", "path, 20"]
 
 
+@pytest.mark.slow
 def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
     report, text = write_report(folder)
     response = report["system_response"]
@@ -83,6 +84,7 @@ def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
     assert f"{TOGETHER}: eq. 3.2 bound 60, eq. 3.3 sum 25" in text
 
 
+@pytest.mark.slow
 def test_a_slower_joint_has_a_response_of_its_own(jointed: Path, rack_name: str, tmp_path: Path) -> None:
     config = load(jointed, [f"name={rack_name}", "board.joint2.rate_hz=100"])
     recording = run_commands(config, (), tmp_path / "run", 1.0)
@@ -106,6 +108,7 @@ def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> 
     assert response.paths["path"].levels == ("path", "joint1", "arm")
 
 
+@pytest.mark.slow
 def test_the_levels_alone_write_what_they_write_in_the_rack(jointed: Path, rack_name: str, tmp_path: Path) -> None:
     config = load(jointed, [f"name={rack_name}"])
     recording = run_commands(config, (), tmp_path / "run", 0.5)

@@ -27,6 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here / "run"
 
 
+@pytest.mark.slow
 def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
     rows = json.loads((folder / "report.json").read_text())["state_tables"]["counter"]
     assert [(row["table"], row["row"], row["name"], row["cycles"]) for row in rows] == [

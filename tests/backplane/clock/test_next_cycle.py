@@ -167,6 +167,7 @@ def busy() -> None:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 @pytest.mark.parametrize(("clock", "rung"), [(busy, []), (signal.pause, [Alarm.CLOCK_STOPPED])])

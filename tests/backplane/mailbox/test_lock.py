@@ -81,6 +81,7 @@ def compete(segment: Segment, word: int) -> None:
     time.sleep(60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trial", range(15))
 def test_of_several_waiters_one_takes_over_from_a_killed_holder(bus: Segment, trial: int) -> None:
     reports = [REPORT + 1, REPORT + 2, REPORT + 3]
@@ -126,6 +127,7 @@ def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
     assert 0 <= counted - sum(bus.words[word] for word in reports) <= len(reports)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bystanders", [0, 2])
 def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystanders: int) -> None:
     rng, lock = random.Random(3), MailboxLock(bus, NAME)
@@ -164,6 +166,7 @@ def test_a_semaphore_posted_once_too_often_lets_no_second_one_in(bus: Segment) -
     assert lock_semaphore(bus.rack, NAME).value == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opened", [open_writer, MailboxLock], ids=["writer", "lock"])
 def test_a_closed_end_leaves_no_file_open(bus: Segment, opened: Callable[[Segment, str], MailboxLock]) -> None:
     before = descriptors()

@@ -21,6 +21,8 @@ from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, links
 
+pytestmark = pytest.mark.slow
+
 DEPTH = 8
 READ_EVERY = 3
 LEAST = 300

@@ -70,6 +70,7 @@ def test_an_observer_reads_by_its_protocol_and_never_waits(make_bus: MakeBus, pr
     assert observer.statistics.bus_errors == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_reader_never_gets_half_a_message(make_bus: MakeBus, protocol: Protocol) -> None:
     segment = make_bus(mailbox(protocol, depth=4))
@@ -91,6 +92,7 @@ def follows(slots: Slots, serial: int) -> bool:
     return xxh3_64_intdigest(slots.record[CHECKED_FROM:], before) == slots.chain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_writer_killed_anywhere_leaves_its_last_whole_message(make_bus: MakeBus, protocol: Protocol) -> None:
     segment = make_bus(mailbox(protocol, depth=4))

@@ -83,6 +83,7 @@ def test_a_file_too_small_for_a_segment_is_removed(rack_name: str, size: int) ->
     assert rack_name not in racks()
 
 
+@pytest.mark.slow
 def test_removing_leaves_no_file_open(spec: Layout) -> None:
     before = descriptors()
     leave_dead(spec)
@@ -171,6 +172,7 @@ def contend(spec: Layout, start: Segment, word: int) -> bool:
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trial", range(10))
 def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(spec: Layout, rack_name: str, trial: int) -> None:
     leave_dead(spec)

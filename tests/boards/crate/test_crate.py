@@ -38,6 +38,7 @@ def test_a_line_says_when_its_other_end_is_gone_even_in_half_a_message() -> None
     assert received(ours) is None
 
 
+@pytest.mark.slow
 def test_the_crate_ends_when_its_line_is_closed() -> None:
     before = descriptors()
     line = CrateLine()

@@ -48,6 +48,7 @@ def end_of(rack: Rack) -> Outcome:
     return rack.outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
 @pytest.mark.parametrize("victim", [*TASKS, "clock", "crate"])
 def test_a_killed_process_ends_the_run_with_its_name(
@@ -66,6 +67,7 @@ def test_a_killed_process_ends_the_run_with_its_name(
     wait_until(lambda: not any(runs(pid) for pid in family))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", [*TASKS, "clock", "crate"])
 def test_a_process_killed_before_the_start_ends_the_run_too(config: MakeConfig, victim: str) -> None:
     with Rack(config(REALTIME, NEVER)) as rack:
@@ -78,6 +80,7 @@ def test_a_process_killed_before_the_start_ends_the_run_too(config: MakeConfig, 
         assert end_of(rack).cause == "board lost"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("victim", "mode"), [("wave", "realtime"), ("clock", "realtime"), ("wave", "lockstep")])
 def test_a_stopped_process_is_reported_as_hanging(
     config: MakeConfig, victim: str, mode: str, monkeypatch: pytest.MonkeyPatch
@@ -93,6 +96,7 @@ def test_a_stopped_process_is_reported_as_hanging(
     assert f"board '{victim}' ended: signal SIGKILL" in outcome.faults[0]
 
 
+@pytest.mark.slow
 def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rack.boards.crate.rack.LEAVE_S", 0.2)
     with Rack(config(REALTIME)) as rack:
@@ -104,6 +108,7 @@ def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(config: MakeConfig, m
     assert not runs(crate)
 
 
+@pytest.mark.slow
 def test_a_level_that_raises_is_reported_with_its_reason(config: MakeConfig) -> None:
     with Rack(config("board.wave.params={ trouble = 'raise', at = 30 }", NEVER)) as rack:
         rack.start()
@@ -138,6 +143,7 @@ def waves(config: MakeConfig, rack_name: str, tmp_path: Path) -> Iterator[tuple[
     remove_dead(rack_name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_a_killed_launcher_takes_every_process_with_it(waves: tuple[Path, str], rack_name: str, mode: str) -> None:
     with launcher(*waves, f"clock.mode={mode}") as program:
@@ -150,6 +156,7 @@ def test_a_killed_launcher_takes_every_process_with_it(waves: tuple[Path, str], 
     assert not Segment.attach(rack_name).launcher_is_alive
 
 
+@pytest.mark.slow
 def test_a_process_that_the_launcher_forked_does_not_keep_its_rack(waves: tuple[Path, str]) -> None:
     with launcher(*waves, REALTIME, "--fork") as program:
         program.wait_for_launch()
@@ -159,6 +166,7 @@ def test_a_process_that_the_launcher_forked_does_not_keep_its_rack(waves: tuple[
         wait_until(lambda: len(program.descendants) == 1)
 
 
+@pytest.mark.slow
 def test_the_next_launch_takes_a_killed_racks_name(config: MakeConfig, waves: tuple[Path, str], rack_name: str) -> None:
     with launcher(*waves, REALTIME) as program:
         program.wait_for_launch()
@@ -170,6 +178,7 @@ def test_the_next_launch_takes_a_killed_racks_name(config: MakeConfig, waves: tu
     assert rack_name not in racks()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_launcher_leaves_no_process(waves: tuple[Path, str], number: signal.Signals) -> None:
     with launcher(*waves, REALTIME) as program:
@@ -179,6 +188,7 @@ def test_an_interrupted_launcher_leaves_no_process(waves: tuple[Path, str], numb
         program.wait_for_descendants()
 
 
+@pytest.mark.slow
 def test_an_interrupted_launcher_removes_its_segment_itself(waves: tuple[Path, str], rack_name: str) -> None:
     with launcher(*waves, REALTIME) as program:
         program.wait_for_launch()
@@ -188,6 +198,7 @@ def test_an_interrupted_launcher_removes_its_segment_itself(waves: tuple[Path, s
         assert not program.descendants
 
 
+@pytest.mark.slow
 def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
     waves: tuple[Path, str], rack_name: str
 ) -> None:
@@ -206,6 +217,7 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
         assert not named(f"{rack_name}:")
 
 
+@pytest.mark.slow
 def test_a_board_killed_at_any_moment_does_not_count_as_hanging(config: MakeConfig) -> None:
     rng = random.Random(5)
     for _ in range(6):

@@ -52,6 +52,7 @@ def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack)
     assert str(refused.value) == wanted
 
 
+@pytest.mark.slow
 @needs_fifo
 def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, "board.wave.core=0")) as rack:
@@ -70,6 +71,7 @@ def test_a_core_held_by_another_users_rack_is_seen(first: Rack) -> None:
     assert exit_status(fork(look)) == 0
 
 
+@pytest.mark.slow
 @needs_fifo
 @pytest.mark.parametrize("setting", ["clock.mode=lockstep", "board.wave.priority=0"])
 def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: str) -> None:
@@ -77,6 +79,7 @@ def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: st
         assert not [event for event in rack.events if event.kind == "ready"]
 
 
+@pytest.mark.slow
 @needs_fifo
 @needs_two_cores
 def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig, first: Rack) -> None:
@@ -87,6 +90,7 @@ def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig,
     assert ready[0].startswith(f"wave on core {core}: rack '{first.config.name}'")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="needs to drop CAP_SYS_NICE")
 @pytest.mark.parametrize("policy", ["warn", "refuse"])
 def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_path: Path, policy: str) -> None:

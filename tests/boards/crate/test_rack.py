@@ -56,6 +56,7 @@ def test_a_task_that_ends_in_error_has_failed_with_its_reason(config: MakeConfig
     assert not outcome.worked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("moves", "cause"), [(0, "task refused"), (3, "task failed")])
 def test_a_task_that_was_never_begun_is_refused_and_any_other_has_failed(
     config: MakeConfig, moves: int, cause: str
@@ -65,6 +66,7 @@ def test_a_task_that_was_never_begun_is_refused_and_any_other_has_failed(
     assert run(Rack(config(text=text))).cause == cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "ticks"), [(0.1, 40), (0.0025, 1), (0.5051, 202)])
 def test_a_run_of_given_length_ends_at_its_exact_tick(config: MakeConfig, seconds: float, ticks: int) -> None:
     rack = Rack(config())
@@ -74,6 +76,7 @@ def test_a_run_of_given_length_ends_at_its_exact_tick(config: MakeConfig, second
     assert rack.segment.block("wave")[Block.CYCLES] == ticks
 
 
+@pytest.mark.slow
 def test_events_report_the_run_in_order(config: MakeConfig) -> None:
     received: list[Event] = []
     rack = Rack(config(), received.append)
@@ -84,6 +87,7 @@ def test_events_report_the_run_in_order(config: MakeConfig) -> None:
     assert [event.time_ns for event in received] == sorted(event.time_ns for event in received)
 
 
+@pytest.mark.slow
 def test_output_of_a_board_becomes_an_event(config: MakeConfig) -> None:
     rack = Rack(config("board.wave.params={ trouble = 'print', at = 5 }"))
     run(rack, 0.1)
@@ -120,6 +124,7 @@ def test_a_stop_ends_the_run_at_the_next_tick(config: MakeConfig) -> None:
     assert "enough" in [event.text for event in rack.events if event.kind == "stop"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -> None:
     with Rack(config(f"clock.mode={mode}")) as rack:
@@ -148,6 +153,7 @@ def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(conf
         assert before + 1 <= rack.outcome.ticks <= words[System.TICK] + 1
 
 
+@pytest.mark.slow
 def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as first:
         first.start(0.25)
@@ -159,6 +165,7 @@ def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConf
     assert first.outcome.cause == "time over"
 
 
+@pytest.mark.slow
 def test_racks_running_together_do_not_affect_each_other(config: MakeConfig, rack_name: str) -> None:
     alone = run(Rack(config()), 0.5)
     pair = [Rack(config(f"name={rack_name}-{end}")) for end in ("a", "b")]
@@ -170,6 +177,7 @@ def test_racks_running_together_do_not_affect_each_other(config: MakeConfig, rac
     assert [rack.outcome and rack.outcome.digest for rack in pair] == [alone.digest] * 2
 
 
+@pytest.mark.slow
 def test_racks_one_after_the_other_leave_no_file_open(config: MakeConfig) -> None:
     run(Rack(config()), 0.0025)
     before = descriptors()
@@ -206,6 +214,7 @@ def text_of(events: Sequence[Event], kind: str) -> str:
     return "\n".join(event.text for event in events if event.kind == kind)
 
 
+@pytest.mark.slow
 def test_a_board_that_cannot_have_its_core_is_reported(config: MakeConfig) -> None:
     rack = Rack(config("board.watch.core=1000"))
     with rack:

@@ -39,6 +39,7 @@ def of(events: Sequence[Event], kind: str, code: str = "") -> list[Event]:
     return [event for event in events if event.kind == kind and code in ("", event.code)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", TASKS)
 @pytest.mark.parametrize("kind", ["kill", "hang"])
 def test_a_lost_board_is_back_on_the_grid_at_its_tick(config: MakeConfig, victim: str, kind: str) -> None:
@@ -55,6 +56,7 @@ def test_a_lost_board_is_back_on_the_grid_at_its_tick(config: MakeConfig, victim
     assert [e.text for e in of(events, "reaction", "restart")] == ["restart 1 of at most 5 in 10 s"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
 def test_a_run_with_its_faults_repeats(config: MakeConfig, coupling: tuple[str, ...]) -> None:
     faults = [{"kind": "kill", "board": victim, "tick": 90 + 150 * k} for k, victim in enumerate(TASKS)]
@@ -73,6 +75,7 @@ def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeCon
     assert sorted(set((rows["epoch"] & 0xFFFFFFFF).tolist())) == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -> None:
     plain, _ = run(config())
     killed, events = run(faulty(config(), {"kind": "kill", "board": "clock", "tick": 300}))
@@ -101,6 +104,7 @@ def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
     assert outcome.cause == "time over"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0]), ("brake", [2.0, 0.0])])
 def test_a_loss_demands_of_the_arm_as_configured(config: MakeConfig, on_loss: str, demand: list[float]) -> None:
     settled = config(f"board.wave.on_loss={on_loss}")
@@ -119,6 +123,7 @@ def test_two_boards_lost_at_once_come_back_lower_first(config: MakeConfig) -> No
     assert {event.tick for event in back} == {300}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", [*TASKS, "clock"])
 def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim: str) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
@@ -137,6 +142,7 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
     assert [event.board for event in of(rack.events, "recovery", "rejoined")] == [victim]
 
 
+@pytest.mark.slow
 def test_a_stopped_board_in_real_time_is_detected_within_its_cycles(config: MakeConfig) -> None:
     fault = {"kind": "hang", "board": "watch", "tick": 120, "phase": 0.4}
     outcome, events = run(faulty(config("clock.mode=realtime"), fault))
@@ -148,6 +154,7 @@ def test_a_stopped_board_in_real_time_is_detected_within_its_cycles(config: Make
     assert outcome.worked
 
 
+@pytest.mark.slow
 def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) -> None:
     outcome, events = run(faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120}))
     (stopped,) = of(events, "detection", "clock_stopped")
@@ -158,6 +165,7 @@ def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) ->
     assert outcome.worked
 
 
+@pytest.mark.slow
 def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
         rack.start(2.0)
@@ -175,6 +183,7 @@ def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: Make
     assert [event.board for event in of(rack.events, "died")] == ["clock"]
 
 
+@pytest.mark.slow
 def test_the_latch_is_set_before_the_start_and_reset_by_it(config: MakeConfig) -> None:
     with Rack(config()) as rack:
         assert rack.segment.words[System.EMERGENCY_STOP] == 1
@@ -182,6 +191,7 @@ def test_the_latch_is_set_before_the_start_and_reset_by_it(config: MakeConfig) -
         assert rack.segment.words[System.EMERGENCY_STOP] == 0
 
 
+@pytest.mark.slow
 def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
         rack.start(1.5)
@@ -198,12 +208,14 @@ def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) 
     assert [event.kind for event in rack.events if event.code == "demand"] == ["reaction", "recovery"]
 
 
+@pytest.mark.slow
 def test_a_board_without_restarts_ends_the_run(config: MakeConfig) -> None:
     outcome, events = run(faulty(config(NEVER), {"kind": "kill", "board": "watch", "tick": 100}))
     assert outcome.cause == "board lost"
     assert [event.board for event in of(events, "reaction", "given_up")] == ["watch"]
 
 
+@pytest.mark.slow
 def test_alarms_are_read_by_whoever_attaches(config: MakeConfig) -> None:
     with Rack(faulty(config(), {"kind": "kill", "board": "wave", "tick": 20})) as rack:
         rack.run(1.0)

@@ -228,6 +228,7 @@ def check_grids(one: dict[str, Any], other: dict[str, Any]) -> None:
     assert other["ahead"] == pytest.approx((other["offset"] + epochs_s) * one["speed"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_two_machines_with_one_clock_find_no_offset(rack_name: str) -> None:
     one, other = compared(rack_name, free_port())
     for seen in (one, other):
@@ -244,6 +245,7 @@ def why_no_time_namespace() -> str:
     return f"no time namespace: {done.stderr.strip() or done.returncode}" if done.returncode else ""
 
 
+@pytest.mark.slow
 def test_a_machine_that_is_a_thousand_seconds_ahead_is_found_to_be(rack_name: str) -> None:
     if reason := why_no_time_namespace():
         pytest.skip(reason)
@@ -286,6 +288,7 @@ def slow_one_way(port: int) -> Iterator[int]:
             server.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.slow
 def test_a_way_that_is_slower_than_the_way_back_is_within_the_uncertainty(rack_name: str) -> None:
     port = free_port()
     with slow_one_way(port) as through:

@@ -141,6 +141,7 @@ def racks(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[
         yield pair
 
 
+@pytest.mark.slow
 def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(lab: Lab, racks: tuple[LabRack, LabRack]) -> None:
     before = [rack.counts() for rack in racks]
     lab.lose(1, LOSS)
@@ -156,6 +157,7 @@ def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(lab: Lab, ra
         assert rack.heard()[1] == 0
 
 
+@pytest.mark.slow
 def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_as_new(
     lab: Lab, racks: tuple[LabRack, LabRack]
 ) -> None:
@@ -182,6 +184,7 @@ def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_
         assert rack.heard()[1] == 0
 
 
+@pytest.mark.slow
 def test_a_killed_rack_is_lost_and_its_next_launch_is_told_from_it(racks: tuple[LabRack, LabRack]) -> None:
     killed, other = racks[1], racks[0]
     before, count = other.counts(), other.heard()[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -20,6 +21,7 @@ PAYLOADS = st.binary(max_size=MOST)
 SEALER = Sealer(b"s" * 32, MOST)
 
 
+@pytest.mark.slow
 @given(st.text(), HEADS, PAYLOADS)
 def test_what_was_sealed_is_opened_unchanged(key: str, head: Envelope, payload: bytes) -> None:
     assert SEALER.opened(key, SEALER.seal(key, head, payload), payload) == head

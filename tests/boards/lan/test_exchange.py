@@ -28,6 +28,8 @@ from tests.boards.lan.racks import ROOT, RackProcess, configs, endpoints, rack_t
 from tests.machine import needs_fifo
 from tests.processes import BOUND_S, wait_until
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 120.0
 """Longest run of a rack: the tests end them long before."""
 LAUNCH_S = 60.0

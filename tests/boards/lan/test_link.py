@@ -16,6 +16,8 @@ from rack.tools.viewer.window import free_port
 from tests.boards.lan.test_strangers import OWN, Program, Site, at_home, friend, running
 from tests.processes import wait_until
 
+pytestmark = pytest.mark.slow
+
 LISTENS = "0A"
 """State of a listening socket in /proc/net/tcp."""
 ZENOH_WAITS_S = 0.5

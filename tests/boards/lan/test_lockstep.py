@@ -16,6 +16,8 @@ from rack.tools.live.holds import Holds
 from tests.boards.lan.racks import Ended, configs, ended, ring_texts, run_together, running, started, watch
 from tests.processes import forked, runs, wait_until
 
+pytestmark = pytest.mark.slow
+
 CYCLE = 8
 """Ticks in a cycle of the adapters, at 50 Hz."""
 STEPPED = "clock.mode=lockstep"

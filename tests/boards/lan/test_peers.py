@@ -152,6 +152,7 @@ def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_and_an_adapter_start
     assert written[0] == written[1]
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(1, 4), st.booleans()), max_size=40))
 def test_a_rack_is_there_exactly_if_a_launch_that_is_not_over_is(
     steps: list[tuple[int, bool]],

@@ -15,6 +15,8 @@ from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import configs, endpoints, rack_text, started
 from tests.processes import wait_until
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def names(rack_name: str, tmp_path: Path) -> list[str]:

@@ -193,6 +193,7 @@ def found(site: Site) -> Found:
         return Found(site.home.state(), others.state())
 
 
+@pytest.mark.slow
 def test_a_friend_is_heard_answered_and_shown_who_is_there(found: Found) -> None:
     assert found.home["good"][pulse("friend")] == found.home["came"][pulse("friend")]
     assert set(found.of["friend"]["tokens"]) >= {TOKEN}
@@ -245,6 +246,7 @@ def test_a_huge_message_is_not_put_together(found: Found) -> None:
     assert found.home["sizes"][pulse("heavy")] == [100]
 
 
+@pytest.mark.slow
 def test_a_friend_may_come_over_quic(tmp_path: Path) -> None:
     with at_home(tmp_path, "quic") as site:
         settings = site.mutual("friend") | {"connect/endpoints": [f"quic/127.0.0.1:{site.port}"]}
@@ -254,6 +256,7 @@ def test_a_friend_may_come_over_quic(tmp_path: Path) -> None:
             wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
 
 
+@pytest.mark.slow
 def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:
     mole, lies = pulse("mole"), [(out_key(name, "pulse.status"), 9, None) for name in ("nobody", "home")]
     with at_home(tmp_path, "tcp") as site:

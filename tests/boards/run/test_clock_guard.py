@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+import pytest
+
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
@@ -75,6 +77,7 @@ def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(make_
     assert sum(count for _, _, count in skips) == segment.words[System.CLOCK_SKIPPED] >= 2
 
 
+@pytest.mark.slow
 def test_a_skip_while_the_guard_is_lost_is_seen_when_it_is_back(config: MakeConfig) -> None:
     kill = FaultConfig(kind="kill", board="wave", tick=100)
     skip = FaultConfig(kind="clock-skip", board="clock", tick=150, ticks=3)

@@ -12,6 +12,8 @@ from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
 from tests.machine import needs_fifo
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 0.25
 TICKS = 100
 PRIORITIES = ("board.wave.priority=20", "board.watch.priority=19")

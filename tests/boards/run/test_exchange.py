@@ -74,12 +74,14 @@ def model(port: str) -> list[tuple[int, int]]:
     return found
 
 
+@pytest.mark.slow
 def test_ages_and_arrivals_are_those_of_the_configured_exchange(config: MakeConfig) -> None:
     found = written(Rack(config(text=TEXT)))
     for port in ("plain", "sparse", "early"):
         assert ages(found.messages["notes.exchange"], port) == model(port)
 
 
+@pytest.mark.slow
 def test_a_level_sees_the_last_reading_as_old_until_the_next_exchange(config: MakeConfig) -> None:
     found = written(Rack(config(text=TEXT))).messages
     seen, record = found["notes.status"], found["notes.exchange"]["message"]
@@ -93,6 +95,7 @@ def test_a_level_sees_the_last_reading_as_old_until_the_next_exchange(config: Ma
         assert not seen["message"]["lost"][:, at].any()
 
 
+@pytest.mark.slow
 def test_a_snapshot_shows_the_messages_in_use(config: MakeConfig) -> None:
     with Rack(config(text=TEXT)) as rack:
         rack.run(SECONDS)
@@ -100,11 +103,13 @@ def test_a_snapshot_shows_the_messages_in_use(config: MakeConfig) -> None:
     assert found.exchanges == {"notes": {port: PortAge(*model(port)[-1]) for port in ("plain", "sparse", "early")}}
 
 
+@pytest.mark.slow
 def test_lockstep_with_an_asynchronous_port_repeats(config: MakeConfig) -> None:
     racks = [Rack(config(text=TEXT)) for _ in range(3)]
     assert len({str(written(rack).until(TICKS)) for rack in racks}) == 1
 
 
+@pytest.mark.slow
 def test_a_port_that_is_read_rarely_raises_no_alarm(config: MakeConfig) -> None:
     with Rack(config("board.notes.exchange.sparse.every=50", text=TEXT)) as rack:
         rack.run(1.5)
@@ -119,6 +124,7 @@ QUEUE = (
 )
 
 
+@pytest.mark.slow
 def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime", text=TEXT)) as rack:
         rack.run(SECONDS)
@@ -131,6 +137,7 @@ def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(config
     assert (made["early"][both] >= made["plain"][both]).all()
 
 
+@pytest.mark.slow
 def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(config: MakeConfig) -> None:
     with Rack(config(*QUEUE, text=NO_TABLE)) as rack:
         rack.run(1.5)
@@ -159,6 +166,7 @@ def killed(config: MakeConfig, victim: str) -> Any:
     return written(rack, 2 * SECONDS).messages
 
 
+@pytest.mark.slow
 def test_a_restarted_board_keeps_the_grid_of_its_exchange(config: MakeConfig) -> None:
     rows = killed(config, "notes")["notes.exchange"]
     back = int(np.flatnonzero(np.diff(rows["tick"]) > NOTES[0])[0]) + 1
@@ -173,6 +181,7 @@ def test_a_restarted_board_keeps_the_grid_of_its_exchange(config: MakeConfig) ->
     assert (taken[back:][waiting] == -1).all()
 
 
+@pytest.mark.slow
 def test_a_lost_writer_shows_between_two_exchanges(config: MakeConfig) -> None:
     rows = killed(config, "wave")["notes.status"]
     lost = rows["message"]["lost"][(rows["tick"] > 42) & (rows["tick"] < 41 + 40)]

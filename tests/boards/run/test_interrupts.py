@@ -15,6 +15,8 @@ from tests.boards.conftest import MakeConfig
 from tests.boards.interrupt_levels import BOARDS
 from tests.boards.messages import Written
 
+pytestmark = pytest.mark.slow
+
 TICKS, SECONDS = 100, 0.25
 RACK = f"""
 name = "interrupted"

@@ -33,16 +33,19 @@ def digest(rack: Rack, seconds: float = SECONDS) -> str:
         return rack.run(seconds).digest
 
 
+@pytest.mark.slow
 def test_ten_runs_in_lockstep_have_one_digest(config: MakeConfig) -> None:
     assert len({digest(Rack(config())) for _ in range(10)}) == 1
 
 
+@pytest.mark.slow
 def test_the_digest_distinguishes_runs(config: MakeConfig) -> None:
     settings = ("board.wave.params.done_at=90", "board.wave.within_cycles=5", "board.wave.params.plan_every=3")
     digests = {digest(Rack(config(*extra))) for extra in [(), *((one,) for one in settings)]}
     assert len(digests) == 1 + len(settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_protocol_is_repeatable_in_lockstep(config: MakeConfig, protocol: Protocol) -> None:
     racks = [Rack(config(f"protocol.default={protocol}")) for _ in range(3)]
@@ -51,6 +54,7 @@ def test_every_protocol_is_repeatable_in_lockstep(config: MakeConfig, protocol: 
         assert counted(rack, Block.CORRUPT, Block.BUS_ERRORS, Block.MISSED, Block.SKIPPED) == 0
 
 
+@pytest.mark.slow
 def test_one_mailbox_may_have_a_protocol_of_its_own(config: MakeConfig) -> None:
     shared = "protocol.mailbox={ 'wave.plan' = 'double-buffer' }"
     time_slice, mixed = written(Rack(config())), written(Rack(config(shared)))
@@ -71,6 +75,7 @@ def test_under_time_slice_a_level_reads_by_ticks_alone(config: MakeConfig) -> No
     assert seen["basis"].tolist() == [0, *(tick - 1 for tick in range(8, TICKS, 8))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
 def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig, coupling: tuple[str, ...]) -> None:
     exact = Rack(config(*coupling))
@@ -93,6 +98,7 @@ def counted(rack: Rack, *words: Block) -> int:
     return sum(rack.segment.block(task.name)[word] for task in rack.segment.layout.tasks for word in words)
 
 
+@pytest.mark.slow
 def test_a_late_cycle_is_counted_and_the_board_rejoins_the_grid(config: MakeConfig) -> None:
     rack = Rack(config(*SLOW, LATE, text=PLAIN))
     found = written(rack)
@@ -109,6 +115,7 @@ def test_a_late_cycle_is_counted_and_the_board_rejoins_the_grid(config: MakeConf
     assert (cycles["release_ns"] == words[System.EPOCH_NS] + ticks * words[System.PERIOD_NS]).all()
 
 
+@pytest.mark.slow
 def test_a_late_message_shows_from_the_next_boundary(config: MakeConfig) -> None:
     messages = written(Rack(config(*SLOW, LATE, text=PLAIN))).messages["wave.status"]
     assert messages[messages["tick"] == 40]["visible_at"][0] >= 45
@@ -117,6 +124,7 @@ def test_a_late_message_shows_from_the_next_boundary(config: MakeConfig) -> None
     assert (behind["visible_at"] > behind["tick"]).all()
 
 
+@pytest.mark.slow
 def test_a_run_is_unchanged_up_to_its_first_late_cycle(config: MakeConfig) -> None:
     lockstep, realtime = written(Rack(config(text=PLAIN))), written(Rack(config(*SLOW, LATE, text=PLAIN)))
     same = realtime.first_miss(TICKS)
@@ -125,6 +133,7 @@ def test_a_run_is_unchanged_up_to_its_first_late_cycle(config: MakeConfig) -> No
     assert realtime.until(TICKS) != lockstep.until(TICKS)
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
     late = "board.wave.params={ trouble = 'late', at = 40, ticks = 20 }"
@@ -139,6 +148,7 @@ def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
     assert rack.segment.block("wave.planner")[Block.PLANS] == len(plans)
 
 
+@pytest.mark.slow
 def test_a_slow_cycle_changes_nothing_in_lockstep(config: MakeConfig) -> None:
     quiet, slow = (
         Rack(config(text=PLAIN)),
@@ -148,6 +158,7 @@ def test_a_slow_cycle_changes_nothing_in_lockstep(config: MakeConfig) -> None:
     assert counted(slow, Block.MISSED, Block.SKIPPED) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.5, 2.0])
 def test_speed_scales_the_grid_but_not_the_run(config: MakeConfig, speed: float) -> None:
     rack = Rack(config(REALTIME, f"clock.speed={speed}", text=PLAIN))
@@ -159,6 +170,7 @@ def test_speed_scales_the_grid_but_not_the_run(config: MakeConfig, speed: float)
     assert (cycles["start_ns"] >= cycles["release_ns"]).all()
 
 
+@pytest.mark.slow
 def test_simulated_time_is_the_tick_whatever_the_boards_miss(config: MakeConfig) -> None:
     rack = Rack(config(REALTIME, "board.wave.params={ trouble = 'late', at = 40, ticks = 40 }", text=PLAIN))
     with rack:

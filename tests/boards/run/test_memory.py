@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.machine import needs_fifo
 from tests.processes import in_thread, wait_until
+
+pytestmark = pytest.mark.slow
 
 FIRST = 40
 """Cycles in which a process may still meet a page for the first time."""

@@ -56,6 +56,7 @@ def written(rack: Rack, seconds: float = 0.25) -> Written:
         return Written.on(rack.segment)
 
 
+@pytest.mark.slow
 def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConfig) -> None:
     first, again = Rack(config(text=cyclic())), Rack(config(text=cyclic()))
     found = written(first)
@@ -94,6 +95,7 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(conf
     assert not is_whole(phases=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", ["left", "wave"])
 def test_a_restart_keeps_the_phase(config: MakeConfig, victim: str) -> None:
     plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
@@ -108,6 +110,7 @@ def test_a_restart_keeps_the_phase(config: MakeConfig, victim: str) -> None:
     assert steps.count(every) == len(steps) - 1
 
 
+@pytest.mark.slow
 def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
     rack = Rack(config("clock.mode=realtime", text=cyclic()))
     found = written(rack)

@@ -82,6 +82,7 @@ def run(rack: Link, seed: int) -> None:
     assert [exit_status(pid) for pid in (fork(write), fork(read))] == [0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rates", "depth"), [((1, 1), 1024), ((1, 8), ROUND), ((8, 1), 1024)])
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_stalls_of_writer_and_reader_raise_no_alarm(

@@ -18,6 +18,7 @@ TICKS = 100
 pytestmark = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="a polling board needs its own core")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_boards_write_the_same_however_they_wait(config: MakeConfig, protocol: Protocol) -> None:
     digests = set()
@@ -27,6 +28,7 @@ def test_boards_write_the_same_however_they_wait(config: MakeConfig, protocol: P
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wake", get_args(Wake))
 def test_a_board_keeps_the_grid_in_real_time(config: MakeConfig, wake: Wake) -> None:
     with Rack(config(f"board.wave.wake={wake}", "clock.mode=realtime", "clock.speed=0.5", text=PLAIN)) as rack:

@@ -48,6 +48,7 @@ def test_the_brakes_close_after_two_torque_cycles_without_a_command(every: int) 
     assert not arm.torque.any()
 
 
+@pytest.mark.slow
 def test_closed_brakes_stop_and_hold_an_arm_all_of_whose_motors_are_off() -> None:
     arm, _, torque = moving()
     arm.weaken(np.zeros(6))
@@ -115,6 +116,7 @@ def test_a_torque_at_its_limit_is_a_command_like_any_other() -> None:
     assert arm.drive(made.bounds.torque.copy(), 0.0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_limits_hold_at_every_step_when_brakes_close_and_open_at_any_time(name: str) -> None:
     arm, made, _ = moving(name)

@@ -52,6 +52,7 @@ def in_python(arm: SimulatedArm) -> None:
         used._evaluate, used._carry = dynamics.evaluate, dynamics.carry
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["puma560", "k1607", "puma560_crossing"])
 def test_an_arm_moves_bit_for_bit_as_in_python(name: str) -> None:
     made = cell(name)
@@ -144,6 +145,7 @@ def test_the_gate_predicts_with_the_controllers_evaluation_only_if_it_is_of_the_
     assert np.array_equal(arm.sense().position, alone.sense().position)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_what_is_clear_of_all_limits_would_also_pass_a_careful_look(name: str) -> None:
     made = cell(name)

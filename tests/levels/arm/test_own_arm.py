@@ -79,6 +79,7 @@ def rig(tmp_path: Path) -> ServoRig:
     return ServoRig(pendulum(tmp_path), SceneConfig(), arm="tests.levels.arm.test_own_arm:IdealArm")
 
 
+@pytest.mark.slow
 def test_an_arm_named_in_the_config_is_driven_and_follows_its_set_points(rig: ServoRig) -> None:
     course = Course(START, GOAL, 0.8)
     rig.run(400, course.at)

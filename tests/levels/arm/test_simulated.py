@@ -127,6 +127,7 @@ def test_an_arm_without_commands_stands_still(name: str) -> None:
     assert arm.sense().position == pytest.approx(made.home, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Watch) -> None:
     arm, made = arm_of(name)
@@ -145,6 +146,7 @@ def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Wat
     assert arm.violations == 0
 
 
+@pytest.mark.slow
 def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(
     watched: Watch,
 ) -> None:
@@ -160,6 +162,7 @@ def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(
     assert extremes.beyond <= 0.0
 
 
+@pytest.mark.slow
 def test_drives_keep_the_last_torque_for_a_while_then_brake_to_standstill() -> None:
     arm, made = arm_of("puma560")
     torque = wobble(made)
@@ -208,6 +211,7 @@ def test_a_broken_simulation_is_a_fault_that_leaves_the_last_sound_state(
     assert not list(tmp_path.iterdir())  # MuJoCo's own log file
 
 
+@pytest.mark.slow
 def test_arm_and_table_touching_is_counted_and_named_objects_on_the_table_are_not() -> None:
     arm, made = arm_of("puma560")
     for _ in range(200):

@@ -47,6 +47,7 @@ def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
     data.xfrc_applied[body, :3], data.xfrc_applied[body, 3:] = force, torque + np.cross(site - centre, force)
 
 
+@pytest.mark.slow
 def test_a_free_arm_at_rest_senses_the_weight_upwards_and_no_contact(tmp_path: Path) -> None:
     arm = arm_of(tmp_path)
     arm.step(20)

@@ -36,6 +36,7 @@ def transferred() -> tuple[WholeRack, list[tuple[int, bool]]]:
     return rack, seen
 
 
+@pytest.mark.slow
 def test_block_is_put_where_it_should_be_and_nothing_is_touched(transferred: tuple) -> None:
     rack, _ = transferred
     assert rack.task.state == State.DONE
@@ -57,6 +58,7 @@ def test_arm_hardly_waits_for_a_path_once_it_has_begun(transferred: tuple) -> No
     assert longest * 10 < 100
 
 
+@pytest.mark.slow
 def test_another_path_is_taken_around_an_obstacle_that_comes_into_the_way() -> None:
     rack = WholeRack(arm="puma560_crossing", actions=[TRANSFER], motion=post_moves((5.5, (0.6, 0.0, 0.9))))
     assert rack.run_to_end(40.0).state == State.DONE
@@ -65,6 +67,7 @@ def test_another_path_is_taken_around_an_obstacle_that_comes_into_the_way() -> N
     assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
 
 
+@pytest.mark.slow
 def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)), (8.0, (0.5, 0.85, 0.95)))
     above_block = {"do": "goto", "position": [0.5, 0.3, 0.6]}
@@ -78,6 +81,7 @@ def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() ->
     assert rack.read("servo.status").touches == 0
 
 
+@pytest.mark.slow
 def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)))
     rack = WholeRack(
@@ -88,6 +92,7 @@ def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
     assert "'post'" in status.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("elemental_move",), ("elemental_move.planner", "task")])
 def test_task_continues_when_boards_are_restarted_repeatedly(names: tuple[str, ...]) -> None:
     rack = WholeRack(actions=[TRANSFER])

@@ -50,6 +50,7 @@ def used(path: BlendedPath, trajectory: Trajectory, samples: int = 3000) -> tupl
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", [0, 1, 2, 4, 9])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_every_joint_keeps_velocity_acceleration_and_jerk_limits(seed: int, corners: int) -> None:
@@ -162,6 +163,7 @@ def test_curve_that_leaves_no_acceleration_is_followed_at_constant_speed() -> No
     assert part.speed < whole.speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", [0, 1, 3])
 def test_stop_keeps_the_joint_limits_and_stays_on_the_path(corners: int) -> None:
     path = random_path(10 + corners, corners, stops=corners == 3)

@@ -24,6 +24,7 @@ def random_poses(name: str, count: int) -> list[Pose]:
     return [SOLVERS[name].tool_at(rng.uniform(low + margin, high - margin)) for _ in range(count)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CELLS)
 def test_every_pose_that_some_configuration_has_is_reached_within_the_limits(name: str) -> None:
     ik, limits = SOLVERS[name], CELLS[name].limits.position

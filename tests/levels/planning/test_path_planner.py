@@ -55,6 +55,7 @@ def test_free_straight_line_is_the_path(planner: PathPlanner, checker: Collision
     assert np.array_equal(path.waypoints, [puma.home, goal])
 
 
+@pytest.mark.slow
 def test_path_around_the_wall_is_free_between_its_checks_too(
     planner: PathPlanner, checker: CollisionChecker, around: Path
 ) -> None:
@@ -74,6 +75,7 @@ def test_corners_are_rounded_so_that_motion_does_not_stop(around: Path) -> None:
     assert BlendedPath(*around).stops == []
 
 
+@pytest.mark.slow
 def test_equal_questions_get_equal_paths_whatever_was_planned_before(
     puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
 ) -> None:
@@ -85,6 +87,7 @@ def test_equal_questions_get_equal_paths_whatever_was_planned_before(
     assert np.array_equal(again.blend, around.blend)
 
 
+@pytest.mark.slow
 def test_another_attempt_takes_other_random_numbers(
     planner: PathPlanner, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
 ) -> None:

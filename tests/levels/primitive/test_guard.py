@@ -47,6 +47,7 @@ def crossed(at: float, y: float) -> PrimitiveRack:
     return rack
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("at", "y"), [(0.5, 0.0), (1.4, 0.0), (1.4, 0.25)])
 def test_arm_rests_before_an_obstacle_that_crosses_touches_it(at: float, y: float) -> None:
     rack = crossed(at, y)
@@ -56,6 +57,7 @@ def test_arm_rests_before_an_obstacle_that_crosses_touches_it(at: float, y: floa
     assert rack.status.done == 1
 
 
+@pytest.mark.slow
 def test_motion_continues_once_the_obstacle_has_left() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
     sweep(rack)
@@ -67,6 +69,7 @@ def test_motion_continues_once_the_obstacle_has_left() -> None:
     assert rack.seen[held[0]]["progress"] > 0.1
 
 
+@pytest.mark.slow
 def test_arm_that_looks_ahead_too_little_touches_the_obstacle() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(1.0), params={"lookahead": 0.001})
     sweep(rack)
@@ -74,6 +77,7 @@ def test_arm_that_looks_ahead_too_little_touches_the_obstacle() -> None:
     assert rack.servo.touches > 0
 
 
+@pytest.mark.slow
 def test_obstacle_that_enters_the_path_after_the_arm_has_passed_does_not_hold_it() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(2.2))
     sweep(rack)
@@ -90,6 +94,7 @@ def test_hold_keeps_the_path_and_brakes_within_its_limits() -> None:
     assert last[0, 1:] == pytest.approx(NEAR[1:], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_held_arm_says_when_the_way_is_free_again() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
     sweep(rack)
@@ -104,6 +109,7 @@ def test_held_arm_says_when_the_way_is_free_again() -> None:
     assert rack.status.resting
 
 
+@pytest.mark.slow
 def test_missing_world_model_holds_the_arm_until_it_is_back() -> None:
     rack = PrimitiveRack(CROSSING)
     sweep(rack)

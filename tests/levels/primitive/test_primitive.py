@@ -75,6 +75,7 @@ def test_segment_is_done_no_later_than_the_level_said_it_would_be(finished: Prim
     assert done <= said <= done + 0.2
 
 
+@pytest.mark.slow
 def test_hold_ramps_to_rest_on_the_path_and_motion_continues_from_there() -> None:
     rack = PrimitiveRack()
     segments = two_paths(rack)
@@ -95,6 +96,7 @@ def test_hold_ramps_to_rest_on_the_path_and_motion_continues_from_there() -> Non
     assert np.abs(beside).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_replaced_segment_starts_where_the_motion_rests() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN]))
@@ -120,6 +122,7 @@ def test_gripper_segments_close_and_open_and_say_what_is_held() -> None:
     assert rack.status.opening > 0.038
 
 
+@pytest.mark.slow
 def test_move_by_a_time_is_done_just_in_time() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN], by=3.0))
@@ -147,6 +150,7 @@ def test_earliest_time_of_a_refusal_is_met_when_it_is_asked_for() -> None:
     assert again.seconds <= earliest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("offset", "fields", "code", "said"),
     [

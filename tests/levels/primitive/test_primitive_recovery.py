@@ -27,6 +27,7 @@ def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
     assert rack.status.done == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("died_at_s", "away_s"), [(0.05, 0.25), (0.3, 0.0), (0.9, 0.04), (1.2, 0.25)])
 def test_executor_that_starts_anew_finishes_what_was_under_way(died_at_s: float, away_s: float) -> None:
     rack = PrimitiveRack()
@@ -137,6 +138,7 @@ def seconds(time_s: float) -> int:
     return round(time_s * 1e9 / CLOCK_NS)
 
 
+@pytest.mark.slow
 def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_continues_when_it_is_back() -> None:
     rack = PrimitiveRack(params={"settling": 0.5, "silent": 0.5})
     rack.command(*two_paths(rack))
@@ -164,6 +166,7 @@ def test_gripper_does_not_begin_while_the_board_above_is_lost() -> None:
     assert rack.run_until_done(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) -> None:
     # The stop lasts longer than every time that may run out; brakes take the arm some way off its path.
@@ -191,6 +194,7 @@ def test_gripper_that_the_servo_left_alone_is_waited_for_anew() -> None:
     assert rack.servo.opening < 0.03
 
 
+@pytest.mark.slow
 def test_segment_that_is_withdrawn_and_wanted_again_continues_where_it_was() -> None:
     rack = PrimitiveRack()
     first, second = two_paths(rack)
@@ -205,6 +209,7 @@ def test_segment_that_is_withdrawn_and_wanted_again_continues_where_it_was() -> 
     assert np.abs(rack.servo.position - rack.home).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_path_that_returns_to_itself_continues_on_the_way_back() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN, rack.home]))
@@ -215,6 +220,7 @@ def test_path_that_returns_to_itself_continues_on_the_way_back() -> None:
     assert rack.run_until_done(1)
 
 
+@pytest.mark.slow
 def test_arm_moved_while_nobody_drove_it_does_not_fail_the_next_segment() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN]))
@@ -226,6 +232,7 @@ def test_arm_moved_while_nobody_drove_it_does_not_fail_the_next_segment() -> Non
     assert (rack.status.error, rack.status.current, rack.status.blocked) == (0, 2, 1)
 
 
+@pytest.mark.slow
 def test_arm_is_held_when_the_world_model_receives_no_scene() -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
@@ -237,6 +244,7 @@ def test_arm_is_held_when_the_world_model_receives_no_scene() -> None:
     assert rack.run_until_done(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_set_points_never_jump_however_often_boards_are_lost(seed: int) -> None:
     chance = np.random.default_rng(seed)
@@ -256,6 +264,7 @@ def test_set_points_never_jump_however_often_boards_are_lost(seed: int) -> None:
     assert (rack.servo.clipped, rack.servo.touches) == (0, 0)
 
 
+@pytest.mark.slow
 def test_motion_that_is_found_at_the_end_of_its_path_is_finished() -> None:
     for length in np.random.default_rng(4).uniform(0.1, 9.0, 200):
         line = BlendedPath([[0.0], [length]], [0.0, 0.0])

@@ -101,6 +101,7 @@ def test_joint_that_nothing_determines_is_refused_by_name(tmp_path: Path, equali
         built(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')
 
 
+@pytest.mark.slow
 def test_task_with_a_gripper_of_closed_loops_is_done(tmp_path: Path) -> None:
     rack = WholeRack(arm=four_bar(tmp_path), actions=[TRANSFER])
     assert rack.run_to_end(25.0).state == State.DONE

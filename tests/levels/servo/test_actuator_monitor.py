@@ -76,6 +76,7 @@ def found(rig: ServoRig) -> list[int]:
     return [tick for tick, finding in rig.found if finding.alarm is Alarm.ACTUATOR]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize(
     ("name", "joint"), [("puma560", joint) for joint in range(6)] + [("k1607", joint) for joint in (1, 3, 5)]
@@ -105,6 +106,7 @@ def test_a_shoulder_that_loses_its_torque_at_rest_hardly_falls(kind: str, parame
     assert np.abs(rig.servo.arm.sense().position - home).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_failed_motor_is_retried_and_set_points_are_followed_once_it_works() -> None:
     rig, dash = dashing("puma560", 1, 1.0, retry=0.1)
     rig.inject("actuator-off", joint=1)
@@ -121,6 +123,7 @@ def test_a_failed_motor_is_retried_and_set_points_are_followed_once_it_works() -
     assert (rig.status.violations, len(found(rig))) == (0, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
 def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(reaction: str, braked: int) -> None:
     rig, dash = dashing("puma560", 0, 1.0, on_actuator_fault=reaction)
@@ -149,6 +152,7 @@ def test_a_motor_that_is_asked_for_nothing_is_not_missed() -> None:
     assert (rig.acted, rig.found) == ([], [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["command-nan", "command-limit"])
 @pytest.mark.parametrize("cycles", [1, 120])
 def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torques_are_valid(

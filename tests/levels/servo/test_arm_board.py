@@ -40,6 +40,7 @@ def assert_goes_on(rig: JointRig) -> None:
     assert (rig.status.violations, rig.status.reason) == (0, "")
 
 
+@pytest.mark.slow
 def test_six_boards_move_the_arm_as_one_does() -> None:
     together, apart = JointRig(TOGETHER), JointRig(APART)
     for rig in (together, apart):
@@ -49,6 +50,7 @@ def test_six_boards_move_the_arm_as_one_does() -> None:
     assert np.ptp(apart.positions, axis=0).min() > 0.1
 
 
+@pytest.mark.slow
 def test_boards_slower_than_the_arm_drive_it_too() -> None:
     rig = JointRig(APART, every=2)
     rig.run(900)
@@ -68,6 +70,7 @@ def test_arm_is_braked_until_every_board_sends_torques_and_then_stays_where_it_i
     assert np.abs(rig.positions[-1] - rig.arm.cell.home).max() < NEAR_RAD
 
 
+@pytest.mark.slow
 def test_lost_board_brakes_all_joints_at_once_and_motion_goes_on_when_it_is_back() -> None:
     rig = swinging()
     rig.rack.lose("servo_j3", ticks=300)
@@ -81,6 +84,7 @@ def test_lost_board_brakes_all_joints_at_once_and_motion_goes_on_when_it_is_back
     assert_goes_on(rig)
 
 
+@pytest.mark.slow
 def test_silent_board_brakes_the_arm_after_two_of_its_cycles() -> None:
     rig = swinging()
     rig.rack.disturb("servo_j2.command", mute, ticks=100)
@@ -92,6 +96,7 @@ def test_silent_board_brakes_the_arm_after_two_of_its_cycles() -> None:
     assert_goes_on(rig)
 
 
+@pytest.mark.slow
 def test_restarted_board_of_the_arm_finds_it_where_it_is() -> None:
     rig = swinging()
     before = rig.positions[-1]
@@ -102,6 +107,7 @@ def test_restarted_board_of_the_arm_finds_it_where_it_is() -> None:
     assert_goes_on(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "alarm", "parameters"),
     [
@@ -157,6 +163,7 @@ def test_torque_of_a_board_that_is_nan_never_reaches_the_arm() -> None:
     assert_goes_on(rig)
 
 
+@pytest.mark.slow
 def test_stop_brings_the_arm_to_rest_by_torques_before_it_is_braked() -> None:
     rig = swinging()
     rig.rack.stop(Demand.STOP, ticks=400)
@@ -198,6 +205,7 @@ def test_arm_that_its_boards_do_not_bring_to_rest_is_braked() -> None:
     assert rig.braked[-1]
 
 
+@pytest.mark.slow
 def test_operator_of_the_arm_holds_it_and_lets_it_go() -> None:
     rig = swinging()
     operator = Operator(rig.rack)
@@ -210,6 +218,7 @@ def test_operator_of_the_arm_holds_it_and_lets_it_go() -> None:
     assert_goes_on(rig)
 
 
+@pytest.mark.slow
 def test_operator_moves_the_joint_of_one_board() -> None:
     rig = swinging()
     operator = Operator(rig.rack)

@@ -56,6 +56,7 @@ def test_noise_is_that_of_its_tick_and_seed_and_has_its_size() -> None:
     assert np.std(noise) == pytest.approx(1e-3, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
 @pytest.mark.parametrize("resolution", [1e-5, 1e-4, 3e-4, 1e-3])
 def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resolution: float, noise: float) -> None:
@@ -85,6 +86,7 @@ def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(monkeypatch:
     assert (rack.read("servo.status").violations, rack.read("servo.status").touches) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "parameters", "error"),
     [

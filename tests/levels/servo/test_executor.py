@@ -104,6 +104,7 @@ def test_motion_resumes_smoothly_after_a_pause_above() -> None:
     assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [1, 3, PERIOD, 2 * PERIOD])
 def test_a_late_set_point_costs_no_jump(late: int) -> None:
     rig, move = rig_of("puma560"), course("puma560")
@@ -117,6 +118,7 @@ def test_a_late_set_point_costs_no_jump(late: int) -> None:
     assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missed", [1, 3, 20, 200])
 def test_missed_cycles_do_not_stretch_simulated_time_nor_break_the_motion(missed: int) -> None:
     rig, move = rig_of("puma560"), course("puma560", 3.0)
@@ -180,6 +182,7 @@ def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> Non
     assert kind == "jump" or rig.status.clipped > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nan", "fast"])
 def test_after_broken_set_points_good_ones_are_followed_again(kind: str) -> None:
     rig, move = rig_of("puma560"), course("puma560")
@@ -225,6 +228,7 @@ def test_an_unknown_parameter_is_refused_with_the_valid_ones() -> None:
         rig_of("puma560", bandwith=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "drives",
     [
@@ -292,6 +296,7 @@ def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
     assert grasping.status.touches == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("early", [0, 3, PERIOD - 1])
 def test_set_points_that_come_early_wait_for_their_turn(early: int) -> None:
     move, targets = course("puma560"), []

@@ -33,6 +33,7 @@ def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[i
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["nasrem", "nasrem-1khz", "crossing", "k1607"])
 def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
     rack = WholeRack(name, motion=load(name).scene.motion)
@@ -41,6 +42,7 @@ def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
     assert (rack.read("servo.status").violations, rack.read("servo.status").touches) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "seed"), [("nasrem", 1), ("k1607", 2)])
 def test_missed_cycles_and_restarted_boards_are_not_faults_of_the_arm(name: str, seed: int) -> None:
     rack = WholeRack(name, motion=load(name).scene.motion)

@@ -43,6 +43,7 @@ def torques(rig: ServoRig, ticks: int) -> Array:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_a_law_is_replaced_under_motion_without_a_step_and_the_arm_follows_its_course() -> None:
     rig = rig_of(pd=PD)
     operator = Operator(rig.rack)
@@ -64,6 +65,7 @@ def test_modifications_that_are_not_put_in_change_no_torque() -> None:
     assert (torques(rig_of(pd=PD), 200) == torques(rig_of(), 200)).all()
 
 
+@pytest.mark.slow
 def test_one_that_fails_leaves_the_law_to_itself() -> None:
     rig = rig_of(breaks=BREAKS)
     torques(rig, 200)

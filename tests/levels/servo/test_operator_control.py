@@ -24,6 +24,7 @@ def rig() -> ServoRig:
     return ServoRig(*config("puma560"))
 
 
+@pytest.mark.slow
 def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     assert np.abs(rig.status.target_velocity).max() > 0.1
@@ -38,6 +39,7 @@ def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None
     assert np.abs(rig.status.position - held).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     Operator(rig.rack).say("servo", Operation.HOLD)
@@ -45,6 +47,7 @@ def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> Non
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
 
+@pytest.mark.slow
 def test_after_a_hold_set_points_are_followed_again(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND, COURSE.at)
@@ -57,6 +60,7 @@ def test_after_a_hold_set_points_are_followed_again(rig: ServoRig) -> None:
     assert np.abs(rig.status.position - COURSE.goal).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_set_point_is_reached_within_the_limits_of_every_joint(rig: ServoRig) -> None:
     rig.run(SECOND // 2)
     Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
@@ -69,6 +73,7 @@ def test_a_set_point_is_reached_within_the_limits_of_every_joint(rig: ServoRig) 
     assert_within_limits(np.array(rig.targets))
 
 
+@pytest.mark.slow
 def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
@@ -77,6 +82,7 @@ def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
 
+@pytest.mark.slow
 def test_from_its_set_points_the_arm_returns_the_same_way(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
@@ -119,6 +125,7 @@ def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force
     assert np.abs(rig.status.position - HOME).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
@@ -132,6 +139,7 @@ def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_restarted_board_continues_with_the_command_in_force(rig: ServoRig) -> None:
     Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
     rig.run(2 * SECOND, COURSE.at)

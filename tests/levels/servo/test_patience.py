@@ -57,6 +57,7 @@ def swinging(**params: float) -> ServoRig:
     return rig
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [1, 25])
 @pytest.mark.parametrize(("kind", "parameters", "error"), KINDS)
 def test_a_fault_of_any_joint_that_ends_in_time_is_recovered_from_within_its_bound(
@@ -78,6 +79,7 @@ def test_a_fault_of_any_joint_that_ends_in_time_is_recovered_from_within_its_bou
     assert (rig.status.violations, rig.status.error) == (0, Error.NONE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize(("kind", "parameters", "error"), KINDS)
 def test_a_fault_of_any_joint_that_outlasts_the_patience_is_latched_with_its_cause(
@@ -161,6 +163,7 @@ def test_sensors_trusted_again_report_the_offset_found() -> None:
         assert rest[joint] == pytest.approx(thought[joint] + offset, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(200)
 def test_nasrem_continues_after_all_sensors_were_stuck_for_half_a_second() -> None:
     rack = WholeRack("nasrem")

@@ -34,6 +34,7 @@ def rig_under_way(**params: float | str) -> ServoRig:
     return rig
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
 def test_sensor_fault_is_found_in_time_the_arm_braked_and_motion_resumed(
     kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
@@ -57,6 +58,7 @@ def test_sensor_fault_is_found_in_time_the_arm_braked_and_motion_resumed(
     assert rig.alarms().count(alarm) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
 def test_the_status_stays_near_the_truth_meanwhile(
     kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
@@ -71,6 +73,7 @@ def test_the_status_stays_near_the_truth_meanwhile(
     assert rig.status.target == pytest.approx(rig.status.position)
 
 
+@pytest.mark.slow
 def test_a_biased_sensor_is_not_trusted_until_the_bias_is_gone() -> None:
     rig = rig_under_way()
     rig.inject("sensor-bias", size=0.01, joint=1)
@@ -228,6 +231,7 @@ def delay(kind: str, size: float, cycles: int = 200) -> int | None:
     return found[0] if found else None
 
 
+@pytest.mark.slow
 def test_the_greater_a_fault_the_sooner_it_is_found() -> None:
     assert [delay("sensor-bias", size) for size in (1e-5, 2e-4, 3e-2)] == [None, 0, 0]
     noise = [delay("sensor-noise", size) for size in (1e-6, 3e-5, 1e-3)]

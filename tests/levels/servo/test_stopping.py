@@ -42,6 +42,7 @@ def under_fire(at: tuple[float, float], end_y: float, speed: float) -> ServoRig:
     return ServoRig(ROBOT, SCENE.model_copy(update={"motion": motion}), patience=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", [stand, turn])
 @pytest.mark.parametrize("at", [FOREARM, HAND])
 def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_broken_limit(
@@ -62,6 +63,7 @@ def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_br
     assert [f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES] == [Alarm.COLLISION]
 
 
+@pytest.mark.slow
 def test_a_lasting_contact_is_latched_with_the_names_of_both_geoms() -> None:
     rig = under_fire(HAND, 0.2, 4.0)
     rig.run(1200, turn)
@@ -125,6 +127,7 @@ def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> 
     assert rig.status.braked == 1  # an arm at rest stays braked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 @pytest.mark.parametrize("ticks", [1, 30, 300])
 def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(demand: Demand, ticks: int) -> None:

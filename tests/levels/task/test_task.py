@@ -72,6 +72,7 @@ def test_transfer_is_eight_moves_and_leaves_the_object_at_its_goal(start: Rehear
     assert 0.475 <= put[2] <= 0.476
 
 
+@pytest.mark.slow
 def test_later_actions_know_what_earlier_ones_have_moved(start: Rehearsal) -> None:
     onto_its_place = {"do": "transfer", "object": "block2", "to": [0.50, 0.30, 0.475]}
     assert refusal(start, onto_its_place).code == Error.NO_PATH
@@ -85,6 +86,7 @@ def test_object_is_turned_as_wanted(start: Rehearsal) -> None:
     assert 2.0 * np.arctan2(z, w) == pytest.approx(0.6, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("action", "code", "words"),
     [
@@ -118,6 +120,7 @@ def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Reh
     assert "action 0, place block1 at [0.5, -0.2, 0.475]: '" in str(refusal(taken, TRANSFER))
 
 
+@pytest.mark.slow
 def test_place_named_as_reachable_is_reachable(start: Rehearsal) -> None:
     text = str(refusal(start, {"do": "goto", "position": [1.5, 0.0, 0.6]}))
     place = [float(x) for x in text.partition("in reach: [")[2].partition("]")[0].split(",")]
@@ -153,6 +156,7 @@ def refused_run() -> WholeRack:
     return rack
 
 
+@pytest.mark.slow
 def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(refused_run: WholeRack) -> None:
     status = refused_run.task
     earliest = refused_run.read("task.plan").earliest
@@ -163,6 +167,7 @@ def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(refused_ru
     assert refused_run.read("servo.status").position == pytest.approx(ROBOT.home, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_earliest_time_that_was_reported_can_be_met(refused_run: WholeRack) -> None:
     earliest = refused_run.read("task.plan").earliest
     rack = WholeRack(actions=[REACH, {**HOME, "by": earliest + 1e-6}])
@@ -170,6 +175,7 @@ def test_earliest_time_that_was_reported_can_be_met(refused_run: WholeRack) -> N
     assert rack.seconds <= earliest + 1.0
 
 
+@pytest.mark.slow
 def test_arm_takes_the_time_that_it_is_given() -> None:
     rack = WholeRack(actions=[{**REACH, "by": 10.0}])
     assert rack.run_to_end(15.0).state == State.DONE

@@ -207,6 +207,7 @@ def test_a_task_that_computes_nothing_has_no_response() -> None:
     assert response_times([timed("idle", 0, 10, 10)]) == {}
 
 
+@pytest.mark.slow
 def test_no_schedule_of_executors_and_planners_goes_beyond_the_bound() -> None:
     draw, attained = random.Random(14), 0
     for _ in range(SETS):
@@ -255,6 +256,7 @@ def stepped(tasks: list[TimedTask], until: int) -> dict[str, int] | None:
     return worst
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_with_phases_responses_are_those_of_the_schedule_and_never_longer_than_without(seed: int) -> None:
     draw, exact = random.Random(seed), 0

@@ -196,6 +196,7 @@ def place(task: TimedTask, todo: list[tuple[str, bool, bool]], since: int) -> tu
     return -priority, 0 if is_locked else 1, since, task.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(60))
 def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
     for number in range(10):

@@ -38,6 +38,7 @@ def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_path: Path) -> None:
     done = rack("analyze", run_of("fig4", rack_name, tmp_path / "run"), *USUAL, "--json")
@@ -57,6 +58,7 @@ def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_pa
     assert json.loads((tmp_path / "run" / "analysis.json").read_text()) == found
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_path: Path) -> None:
     folder = run_of("fig4-overload", rack_name, tmp_path / "run")
@@ -146,6 +148,7 @@ def test_the_tables_of_an_analysis_fit_the_terminal(small: Path, tmp_path: Path,
     assert max(map(len, text(analysis).splitlines())) > 120
 
 
+@pytest.mark.slow
 def test_a_run_in_lockstep_is_analyzed_with_its_system_response(tmp_path_factory: pytest.TempPathFactory) -> None:
     found = json.loads(rack("analyze", slow_run(tmp_path_factory), "--json").stdout)
     measured = [(row["equation"], row["measured"]) for row in found["equations"] if row["measured"] is not None]

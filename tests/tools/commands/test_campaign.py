@@ -45,6 +45,7 @@ def trials_in(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text())["finding"] for path in sorted((folder / "trials").glob("0*.json"))]
 
 
+@pytest.mark.slow
 def test_every_death_and_hang_of_a_lockstep_campaign_is_found_and_survived(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
     options = ["--lockstep", "--injections", "2", "--seed", "4", "--seconds", "9", "--kinds", "kill,hang,self-test"]
@@ -64,6 +65,7 @@ def test_every_death_and_hang_of_a_lockstep_campaign_is_found_and_survived(small
     assert not list(out.glob("*.toml"))
 
 
+@pytest.mark.slow
 def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
     done = campaign(small, "--lockstep", "--kills", "3", "--seconds", "12", "--out", out, "--json")
@@ -74,6 +76,7 @@ def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_pat
     assert summary["tasks_done"] == summary["trials"]
 
 
+@pytest.mark.slow
 def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(small: Path, tmp_path: Path) -> None:
     out, options = tmp_path / "campaign", ["--lockstep", "--injections", "2", "--seconds", "9", "--kinds", "kill"]
     # In a rack without restarts its first loss is the end: what comes after it does not strike, and is drawn again.
@@ -90,6 +93,7 @@ def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(small: Path,
         assert tomllib.loads(path.read_text())["fault"] == trial["plan"]["faults"]
 
 
+@pytest.mark.slow
 def test_a_campaign_that_was_killed_goes_on_where_it_was(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
     options = ["--lockstep", "--injections", "3", "--seconds", "9", "--kinds", "kill,hang", "--out", str(out), "--json"]
@@ -110,6 +114,7 @@ def test_a_campaign_that_was_killed_goes_on_where_it_was(small: Path, tmp_path: 
     assert (other.returncode, "holds another campaign; it differs in seed" in other.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
     options = ["--realtime", "--injections", "99", "--seconds", "9", "--kinds", "kill", "--faultless", "0"]

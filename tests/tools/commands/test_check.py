@@ -148,6 +148,7 @@ def test_a_rack_that_fits_is_fixed_as_it_is(small: Path) -> None:
     assert done.stdout == load(small, [*FITS[1:], *ALONE[1::2]]).text()
 
 
+@pytest.mark.slow
 def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
     done = check(small, "--from", recorded, "--percentile", 90, "--json")
     timing = json.loads(done.stdout)["timing"]
@@ -187,6 +188,7 @@ def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> No
     assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"
 
 
+@pytest.mark.slow
 def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
     done = check("cyclic", "--set", "schedule.major_ms=40", "--set", "board.even.budget.process_ms=3.1")
     rows = [line.split() for line in done.stdout.splitlines()]
@@ -204,6 +206,7 @@ def test_the_static_schedule_is_in_the_json_document() -> None:
     assert [place["board"] for place in found["cores"][1]["places"]] == ["fast", "odd"]
 
 
+@pytest.mark.slow
 def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
     (line,) = (line for line in check(*words, "--verbose").stdout.splitlines() if line.startswith("patience: "))

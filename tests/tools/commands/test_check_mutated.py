@@ -170,6 +170,7 @@ def judge(status: int, document: dict[str, Any]) -> None:
         assert status == (0 if document["timing"]["holds"] else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # a machine that is shared: the bound is processor time
 def test_a_spoilt_config_is_answered_in_time_with_what_is_wrong(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -72,6 +72,7 @@ def imported(*arguments: object) -> set[str]:
     return names & {*HEAVY}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "needed"),
     [
@@ -85,6 +86,7 @@ def test_a_command_starts_without_libraries_that_it_does_not_need(arguments: lis
     assert imported(*arguments) <= needed
 
 
+@pytest.mark.slow
 def test_a_look_at_a_rack_needs_numpy_and_nothing_else(small: Path, rack_name: str) -> None:
     with Rack(load(small, [f"name={rack_name}"])):
         assert imported("status", rack_name) <= {"numpy"}
@@ -109,6 +111,7 @@ def test_help_has_a_whole_line_for_every_command() -> None:
         assert hasattr(import_module(module), attribute)
 
 
+@pytest.mark.slow
 def test_run_prints_one_json_document_and_nothing_else(small: Path, rack_name: str, tmp_path: Path) -> None:
     done = rack("run", small, "--seconds", 1, "--set", f"name={rack_name}", "--out", tmp_path / "run", "--json")
     report = json.loads(done.stdout)
@@ -162,6 +165,7 @@ def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
     assert all(f"0x{address:06x}" in text for address in addresses.values())
 
 
+@pytest.mark.slow
 def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], rack_name: str) -> None:
     listed = {entry["rack"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
     assert listed[rack_name] == "running"
@@ -174,6 +178,7 @@ def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], 
     assert wait_until_gone(rack_name)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path) -> None:
     with launched(small, rack_name, "--out", str(tmp_path / "run")) as running:
         running.send_signal(signal.SIGINT)
@@ -185,6 +190,7 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
     assert (report["outcome"]["cause"], report["recording"]) == ("stopped", "complete")
 
 
+@pytest.mark.slow
 def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str], rack_name: str) -> None:
     running.kill()
     running.wait(BOUND_S)

@@ -26,6 +26,7 @@ def run(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rows"),
     [
@@ -51,6 +52,7 @@ def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_m
     assert "R X W P | R X W P U: 10 of 10 plans" in shown.stdout
 
 
+@pytest.mark.slow
 def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> None:
     shown = rack("gantt", "fig3", "--cycles", "0-3", "--out", tmp_path, "--json")
     assert shown.stderr == ""
@@ -65,6 +67,7 @@ def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> No
     assert [Path(path).name for path in found["pictures"]] == ["gantt.png", "gantt.svg"]
 
 
+@pytest.mark.slow
 def test_a_run_is_shown_above_the_schedule_of_its_config(run: Path) -> None:
     shown = rack("gantt", run)
     assert (shown.returncode, shown.stderr) == (0, "")
@@ -80,6 +83,7 @@ def test_a_run_is_shown_above_the_schedule_of_its_config(run: Path) -> None:
     assert (run / "gantt.png").is_file()
 
 
+@pytest.mark.slow
 def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
     config = load("fig2")
     level = config.board["level"].model_copy(update={"budget": None})
@@ -91,6 +95,7 @@ def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
     assert "no board has a budget" in found["notes"][0]
 
 
+@pytest.mark.slow
 def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -> None:
     recorded(tmp_path / "run", load("fig2", ["clock.mode=lockstep"]), {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]})
     shown = rack("gantt", tmp_path / "run")
@@ -99,6 +104,7 @@ def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -
     assert "measured" not in shown.stdout
 
 
+@pytest.mark.slow
 def test_any_rack_has_a_schedule_where_it_has_budgets(tmp_path: Path) -> None:
     settings = (
         "board.servo.budget.process_ms=0.5",

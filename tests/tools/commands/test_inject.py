@@ -50,6 +50,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         process.communicate()
 
 
+@pytest.mark.slow
 def test_a_fault_begins_at_the_next_tick_and_says_which(running: str) -> None:
     segment = Segment.attach(running)
     before = segment.words[System.TICK]
@@ -194,6 +195,7 @@ def test_the_help_lists_every_kind_with_its_means_bound_and_parameters() -> None
     assert [kind["name"] for kind in listed] == [kind.name for kind in KINDS]
 
 
+@pytest.mark.slow
 def test_a_clock_that_gives_out_no_tick_begins_no_fault(
     small: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WATCHDOG_S = 50.0
 
 
+@pytest.mark.slow
 def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: str, tmp_path: Path) -> None:
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     with Rack(config) as rack:
@@ -58,6 +59,7 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
 
 
+@pytest.mark.slow
 def test_racks_that_work_together_are_recorded_on_one_time_line(rack_name: str, tmp_path: Path) -> None:
     names = [f"{rack_name}-a", f"{rack_name}-b"]
     one, other = configs(ring_texts(names, lan=WATCHED), tmp_path, "adapter.lan.rate_hz=100")

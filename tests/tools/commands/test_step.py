@@ -48,6 +48,7 @@ def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
     return answer["tick"], next(level for level in answer["levels"] if level["level"] == "counter")
 
 
+@pytest.mark.slow
 def test_a_held_rack_goes_on_by_cycles_and_ticks(held: subprocess.Popen[str], rack_name: str) -> None:
     assert [stepped(rack_name)[0] for _ in range(3)] == [1, 9, 17]
     assert stepped(rack_name, "--ticks", "3")[0] == 20
@@ -65,6 +66,7 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(held: subprocess.Popen[str], ra
     assert f"HELD: 'rack step {rack_name}' lets it go on" in rack("status", rack_name).stdout
 
 
+@pytest.mark.slow
 def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(held: subprocess.Popen[str], rack_name: str) -> None:
     assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs on\n"
     words = Segment.attach(rack_name).words
@@ -76,6 +78,7 @@ def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(held: subprocess.Pop
     assert rack("step", rack_name).returncode == 1
 
 
+@pytest.mark.slow
 def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[str], rack_name: str) -> None:
     clock = Segment.attach(rack_name).words[System.CLOCK_PID]
     os.kill(held.pid, signal.SIGKILL)

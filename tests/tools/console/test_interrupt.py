@@ -68,6 +68,7 @@ class Run:
         return not [path.name for path in SHM_FOLDER.iterdir() if self.name in path.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("moment", "number"),
     # Each moment once, and each signal during the launch. During the run: SIGHUP below, SIGINT in test_commands.py.
@@ -85,6 +86,7 @@ def test_a_signal_at_any_moment_ends_a_run_and_leaves_nothing(
     assert run.reported(said) == (moment in BEGUN)
 
 
+@pytest.mark.slow
 def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
@@ -97,12 +99,14 @@ def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
     assert run.reported(said)
 
 
+@pytest.mark.slow
 def test_a_second_signal_ends_a_run_at_once(small: Path, rack_name: str, tmp_path: Path) -> None:
     run = Run(small, rack_name, tmp_path / "run", "cycle", (TERM, INT))
     assert run.ended()[0] in (128 + TERM, 128 + INT)
     assert run.leaves_nothing()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0.02, 0.1, 0.25, 0.4, 0.6, 0.9])
 def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     small: Path, rack_name: str, tmp_path: Path, delay_s: float
@@ -117,6 +121,7 @@ def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     assert run.leaves_nothing()
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_gone_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path) -> None:
     pid, terminal = pty.fork()
     if pid == 0:

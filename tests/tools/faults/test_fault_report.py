@@ -38,6 +38,7 @@ def report(folder: Path) -> Report:
     return write_report(folder)[0]
 
 
+@pytest.mark.slow
 def test_a_fault_is_reported_with_its_detection_reaction_and_recovery(report: Report) -> None:
     hang = report["faults"][0]
     assert (hang["kind"], hang["board"], hang["struck"], hang["seen"]) == ("hang", "upper", 80, "detected")
@@ -80,6 +81,7 @@ def test_a_detection_without_a_fault_is_shown_as_one(report: Report) -> None:
     assert "| 7    | upper    | gap | a message is missing |" in lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lasts", "recovered"), [(', for = "50ms"', "ms"), ("", "not recovered")])
 def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
     tmp_path: Path, rack_name: str, lasts: str, recovered: str

@@ -12,6 +12,8 @@ from rack.backplane.segment import racks
 from rack.boards.config import FAULTS, loads, names
 from tests.tools.command_line import rack
 
+pytestmark = pytest.mark.slow
+
 HANG = '[[fault]]\nkind = "hang"\nboard = "upper"\nat = 0.5\n'
 
 

@@ -54,6 +54,7 @@ def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     end(process, name)
 
 
+@pytest.mark.slow
 def test_a_command_is_given_and_taken_up(running: str) -> None:
     done = rack("command", running, "upper", "hold", "--json")
     answer = json.loads(done.stdout)
@@ -142,6 +143,7 @@ def test_a_rack_that_is_not_there_is_one_line() -> None:
     assert done.stderr.startswith("rack 'no-such-rack' does not exist")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str, end: signal.Signals) -> None:
     table = OperatorTable(Segment.attach(running))
@@ -154,6 +156,7 @@ def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str
     assert table.waiting() == []
 
 
+@pytest.mark.slow
 def test_the_end_of_the_run_ends_a_wait(tmp_path: Path) -> None:
     name = f"test-command-end-{os.getpid()}"
     process = start(tmp_path / "told.toml", name, "clock.mode=realtime")
@@ -170,6 +173,7 @@ def test_the_end_of_the_run_ends_a_wait(tmp_path: Path) -> None:
         end(process, name)
 
 
+@pytest.mark.slow
 def test_a_clock_without_ticks_is_not_waited_for(
     rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,6 +194,7 @@ def test_goals_are_numbers_with_commas() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_setting_is_a_name_and_on_or_off() -> None:
     assert goal_of("modify", ["friction", "off"]) == {"name": "friction", "on": False}
     for words in ([], ["friction"], ["friction", "maybe"], ["friction", "on", "off"]):

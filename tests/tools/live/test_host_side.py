@@ -37,6 +37,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     return folder / "run", json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
     hosted: Path, rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
 ) -> None:
@@ -81,6 +82,7 @@ def console(hosted: Path, name: str) -> Iterator[Rack]:
         yield running
 
 
+@pytest.mark.slow
 def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(hosted: Path, rack_name: str) -> None:
     with console(hosted, rack_name) as running:
         assert any("--entries RUN repeats a run" in event.text for event in running.events)
@@ -110,6 +112,7 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(hosted: Path, r
         assert running.outcome.cause == "task done"
 
 
+@pytest.mark.slow
 def test_a_script_that_fails_is_one_line_and_unknown_boards_are_refused(hosted: Path, rack_name: str) -> None:
     with console(hosted, rack_name):
         script = hosted.parent / "bad.py"

@@ -47,6 +47,7 @@ def test_status_shows_every_inbox(tmp_path: Path, rack_name: str) -> None:
     assert full.line == f"interrupts of hub: {3 * (TICKS - 1)} served, at most 2 of 2 waited, {2 * (TICKS - 1)} lost"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [(SMALL,), (SMALL, OVERLOADED)], ids=["burst", "overload"])
 def test_a_recording_tells_what_the_board_itself_had(tmp_path: Path, rack_name: str, settings: tuple[str, ...]) -> None:
     recording = recorded(tmp_path, rack_name, *settings)
@@ -59,6 +60,7 @@ def test_a_recording_tells_what_the_board_itself_had(tmp_path: Path, rack_name: 
         assert had[:, at].tolist() == [found[-1] if len(found) else -1 for found in shown]
 
 
+@pytest.mark.slow
 def test_the_report_holds_losses_and_latencies(tmp_path: Path, rack_name: str) -> None:
     recorded(tmp_path, rack_name, SMALL)
     report, text = write_report(tmp_path / "run")
@@ -69,6 +71,7 @@ def test_the_report_holds_losses_and_latencies(tmp_path: Path, rack_name: str) -
     assert f"Interrupts of hub: {3 * TICKS} messages served, at most 2 waiting, room for 2, {2 * TICKS} lost" in text
 
 
+@pytest.mark.slow
 def test_interrupts_come_at_even_times_and_a_tick_old(tmp_path: Path, rack_name: str) -> None:
     found = times(recorded(tmp_path, rack_name, SMALL))
     assert {name: one.lost for name, one in found.items()} == {
@@ -85,6 +88,7 @@ def test_interrupts_come_at_even_times_and_a_tick_old(tmp_path: Path, rack_name:
     assert last.jitter_ms is last.age_ms is None
 
 
+@pytest.mark.slow
 def test_an_overloaded_handler_makes_arrivals_uneven_and_old(tmp_path: Path, rack_name: str) -> None:
     found = times(recorded(tmp_path, rack_name, OVERLOADED))
     jitter = [one.jitter_ms["max"] for one in found.values() if one.jitter_ms is not None]
@@ -93,6 +97,7 @@ def test_an_overloaded_handler_makes_arrivals_uneven_and_old(tmp_path: Path, rac
     assert max(ages) > 10.0
 
 
+@pytest.mark.slow
 def test_messages_visible_at_once_are_measured_alike(tmp_path: Path, rack_name: str) -> None:
     found = times(recorded(tmp_path, rack_name, "protocol.default=double-buffer"))
     assert len(found) == BOARDS
@@ -104,6 +109,7 @@ def test_messages_visible_at_once_are_measured_alike(tmp_path: Path, rack_name: 
         assert (one.jitter_ms["max"], one.age_ms["p50"]) == (0.0, 2.5)
 
 
+@pytest.mark.slow
 def test_a_slow_reader_is_overtaken(tmp_path: Path, rack_name: str) -> None:
     found = times(recorded(tmp_path, rack_name, "board.hub.every=10", "protocol.default=time-slice"))
     for one in found.values():
@@ -114,6 +120,7 @@ def test_a_slow_reader_is_overtaken(tmp_path: Path, rack_name: str) -> None:
         assert one.jitter_ms["max"] == 0.0
 
 
+@pytest.mark.slow
 def test_real_time_without_ticks_is_measured_by_the_clock(tmp_path: Path, rack_name: str) -> None:
     modes = ("clock.mode=realtime", "protocol.default=double-buffer")
     for one in times(recorded(tmp_path, rack_name, *modes)).values():

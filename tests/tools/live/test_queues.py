@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from rack.boards import Rack
 from rack.boards.config import load, wire
 from rack.tools.commands.check import inventory, inventory_lines
@@ -16,6 +18,7 @@ from tests.boards.test_queues import QUEUES
 FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
 
 
+@pytest.mark.slow
 def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(tmp_path: Path, rack_name: str) -> None:
     path = tmp_path / "queues.toml"
     path.write_text(QUEUES)
@@ -30,6 +33,7 @@ def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(tmp_path
     assert f"at most 6 waiting, room for 7, {queue['refused']} refused" in text
 
 
+@pytest.mark.slow
 def test_a_running_rack_shows_its_queues(tmp_path: Path, rack_name: str) -> None:
     path = tmp_path / "queues.toml"
     path.write_text(QUEUES)

@@ -125,6 +125,7 @@ def shape(document: Any) -> Any:
     return "number" if isinstance(document, float | int) and not isinstance(document, bool) else document
 
 
+@pytest.mark.slow
 @IN_BOTH
 def test_a_status_from_afar_has_the_fields_of_the_local_one(far: Far) -> None:
     near = json.loads(rack("status", far.name, "--json").stdout)
@@ -136,6 +137,7 @@ def test_a_status_from_afar_has_the_fields_of_the_local_one(far: Far) -> None:
     assert all(row["cycles"] > before["cycles"] for row, before in zip(document["tasks"], near["tasks"], strict=True))
 
 
+@pytest.mark.slow
 @IN_BOTH
 def test_a_command_is_given_taken_up_and_resumed(far: Far) -> None:
     held, listed, resumed, wrong = afar(
@@ -153,6 +155,7 @@ def test_a_command_is_given_taken_up_and_resumed(far: Far) -> None:
     assert wrong.err.startswith('what = "jump": ')
 
 
+@pytest.mark.slow
 @REALTIME
 def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
     ended = afar(
@@ -175,6 +178,7 @@ def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
     assert [one.status for one in ended] == [1, 1, 1, 1, 1, 2]
 
 
+@pytest.mark.slow
 @REALTIME
 def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far) -> None:
     shown, closed = afar(f"list --lan {far.port} --json", f"list --lan {far.port} --as nobody --json")
@@ -199,6 +203,7 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
     segment.close()
 
 
+@pytest.mark.slow
 @REALTIME
 def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
     segment = Segment.attach(far.name)
@@ -215,6 +220,7 @@ def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
     segment.close()
 
 
+@pytest.mark.slow
 @REALTIME
 def test_who_watches_sees_the_run_stop(far: Far) -> None:
     with client("top", far.address) as top:
@@ -225,6 +231,7 @@ def test_who_watches_sees_the_run_stop(far: Far) -> None:
         assert "gone" not in top.stdout.read()
 
 
+@pytest.mark.slow
 def test_a_host_that_cannot_be_reached_is_one_line() -> None:
     port = free_port()
     ended = afar(f"status 127.0.0.1:{port}/x", "status 127.0.0.1:99999/x", "status 127.0.0.1/X!", "list localhost")

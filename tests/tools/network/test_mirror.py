@@ -60,6 +60,7 @@ def mirrored(window: Window) -> Mirror:
     return mirror
 
 
+@pytest.mark.slow
 def test_the_mirror_of_everything_equals_the_segment_ring_by_ring(ran: Segment) -> None:
     window = Window(ran)
     mirror = Mirror("far/rack", window)

@@ -116,6 +116,7 @@ def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> No
     assert unknown["frequency_mhz"] is None
 
 
+@pytest.mark.slow
 def test_a_recording_keeps_what_the_machine_did(small: Path, tmp_path: Path, rack_name: str) -> None:
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     run_rack(config, 0.3, tmp_path / "run", Display())

@@ -122,6 +122,7 @@ def figure(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return Recording(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("figure", ["realtime", "lockstep"], indirect=True)
 def test_a_level_that_computes_for_known_times_is_measured_to_have_taken_them(figure: Recording) -> None:
     # The median of all cycles: a host that takes the machine away must not fail this test.

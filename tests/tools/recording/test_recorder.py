@@ -59,6 +59,7 @@ def test_signals_are_what_the_levels_wrote(recording: Recording) -> None:
     assert np.array_equal(visible_at, ticks + 4)
 
 
+@pytest.mark.slow
 def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recording: Recording) -> None:
     unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
     assert unrecorded.outcome.digest == report_of(recording)["digest"]

@@ -157,6 +157,7 @@ def test_a_rack_without_an_arm_is_recorded_too(tmp_path_factory: pytest.TempPath
         assert np.array_equal(rows.ticks, recording.signal(mailbox, "tick"))
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
@@ -182,6 +183,7 @@ class Keeping(Display):
         self.texts.append(event.text)
 
 
+@pytest.mark.slow
 def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
     folder, display = tmp_path / "run", Keeping()
     folder.mkdir()
@@ -254,6 +256,7 @@ def realtime(config: RackConfig) -> RackConfig:
     return config.model_copy(update={"clock": config.clock.model_copy(update={"mode": "realtime"})})
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config: RackConfig, tmp_path: Path) -> None:
     display = AtTick(signal.SIGKILL)
     result = run_rack(config, LONG_S, tmp_path / "run", display)
@@ -272,6 +275,7 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config:
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
 
 
+@pytest.mark.slow
 def test_recorders_killed_before_their_first_block_cost_no_row(config: RackConfig, tmp_path: Path) -> None:
     # Each new one, too, is struck as soon as it is there.
     display = AtTick(signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
@@ -282,6 +286,7 @@ def test_recorders_killed_before_their_first_block_cost_no_row(config: RackConfi
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(config: RackConfig, tmp_path: Path) -> None:
     display = AtTick(signal.SIGSTOP)
     result = run_rack(config, LONG_S, tmp_path / "run", display)
@@ -292,6 +297,7 @@ def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(config: RackC
     assert len(recording.signal("lower.status", "serial")) == result.outcome.ticks
 
 
+@pytest.mark.slow
 def test_lockstep_waits_for_a_recorder_that_comes_late(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -301,6 +307,7 @@ def test_lockstep_waits_for_a_recorder_that_comes_late(
     assert (result.worked, result.recording) == (True, "complete")
 
 
+@pytest.mark.slow
 def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_is_missing(
     config: RackConfig, tmp_path: Path
 ) -> None:
@@ -321,6 +328,7 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     assert result.failure().endswith(result.recording)
 
 
+@pytest.mark.slow
 def test_rows_that_no_recorder_took_are_missing(config: RackConfig, tmp_path: Path) -> None:
     taken, left = tmp_path / "taken", tmp_path / "left"
     with Rack(config) as rack:
@@ -337,6 +345,7 @@ def test_rows_that_no_recorder_took_are_missing(config: RackConfig, tmp_path: Pa
     assert missing["upper.status"] == (25, 25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["drop", "corrupt", "delay", "reorder", "masquerade"])
 def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(small: Path, rack_name: str, kind: str) -> None:
     """Faults of messages, and a recorder that is killed after them."""
@@ -349,6 +358,7 @@ def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(small: Pat
     assert np.all(np.diff(serials) > 0)
 
 
+@pytest.mark.slow
 def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(small: Path, rack_name: str) -> None:
     """In each cycle as many messages as the ring of a slow task holds in a second."""
     faults = "fault=[{ kind = 'babble', board = 'upper', at = 0.4, for = '1s', writes = 25 }]"
@@ -357,6 +367,7 @@ def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(small: Pa
     assert result.recording == "complete"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     config: RackConfig, tmp_path: Path, mode: str
@@ -375,6 +386,7 @@ def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     assert set(children_of(os.getpid())) <= before
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_from_the_start_ends_the_run(config: RackConfig, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / SPOOL).symlink_to("/dev/full")
@@ -382,6 +394,7 @@ def test_a_disk_that_is_full_from_the_start_ends_the_run(config: RackConfig, tmp
         run_rack(config, 5 * LONG_S, tmp_path / "run", Display())
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_is_named(config: RackConfig, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / CONFIG).symlink_to("/dev/full")
@@ -390,6 +403,7 @@ def test_a_folder_that_cannot_be_written_is_named(config: RackConfig, tmp_path: 
     assert config.name not in racks()
 
 
+@pytest.mark.slow
 def test_what_a_killed_recorder_took_is_readable(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -411,6 +425,7 @@ def test_what_a_killed_recorder_took_is_readable(
     assert RrdReader(str(repaired)).stream().filter(content="/boards/**").to_chunks()
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(config: RackConfig, tmp_path: Path) -> None:
     result = run_rack(realtime(config), 2.0, tmp_path / "run", AtTick(signal.SIGSTOP))
     assert result.outcome.worked
@@ -418,6 +433,7 @@ def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(config: RackCon
     assert (result.worked, result.recording) == (True, "complete")
 
 
+@pytest.mark.slow
 def test_a_recorder_that_comes_late_delays_no_run(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -427,6 +443,7 @@ def test_a_recorder_that_comes_late_delays_no_run(
     assert notes_of(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
 
 
+@pytest.mark.slow
 def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path):
         with pytest.raises(Failure, match="another recorder is running there"):

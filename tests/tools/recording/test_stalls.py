@@ -114,6 +114,7 @@ def test_a_phase_at_the_turn_of_the_period_is_one_phase(config: RackConfig, tmp_
     assert found.quota == Quota(together=8, stalls=8, levels=[])
 
 
+@pytest.mark.slow
 def test_what_may_be_chance_is_not_named(config: RackConfig, tmp_path: Path) -> None:
     few = [resumed_at(100.0 * k + 31.2) for k in range(LEAST_STALLS - 1)]
     assert found_in(run(tmp_path / "run", config, {"lower": few})).quota is None
@@ -261,6 +262,7 @@ class Stop(Display):
             os.kill(pid, signal.SIGCONT)
 
 
+@pytest.mark.slow
 @needs_fifo
 def test_a_stop_of_the_clocks_board_is_a_stall_of_its_core(small: Path, rack_name: str, tmp_path: Path) -> None:
     slow = ["clock.period_ms=40", "board.upper.rate_hz=5", "board.lower.rate_hz=25"]

@@ -42,6 +42,7 @@ def response(tmp_path_factory: pytest.TempPathFactory) -> OperatorResponse:
     return measured(load(folder / "told.toml", [f"name=test-response-{os.getpid()}"]), folder / "run", *commands)
 
 
+@pytest.mark.slow
 def test_every_command_of_a_run_comes_at_its_predicted_tick(response: OperatorResponse, tmp_path: Path) -> None:
     assert [(c.given, c.sampled, c.predicted, c.acts) for c in response.commands] == [
         (101, 104, 112, 112),
@@ -85,6 +86,7 @@ def test_a_run_without_commands_has_no_response(config: MakeConfig, tmp_path: Pa
         show(recording, tmp_path, as_json=False)
 
 
+@pytest.mark.slow
 def test_a_run_in_real_time_has_responses_by_the_wall_clock(config: MakeConfig, tmp_path: Path) -> None:
     given = [CommandConfig(level="upper", what="hold", tick=101)]
     response = measured(config("clock.mode=realtime"), tmp_path / "run", *given)

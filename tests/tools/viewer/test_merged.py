@@ -41,6 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return Recording(nasrem_run(tmp_path_factory))
 
 
+@pytest.mark.slow
 def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(run: Recording, tmp_path: Path) -> None:
     write_merged(on_one_time_line([run]), tmp_path / "again.rrd")
     again, live = contents(tmp_path / "again.rrd"), contents(run.folder / "run.rrd")
@@ -87,6 +88,7 @@ def test_how_uncertain_it_is_stands_in_the_log(both: Path) -> None:
     assert line.endswith(" ms")
 
 
+@pytest.mark.slow
 def test_no_view_of_several_racks_fails_in_the_viewer(both: Path) -> None:
     try:
         with opened(both) as screen:

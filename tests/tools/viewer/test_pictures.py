@@ -18,6 +18,7 @@ NO_DRIVER = {"VK_DRIVER_FILES": "/nowhere", "VK_ICD_FILENAMES": "/nowhere", "WGP
 LOOPBACK, LISTENS = "0100007F", "0A"
 
 
+@pytest.mark.slow
 def test_without_a_driver_the_cause_and_what_to_install_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

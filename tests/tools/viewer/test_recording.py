@@ -145,6 +145,7 @@ def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
             assert any(path == stem or path.startswith(stem.rstrip("/") + "/") for path in recorded), query
 
 
+@pytest.mark.slow
 def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
     try:
         with opened(run.folder / "run.rrd") as screen:

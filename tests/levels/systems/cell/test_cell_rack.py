@@ -12,6 +12,8 @@ from rack.levels.systems.cell.messages import Phase, Response
 from tests.levels.lockstep import Lockstep, Operator
 from tests.levels.systems.cell.rack import CellRack
 
+pytestmark = pytest.mark.slow
+
 PLACE = [0.50, -0.20, 0.475]
 TRANSFER = {"do": "transfer", "object": "block1", "to": PLACE}
 REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
+
+pytestmark = pytest.mark.slow
 
 ORDERED = (
     "clock.mode=lockstep",

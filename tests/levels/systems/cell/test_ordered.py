@@ -146,6 +146,7 @@ def test_time_of_a_rack_whose_clock_is_not_compared_is_waited_for() -> None:
     assert bench.until(Response.REFUSED).reason.startswith("home, by 30 s: it is 5")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("changes", "plans"), [(False, 1), (True, 2)])
 def test_promised_plan_is_made_anew_only_if_the_world_has_changed(changes: bool, plans: int) -> None:
     bench = OrderBench()
@@ -266,6 +267,7 @@ def test_arm_that_its_operator_holds_answers_when_it_is_released() -> None:
     bench.until(Response.POSSIBLE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", ["task", "task.planner"])
 @pytest.mark.parametrize("cycle", range(1, 14, 2))
 def test_order_is_done_once_in_whatever_cycle_a_board_dies(board: str, cycle: int) -> None:

@@ -166,6 +166,7 @@ def test_the_arm_that_takes_the_part_moves_it_in_both_simulations(pair: Pair) ->
     np.testing.assert_allclose(pair.beta.part, pair.alpha.part, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     for number, (hoist, other) in enumerate([(pair.alpha, pair.beta), (pair.beta, pair.alpha)] * 2, start=1):
         pair.lift(hoist)
@@ -200,6 +201,7 @@ def test_a_copy_stays_in_the_air_when_the_other_rack_is_lost(pair: Pair) -> None
     assert pair.beta.claim == Claim(1, b"alpha")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"])
 def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     pair: Pair, restarted: Callable[[Pair], Hoist]
@@ -231,6 +233,7 @@ def test_a_rack_launched_anew_gets_its_part_back_where_the_other_saw_it(pair: Pa
     np.testing.assert_allclose(pair.alpha.part, moved, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_two_runs_say_the_same_bit_for_bit(tmp_path: Path) -> None:
     runs = [Pair(tmp_path), Pair(tmp_path)]
     for pair in runs:

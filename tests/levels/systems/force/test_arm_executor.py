@@ -123,6 +123,7 @@ def test_free_motion_is_no_contact(tmp_path: Path, resolution: float, most: floa
     assert max(rig.forces) < most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("on_force_limit", "is_braked"), [("brake", True), ("stop", True), ("hold", False)])
 def test_a_contact_beyond_the_limit_stops_the_arm(tmp_path: Path, on_force_limit: str, is_braked: bool) -> None:
     rig = pressed(tmp_path, 0.01, seconds=1.0, retry=2.0, on_force_limit=on_force_limit)

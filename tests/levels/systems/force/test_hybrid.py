@@ -40,6 +40,7 @@ def test_a_force_settles_at_the_wanted_value_without_overshoot(tmp_path: Path) -
     assert (rig.force.state, rig.force.reason) == (State.EXECUTING, "")
 
 
+@pytest.mark.slow
 def test_sliding_keeps_the_force_and_follows_the_motion(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     rig.line((START[0], START[1] + 0.08, START[2] - 0.015), segment=0.8)
@@ -50,6 +51,7 @@ def test_sliding_keeps_the_force_and_follows_the_motion(tmp_path: Path) -> None:
     assert max(rig.steps()) < 1.2
 
 
+@pytest.mark.slow
 def test_motion_goes_on_without_a_step_when_compliance_ends(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     rig.line((START[0], START[1] + 0.08, START[2] - 0.015), segment=0.8)
@@ -63,6 +65,7 @@ def test_motion_goes_on_without_a_step_when_compliance_ends(tmp_path: Path) -> N
     assert 1e-3 < np.abs(away).max() < 0.1
 
 
+@pytest.mark.slow
 def test_without_compliance_references_are_followed_exactly(tmp_path: Path) -> None:
     rig = HybridRig(tmp_path)
     rig.line((START[0], START[1] + 0.05, START[2]), segment=0.5)
@@ -74,6 +77,7 @@ def test_without_compliance_references_are_followed_exactly(tmp_path: Path) -> N
     assert max(rig.steps()) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
     guard = np.zeros(6)
@@ -100,6 +104,7 @@ def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
         assert abs(before - 2.0 * WANTED_N) < 4.0
 
 
+@pytest.mark.slow
 def test_motion_begins_again_with_another_command(tmp_path: Path) -> None:
     rig = HybridRig(tmp_path, start=(START[0], START[1], START[2] - 0.015))
     rig.run(0.2)
@@ -113,6 +118,7 @@ def test_motion_begins_again_with_another_command(tmp_path: Path) -> None:
     assert rig.force.reason == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("disturbance", "reason"),
     [
@@ -135,6 +141,7 @@ def test_force_axes_rest_while_the_wrench_is_not_fresh(tmp_path: Path, disturban
     assert np.abs(pressed(rig, 0.1) - 2.0 * WANTED_N).max() < 2.0
 
 
+@pytest.mark.slow
 def test_the_arm_rests_while_the_level_above_is_lost(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     rig.rack.boxes["trajectory.compliance"].lost = True
@@ -154,6 +161,7 @@ def test_a_force_beyond_the_arms_limit_is_cut_with_a_reason(tmp_path: Path) -> N
     assert not rig.status.holding
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("field", "value"), [("frame", (0.0, 0.0, 0.0, 0.0)), ("wrench", (np.nan,) * 6)])
 def test_an_impossible_command_is_refused(tmp_path: Path, field: str, value: Sequence[float]) -> None:
     rig = HybridRig(tmp_path)
@@ -166,6 +174,7 @@ def test_an_impossible_command_is_refused(tmp_path: Path, field: str, value: Seq
     assert np.abs(rig.status.target - rig.cell.home).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_restarted_board_goes_on_from_where_the_arm_is_held(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     rig.rack.lose("hybrid", ticks=100)
@@ -175,6 +184,7 @@ def test_a_restarted_board_goes_on_from_where_the_arm_is_held(tmp_path: Path) ->
     assert max(rig.steps()) < 1.2
 
 
+@pytest.mark.slow
 def test_a_restarted_board_strikes_no_guard_again(tmp_path: Path) -> None:
     rig = HybridRig(tmp_path, start=(START[0], START[1], START[2] - 0.015))
     rig.run(0.2)
@@ -187,6 +197,7 @@ def test_a_restarted_board_strikes_no_guard_again(tmp_path: Path) -> None:
     assert rig.force.reason.startswith("guard of axis z was struck")
 
 
+@pytest.mark.slow
 def test_after_the_brakes_the_motion_begins_where_the_arm_is(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     rig.rack.stop(Demand.BRAKE, ticks=200)

@@ -22,6 +22,7 @@ HOLD = {"do": "hold", "seconds": 0.8}
 RELEASE = {"do": "release", "seconds": 0.4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boards", ["loops", "fingers"])
 def test_an_object_is_lifted_kept_while_it_is_pulled_and_put_back(boards: str) -> None:
     rig = GraspRig(boards, [PRESHAPE, CLOSE, SQUEEZE, LIFT, HOLD, LOWER, RELEASE], (PULL,))
@@ -37,6 +38,7 @@ def test_an_object_is_lifted_kept_while_it_is_pulled_and_put_back(boards: str) -
     assert not rig.read("hand.status").force.any()
 
 
+@pytest.mark.slow
 def test_the_grip_rises_with_the_load_and_falls_after_it() -> None:
     rig = GraspRig("fingers", [PRESHAPE, CLOSE, SQUEEZE, {**HOLD, "seconds": 9.0}], (PULL,))
     assert rig.go(3.0, steps=3)
@@ -47,6 +49,7 @@ def test_the_grip_rises_with_the_load_and_falls_after_it() -> None:
     assert rig.grasp.grip == pytest.approx(before, abs=0.8)
 
 
+@pytest.mark.slow
 def test_fingers_that_touch_nothing_are_named() -> None:
     beside = {name: [x, y, z + 0.2] for name, (x, y, z) in CLOSE["points"].items()}
     rig = GraspRig("fingers", [PRESHAPE, {**CLOSE, "points": beside, "seconds": 0.6}])
@@ -56,6 +59,7 @@ def test_fingers_that_touch_nothing_are_named() -> None:
     assert status.reason == "missed 'can': touched nothing: index, middle, ring, thumb"
 
 
+@pytest.mark.slow
 def test_an_object_that_is_torn_out_is_lost() -> None:
     tear = PushConfig(body="can", at=2.2, seconds=2.0, force=(0.0, -30.0, 0.0))
     rig = GraspRig("fingers", [PRESHAPE, CLOSE, SQUEEZE, {**HOLD, "seconds": 9.0}], (tear,))
@@ -65,6 +69,7 @@ def test_an_object_that_is_torn_out_is_lost() -> None:
     assert status.reason.startswith("lost 'can': ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", ["grasp", "fingertip", "joint", "tendon", "hand"])
 def test_a_board_that_dies_leaves_the_object_in_the_hand(board: str) -> None:
     rig = GraspRig("loops", [PRESHAPE, CLOSE, SQUEEZE, {**HOLD, "seconds": 0.5}])
@@ -77,6 +82,7 @@ def test_a_board_that_dies_leaves_the_object_in_the_hand(board: str) -> None:
     assert status.farthest < 0.003
 
 
+@pytest.mark.slow
 def test_an_operator_holds_the_grasp_which_then_goes_on() -> None:
     rig = GraspRig("fingers", [PRESHAPE, CLOSE])
     operator = Operator(rig)

@@ -32,6 +32,7 @@ def tips(posture: Array) -> Array:
     return np.array([kinematics.tip(finger) for finger in range(4)])
 
 
+@pytest.mark.slow
 def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planner: GraspPlanner) -> None:
     found = planner.plan(0, AT, UPRIGHT)
     assert found is not None
@@ -43,6 +44,7 @@ def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planner: Grasp
     assert 0.1 < found.margin < 0.5
 
 
+@pytest.mark.slow
 def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_asked(planner: GraspPlanner) -> None:
     found = planner.plan(0, AT, UPRIGHT)
     assert found is not None
@@ -52,6 +54,7 @@ def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_
     assert np.abs(tips(found.posture) - wanted).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(planner: GraspPlanner) -> None:
     turned = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)])
     moved = planner.plan(0, AT + np.array([0.006, -0.004, 0.003]), UPRIGHT)
@@ -69,10 +72,12 @@ def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(
     assert np.array(again) == pytest.approx(straight.contact, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_an_object_out_of_reach_has_no_grasp(planner: GraspPlanner) -> None:
     assert planner.plan(0, AT + np.array([0.3, 0.0, 0.0]), UPRIGHT) is None
 
 
+@pytest.mark.slow
 def test_the_grip_bears_weight_and_pull_by_friction_with_a_reserve() -> None:
     found = GraspPlanner(HAND, "thumb", GraspRules(pull=4.0, reserve=2.0)).plan(0, AT, UPRIGHT)
     assert found is not None

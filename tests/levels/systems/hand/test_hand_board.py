@@ -97,6 +97,7 @@ def test_board_that_sees_nothing_new_closes_the_valves() -> None:
     assert_follows(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 def test_emergency_stop_closes_the_valves_and_keeps_the_tensions(demand: Demand) -> None:
     rig = swinging()

@@ -71,6 +71,7 @@ def test_torque_is_the_arm_times_the_difference_of_the_tensions() -> None:
     assert sample.torque == pytest.approx(hand.hand.arms * (sample.tension[FLEXOR] - sample.tension[EXTENSOR]))
 
 
+@pytest.mark.slow
 def test_no_pull_breaks_a_limit_at_any_step() -> None:
     hand, rng = hand_of(), np.random.default_rng(3)
     for _ in range(20):
@@ -82,6 +83,7 @@ def test_no_pull_breaks_a_limit_at_any_step() -> None:
     assert (hand.violations, hand.pushed, hand.first_violation, hand.fault) == (0, 0, "", "")
 
 
+@pytest.mark.slow
 def test_closed_valves_bring_a_moving_finger_to_rest_and_a_stiffer_one_sooner() -> None:
     ways = []
     for stiff in (1000.0, 4000.0):

@@ -95,6 +95,7 @@ def test_a_lead_brings_torques_earlier_without_overshoot() -> None:
     assert after[1.0] <= 0.6 * after[0.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "offset"), [(0.9, 0.0), (1.1, 0.0), (1.0, 1.0), (0.95, -0.8)])
 def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(gain: float, offset: float) -> None:
     valves = Valves(gain, offset, TendonGains())

@@ -85,6 +85,7 @@ def workstation(tmp_path: Path, **params: Any) -> Workstation:
     return Workstation(context)
 
 
+@pytest.mark.slow
 def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held(tmp_path: Path) -> None:
     crate, host = Crate(), workstation(tmp_path)
     host.run(crate)  # type: ignore[arg-type]
@@ -115,6 +116,7 @@ def test_it_waits_until_it_knows_object_and_coordinator(tmp_path: Path) -> None:
     assert not (tmp_path / "lab").exists()
 
 
+@pytest.mark.slow
 def test_the_picture_is_replaced_whole_and_shows_forces_and_the_crates_counts(tmp_path: Path) -> None:
     crate, host = Crate(), workstation(tmp_path)
     crate.messages["hand"].force[3] = (0.0, 0.0, 4.0)

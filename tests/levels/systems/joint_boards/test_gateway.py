@@ -79,6 +79,7 @@ def test_references_are_handed_on_later_by_a_constant_time_and_in_time_to_be_fol
     assert all(tick + EVERY <= due for tick, due in zip(ticks[1:], dues, strict=False))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, MISSING])
 def test_missing_references_are_extrapolated_without_a_gap(count: int) -> None:
     rig = GatewayRig()
@@ -91,6 +92,7 @@ def test_missing_references_are_extrapolated_without_a_gap(count: int) -> None:
     assert [position for _, _, position in rig.given] == pytest.approx(wanted)
 
 
+@pytest.mark.slow
 def test_references_that_are_always_late_are_extrapolated_from_the_newest() -> None:
     rig = GatewayRig()
     rig.run(100)

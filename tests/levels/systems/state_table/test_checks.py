@@ -173,6 +173,7 @@ def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowCo
     )
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(CONDITIONS, st.booleans()), min_size=1, max_size=7))
 def test_a_table_passes_exactly_if_one_row_fires_in_every_case(rows: list[tuple[dict[str, set[str]], bool]]) -> None:
     configs = {number: row_config(number, *row) for number, row in enumerate(rows, 1)}

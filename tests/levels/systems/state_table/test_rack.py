@@ -25,6 +25,7 @@ def fired(rack: Rack, level: str) -> list[str]:
     return [name.decode() for at, name in enumerate(names) if not at or name != names[at - 1]]
 
 
+@pytest.mark.slow
 def test_it_picks_up_a_block_though_a_board_dies_on_the_way(rack_name: str) -> None:
     config = load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep", KILLED])
     with Rack(config) as rack:
@@ -38,6 +39,7 @@ def test_it_picks_up_a_block_though_a_board_dies_on_the_way(rack_name: str) -> N
     assert heights[-1] > heights[0] + 0.01
 
 
+@pytest.mark.slow
 def test_it_runs_alike_every_time(rack_name: str) -> None:
     digests = []
     for _ in range(2):
@@ -46,6 +48,7 @@ def test_it_runs_alike_every_time(rack_name: str) -> None:
     assert digests[0] == digests[1]
 
 
+@pytest.mark.slow
 def test_without_a_task_level_the_operator_commands_the_elemental_moves(rack_name: str) -> None:
     config = load(FOLDER / "direct.toml", [f"name={rack_name}", "clock.mode=lockstep", TASKLESS])
     with Rack(config) as rack:

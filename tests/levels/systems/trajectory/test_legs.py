@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,6 +40,7 @@ def test_two_legs_begun_half_a_blend_apart_are_one_straight_motion() -> None:
     assert np.abs(np.diff(way, 2)).max() < 1e-12
 
 
+@pytest.mark.slow
 @given(parts, times, st.floats(0.0, 2.0))
 @settings(max_examples=60, deadline=None)
 def test_a_leg_takes_half_the_acceleration_at_most(change: list[float], half: float, segment: float) -> None:
@@ -54,6 +56,7 @@ def test_a_leg_takes_half_the_acceleration_at_most(change: list[float], half: fl
     assert np.allclose(leg.at(leg.law.ends_s + 1.0), CELL.home + np.array(change), rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 @given(parts, parts, st.floats(0.1, 1.0))
 @settings(max_examples=60, deadline=None)
 def test_a_ramp_to_rest_continues_its_state_within_the_limits(v: list[float], a: list[float], least: float) -> None:

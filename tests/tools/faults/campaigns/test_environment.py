@@ -47,6 +47,7 @@ def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pyt
         assert left_behind("other", children()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_stress", [True, False])
 def test_a_load_is_a_busy_process_a_core_and_one_that_writes(has_stress: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if has_stress and shutil.which("stress-ng") is None:

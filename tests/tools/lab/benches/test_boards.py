@@ -26,6 +26,7 @@ def test_a_chain_of_boards_fills_the_crate() -> None:
     assert layout.mailbox("board19.status").readers == ("board20",)
 
 
+@pytest.mark.slow
 def test_messages_take_as_many_cycles_as_there_are_boards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure((2, 5), Runs(0.2, 1, True), ROOT, Progress())
@@ -72,6 +73,7 @@ def test_costs_on_a_line_are_found_to_be_linear() -> None:
     assert Fit.of((1, 20), (1.0, 2.0)) is None
 
 
+@pytest.mark.slow
 def test_costs_are_drawn_with_their_line(tmp_path: Path) -> None:
     chains = [
         replace(SHORT, boards=n, processor_us=50.0 * n + 100.0, lockstep_us={"ours": 40.0 * n}) for n in (1, 5, 9)

@@ -65,6 +65,7 @@ def test_this_tree_is_a_checkout_too() -> None:
         assert found.run("--help", bound_s=BOUND_S) == this_rack().run("--help", bound_s=BOUND_S)
 
 
+@pytest.mark.slow
 def test_a_command_that_fails_or_hangs_is_one_line(tmp_path: Path) -> None:
     with checkout(tree_of(tmp_path / "other", "tools.")) as found:
         with pytest.raises(Failure, match=r"^other: rack fail now: the reason$"):

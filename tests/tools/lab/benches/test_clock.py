@@ -22,6 +22,7 @@ from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 
 
+@pytest.mark.slow
 @needs_fifo
 def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
@@ -43,6 +44,7 @@ def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: 
     assert all(path.stat().st_size for path in found.plot(tmp_path))
 
 
+@pytest.mark.slow
 def test_peers_that_the_machine_lacks_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure((1000,), Runs(0.1, 1, True), Progress())
@@ -65,6 +67,7 @@ def test_a_peer_that_fails_is_named_with_its_reason(monkeypatch: pytest.MonkeyPa
     assert absent.line == "absent: cyclictest at 50 Hz, 2 of 2 rounds: cyclictest: Unable to change scheduling policy!"
 
 
+@pytest.mark.slow
 def test_a_machine_without_real_time_says_so_and_measures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clock, "permits_fifo", lambda: False)
     monkeypatch.setattr(clock, "_contestants", lambda share: ({BARE: clock.sleep_loop}, []))
@@ -73,6 +76,7 @@ def test_a_machine_without_real_time_says_so_and_measures(monkeypatch: pytest.Mo
     assert found.samples[0].count > 0
 
 
+@pytest.mark.slow
 def test_the_start_of_a_run_is_left_out() -> None:
     grid = WakeGrid((0,), 2_500_000, 40, 80)
     assert 0 < len(board("signal", True, grid)) <= grid.wakes

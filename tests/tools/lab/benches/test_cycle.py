@@ -77,6 +77,7 @@ def test_without_another_checkout_only_physics_give_a_ratio() -> None:
     assert {sample.case for sample in found.samples if found.ratio(sample)} == {"servo and its physics, real time"}
 
 
+@pytest.mark.slow
 def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> None:
     found = measure(None, 0.6, 1, Progress(), share=True)
     document = found.document()
@@ -105,6 +106,7 @@ def test_an_empty_rack_is_a_ring_of_boards_on_two_cores(tmp_path: Path) -> None:
     assert {board.core for board in config.board.values()} == {0, 1}
 
 
+@pytest.mark.slow
 def test_replayed_physics_end_in_the_recorded_state(tmp_path_factory: pytest.TempPathFactory) -> None:
     run = nasrem_run(tmp_path_factory)
     whole = len(Replay.of(Recording(run)).controls)

@@ -53,6 +53,7 @@ def test_the_document_has_every_figure(tmp_path: Path) -> None:
     assert found["racks"][0]["links"][1] == {**STATUSES.__dict__}
 
 
+@pytest.mark.slow
 def test_it_is_drawn(tmp_path: Path) -> None:
     paths = HandBench((TABLES, INTERRUPTS)).plot(tmp_path)
     assert [path.name for path in paths] == ["hand.png", "hand.svg"]

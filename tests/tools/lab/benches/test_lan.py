@@ -26,6 +26,7 @@ UDP_BYTES = ORDER_BYTES + STATUS_BYTES + 2 * 42
 RATE_HZ, CYCLES = 50.0, 15
 
 
+@pytest.mark.slow
 @needs_lab
 def test_racks_are_measured_next_to_others_and_who_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lan, "ENDS", {TLS: ENDS[TLS], "UDP": ENDS["UDP"], "nobody": "none"})
@@ -50,6 +51,7 @@ def test_racks_are_measured_next_to_others_and_who_fails_is_named(monkeypatch: p
     assert not list(NAMESPACES.glob(f"{Lab(1)._hub.rsplit('-', 2)[0]}-*"))
 
 
+@pytest.mark.slow
 @needs_lab
 @pytest.mark.skipif(find_spec("cyclonedds") is None, reason="needs cyclonedds")
 def test_a_dds_answers_orders_and_what_it_does_not_answer_is_missing() -> None:
@@ -65,6 +67,7 @@ def test_a_task_passes_the_command_line_whole() -> None:
     )
 
 
+@pytest.mark.slow
 def test_figures_show_ratios_deaths_that_were_none_and_a_picture(tmp_path: Path) -> None:
     values = {
         Point("round trip", racks, 10.0, who, "us"): (base * racks, 3 * base * racks)

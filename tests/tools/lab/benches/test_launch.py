@@ -37,6 +37,7 @@ def test_the_fastest_executor_is_looked_for(small: Path) -> None:
     assert fastest(load("nasrem")) == "servo"
 
 
+@pytest.mark.slow
 def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(small: Path, tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
     assert 0.0 < ShortRuns(tmp_path / "runs").launch_s(this_rack(), str(small)) < BOUND_S
@@ -48,6 +49,7 @@ def test_a_rack_without_an_arm_has_no_brakes(small: Path) -> None:
         Killing(str(small), 1, Progress())
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.parametrize("of", ["the arm", "its commands"])
 def test_a_kill_is_detected_before_the_brakes_are_engaged(of: str) -> None:

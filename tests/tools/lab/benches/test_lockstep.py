@@ -19,6 +19,7 @@ from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
 
+@pytest.mark.slow
 def test_levels_without_a_rack_write_what_they_write_in_one(tmp_path_factory: pytest.TempPathFactory) -> None:
     recording = Recording(nasrem_run(tmp_path_factory))
     resolved = resolve(load("nasrem", ["clock.mode=lockstep"]))
@@ -46,6 +47,7 @@ def test_speeds_are_ratios_to_the_other_checkout_and_to_the_limit() -> None:
     assert list(alone.lines(80))[1].split() == ["rack", "this", "tree", "no", "rack"]
 
 
+@pytest.mark.slow
 def test_a_short_bench_runs_a_rack_and_its_levels_alone(tmp_path: Path) -> None:
     found = measure(None, {"fig4": 0.5}, 1, Progress())
     assert {(sample.who, sample.count) for sample in found.comparison.samples} == {("this tree", 1), (BARE, 1)}
@@ -62,6 +64,7 @@ def exits() -> None:
     raise SystemExit(4)
 
 
+@pytest.mark.slow
 def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
     with pytest.raises(Failure, match=r"^no reason$"):
         apart(fails)

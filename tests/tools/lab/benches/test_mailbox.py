@@ -47,6 +47,7 @@ def test_messages_have_the_sizes_that_the_cases_name() -> None:
     assert {case.readers for case in CASES} == {1, 4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peer", [*REFERENCES, *PEERS], ids=lambda peer: peer.name)
 def test_every_reader_receives_every_message_and_nothing_is_left(peer: Peer, tmp_path: Path) -> None:
     if absent_package(peer.name, peer.module) is not None:
@@ -122,6 +123,7 @@ def test_a_bench_measures_every_protocol_and_names_who_is_absent(monkeypatch: py
     assert not left_by(os.getpid())
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_document_and_writes_its_pictures(tmp_path: Path) -> None:
     command = [*RACK, "bench", "mailbox", "--rounds", "1", "--json", "--plot", tmp_path / "pictures"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, timeout=3 * BOUND_S)
@@ -132,6 +134,7 @@ def test_the_command_prints_one_document_and_writes_its_pictures(tmp_path: Path)
     assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == ["mailbox.png", "mailbox.svg"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_bench_leaves_nothing(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*RACK, "bench", "mailbox", "--rounds", "100000"],

@@ -89,6 +89,7 @@ def test_machines_reach_each_other_and_nobody_else() -> None:
         assert [line.split()[0] for line in routes.communicate(timeout=BOUND_S)[0].splitlines()] == ["10.77.0.0/24"]
 
 
+@pytest.mark.slow
 @needs_lab
 def test_the_share_that_is_asked_for_gets_lost_both_ways() -> None:
     packets, share = 5000, 0.1

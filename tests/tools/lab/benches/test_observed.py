@@ -42,6 +42,7 @@ def test_shares_are_of_all_tasks_together() -> None:
     assert missed_share([CycleCount(1, 100), CycleCount(0, 300)]) == 0.0025
 
 
+@pytest.mark.slow
 def test_a_run_leaves_traces_messages_and_its_outcome() -> None:
     chain = Chain(2, 400, "lockstep")
     found = observe(loads(chain.text()), 0.1, True, ["board2.status"])

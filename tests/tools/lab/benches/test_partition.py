@@ -49,6 +49,7 @@ def test_a_board_that_polls_cannot_share_the_only_core() -> None:
         Partition("tight", 1).of(config)
 
 
+@pytest.mark.slow
 def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLANNED)
@@ -71,6 +72,7 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
     assert max(map(len, lines_of(found, 80))) <= 80
 
 
+@pytest.mark.slow
 @needs_fifo
 @needs_two_cores
 @pytest.mark.alone

@@ -57,6 +57,7 @@ def test_a_rate_is_held_up_to_its_bound_beyond_cyclictest() -> None:
     assert replace(RATES, figures=RATES.figures[1:]).highest_held_hz is None
 
 
+@pytest.mark.slow
 def test_a_rack_is_run_at_every_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
@@ -74,6 +75,7 @@ def test_a_rack_is_run_at_every_rate(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert all(picture.stat().st_size for picture in found.plot(tmp_path))
 
 
+@pytest.mark.slow
 def test_late_wakes_of_cyclictest_are_a_share_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
@@ -84,6 +86,7 @@ def test_late_wakes_of_cyclictest_are_a_share_of_its_own(tmp_path: Path, monkeyp
     assert one.late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)

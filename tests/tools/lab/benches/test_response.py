@@ -40,6 +40,7 @@ def test_commands_are_drawn_with_room_for_each_response_and_a_seed_draws_the_sam
     assert [command.what for command in drawn] == ["hold", "resume"] * (len(drawn) // 2)
 
 
+@pytest.mark.slow
 def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(
     rack_name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -60,6 +61,7 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(
     assert (twin.differs, twin.agrees) == (2712, True)
 
 
+@pytest.mark.slow
 def test_a_bench_measures_as_many_as_asked_for() -> None:
     found = ResponseRuns("nasrem", "lockstep", 3, Progress()).measure(2, twins=0)
     assert found.held

@@ -29,6 +29,7 @@ def test_a_wake_up_outside_the_planners_time_is_no_switch_between_the_two() -> N
         cost_of(1, gaps[1:], awake[1:])
 
 
+@pytest.mark.slow
 @needs_fifo
 @needs_two_cores
 def test_a_switch_is_measured_with_real_processes_and_nothing_is_left() -> None:

@@ -36,6 +36,7 @@ def run(name: str, *settings: str) -> tuple[int, dict[str, Any]]:
     return done.returncode, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_an_object_off_its_goal_fails_a_task_that_is_done(rack_name: str) -> None:
     status, report = run(rack_name, GOAL, PUSH)
     (end,) = report["objects"]
@@ -46,6 +47,7 @@ def test_an_object_off_its_goal_fails_a_task_that_is_done(rack_name: str) -> Non
     assert (status, report["worked"]) == (1, False)
 
 
+@pytest.mark.slow
 def test_an_object_within_the_tolerance_is_listed(rack_name: str) -> None:
     status, report = run(rack_name, GOAL)
     (end,) = report["objects"]
@@ -54,6 +56,7 @@ def test_an_object_within_the_tolerance_is_listed(rack_name: str) -> None:
     assert (status, report["worked"]) == (0, True)
 
 
+@pytest.mark.slow
 def test_a_run_that_ends_before_its_task_is_not_judged(rack_name: str) -> None:
     given = [word for setting in (f"name={rack_name}", GOAL, PUSH) for word in ("--set", setting)]
     done = rack("run", "nasrem", "--lockstep", "--no-record", "--json", "--seconds", 1.0, *given)
@@ -79,6 +82,7 @@ def test_a_goal_of_what_is_not_in_the_scene_is_a_mistake() -> None:
         resolve(load("nasrem", [GOAL.replace("block1", "block9")]))
 
 
+@pytest.mark.slow
 def test_the_objects_of_the_nasrem_task_end_within_tolerance_and_none_falls(rack_name: str, tmp_path: Path) -> None:
     config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep"])
     assert run_rack(config, None, tmp_path / "run", Display()).worked
@@ -90,6 +94,7 @@ def test_the_objects_of_the_nasrem_task_end_within_tolerance_and_none_falls(rack
         assert f"Object {end['object']} ended {end['off_mm']:.1f} mm from its goal (tolerance 10 mm)." in text
 
 
+@pytest.mark.slow
 def test_what_is_let_go_in_the_air_is_a_finding_with_its_fall(rack_name: str, tmp_path: Path) -> None:
     (tmp_path / "drop.py").write_text(DROP)
     own = ["host.command.params.script=drop.py", f'python_path=["{tmp_path}"]', GOAL]

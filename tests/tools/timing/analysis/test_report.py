@@ -181,6 +181,7 @@ def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: i
     assert max(map(len, markdown(report).splitlines())) > 120
 
 
+@pytest.mark.slow
 def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
     (tmp_path / "commanded.toml").write_text(COMMANDED)
     given = commands(

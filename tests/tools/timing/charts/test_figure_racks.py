@@ -46,6 +46,7 @@ def late(panel: Panel, task: str) -> float:
     return count.late / count.jobs
 
 
+@pytest.mark.slow
 def test_figure_2_repeats_its_pattern_and_plans_in_time(panels: dict[str, Panel]) -> None:
     assert usual(panels["fig2"].patterns["level"].plans) == "R X W P | R X W P U -"
     assert late(panels["fig2"], "level.planner") < 1 - MOSTLY
@@ -120,6 +121,7 @@ STRADDLING = (
 UPDATE_NS = SLOWER * 1_900_000
 
 
+@pytest.mark.slow
 def test_the_update_of_a_plan_keeps_its_executor_waiting(tmp_path: Path) -> None:
     found = undisturbed("fig2", tmp_path, *STRADDLING)
     met, cut = updates_met(found)
@@ -130,6 +132,7 @@ def test_the_update_of_a_plan_keeps_its_executor_waiting(tmp_path: Path) -> None
     assert sum(span.end_ns - span.start_ns > UPDATE_NS for span in updates) > MOSTLY * met
 
 
+@pytest.mark.slow
 def test_an_update_that_is_no_critical_section_is_preempted(tmp_path: Path) -> None:
     free = "protocol.mailbox={ 'level.plan' = 'time-slice' }"
     found = undisturbed("fig2", tmp_path, *STRADDLING, free)
@@ -138,6 +141,7 @@ def test_an_update_that_is_no_critical_section_is_preempted(tmp_path: Path) -> N
     assert cut > MOSTLY * met
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fig2", "fig4-overload"])
 def test_in_lockstep_a_figure_misses_nothing_and_repeats_itself(name: str, tmp_path: Path) -> None:
     lockstep = "clock.mode=lockstep"

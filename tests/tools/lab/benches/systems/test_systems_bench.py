@@ -23,6 +23,7 @@ def jointed(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_default_is_nasrem_and_every_bundled_rack_with_a_folder() -> None:
     assert systems()[0] == "nasrem"
     assert len(set(systems())) == len(systems())
@@ -65,6 +66,7 @@ def test_the_highest_level_that_responds_within_the_run_is_held() -> None:
     assert hold_for(config, timing, layout, 0.1) is None
 
 
+@pytest.mark.slow
 def test_a_rack_is_compared_by_its_runs(jointed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     pictures = tmp_path / "pictures"

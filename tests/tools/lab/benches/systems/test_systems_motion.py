@@ -54,6 +54,7 @@ def test_a_rack_has_a_motion_only_with_a_config_of_its_own() -> None:
     assert poses_config("none.toml") is None
 
 
+@pytest.mark.slow
 def test_an_operator_stops_the_arm_on_its_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(motion, "LONGEST_S", 4.2)
     monkeypatch.setattr(motion, "STOPPING_S", 1.0)
