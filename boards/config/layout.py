@@ -18,15 +18,15 @@ from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.commands import commandable
-from rack.boards.config.exchange import asynchronous_mistakes, exchanges, strict_mistakes
 from rack.boards.config.interrupts import interrupt_mistakes, is_exempt, with_interrupts
-from rack.boards.config.lan import entry_mistakes, is_taken
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.ports import TaskPorts, all_ports, table_of
 from rack.boards.config.protocols import UNREAD
 from rack.boards.config.queues import queue_mistakes, queue_slots
+from rack.boards.config.rules.lan import entry_mistakes, is_taken
+from rack.boards.config.rules.protocols import asynchronous_mistakes, exchanges, strict_mistakes
+from rack.boards.config.rules.reads import Sides, key_of
 from rack.boards.config.schema import LAN, RackConfig, TaskPlace
-from rack.boards.config.sides import Sides, key_of
 from rack.boards.errors import Mistake
 from rack.levels.level import Output
 from rack.levels.operator import OPERATOR_COMMAND

@@ -20,9 +20,9 @@ from pydantic_core import ErrorDetails
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import ClockError
 from rack.boards.config.files import file_at
-from rack.boards.config.lan import lan_mistakes
-from rack.boards.config.network import network_mistakes
-from rack.boards.config.schedule import schedule_mistakes
+from rack.boards.config.rules.lan import lan_mistakes
+from rack.boards.config.rules.network import network_mistakes
+from rack.boards.config.rules.schedule import schedule_mistakes
 from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, HostConfig, RackConfig
 from rack.boards.errors import Mistake
 

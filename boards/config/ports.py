@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from rack.backplane.layout import Role
 from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
-from rack.boards.config.exchange import exchange_mistakes
+from rack.boards.config.rules.protocols import exchange_mistakes
 from rack.boards.config.schema import RackConfig, Sources, TaskPlace
 from rack.boards.errors import Mistake
 from rack.boards.exchange import EXCHANGE, exchange_message

@@ -23,14 +23,14 @@ from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
-from rack.boards.config.exchange import exchanges
 from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
-from rack.boards.config.lan import at_adapter
 from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
 from rack.boards.config.mistakes import disagreements, mistakes_of
-from rack.boards.config.network import credential_mistakes, network_notes
 from rack.boards.config.ports import TaskPorts, reference
+from rack.boards.config.rules.lan import at_adapter
+from rack.boards.config.rules.network import credential_mistakes, network_notes
+from rack.boards.config.rules.protocols import exchanges
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import Tables, parse

@@ -10,7 +10,7 @@ from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
 from rack.boards.config.mistakes import PLANNER_BUDGET
-from rack.boards.config.schedule import frames
+from rack.boards.config.rules.schedule import frames
 from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
 from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.rack import BoardTiming, RackTiming

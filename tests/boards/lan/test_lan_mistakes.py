@@ -197,7 +197,7 @@ def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> 
     def no_zenoh(name: str, package: str | None = None) -> ModuleSpec | None:
         return None if name == "zenoh" else found(name, package)
 
-    monkeypatch.setattr("rack.boards.config.lan.find_spec", no_zenoh)
+    monkeypatch.setattr("rack.boards.config.rules.lan.find_spec", no_zenoh)
     monkeypatch.setitem(__import__("sys").modules, "zenoh", None)
     for module in ("link", "entries", "adapter"):
         monkeypatch.delitem(__import__("sys").modules, f"rack.boards.lan.{module}", raising=False)
