@@ -9,20 +9,16 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from rack.backplane.segment import Segment
 
 _FLOCK = struct.Struct("hhqqi4x")
 """`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description have none)."""
 
 
 class ByteLock:
-    """The lock on the byte at a bus address."""
+    """The lock on the byte at a bus address of an open segment."""
 
-    def __init__(self, segment: Segment, address: int) -> None:
-        self._fd = os.open(f"/proc/self/fd/{segment.fd}", os.O_RDWR | os.O_CLOEXEC)
+    def __init__(self, fd: int, address: int) -> None:
+        self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
         self._take = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
         self._unlock = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, address, 1, 0)
 

@@ -115,7 +115,7 @@ class FaultTable:
 
     def add(self, injection: Injection) -> FaultEntry:
         """Fill a free entry; its fault begins when the clock finds it due. Raises `FaultTableError`."""
-        lock = ByteLock(self._segment, self._segment.map.faults)
+        lock = ByteLock(self._segment.fd, self._segment.map.faults)
         try:
             # Bounded by the time in which another process fills an entry.
             while not lock.take():

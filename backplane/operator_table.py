@@ -127,7 +127,7 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        lock = ByteLock(self._segment, self._segment.map.operator)
+        lock = ByteLock(self._segment.fd, self._segment.map.operator)
         try:
             return self._add(request, has_client) if lock.take() else None
         finally:
@@ -140,7 +140,7 @@ class OperatorTable:
             raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
         entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
         ticket = self._words[System.REQUESTED] + 1
-        lock = ByteLock(self._segment, _CLAIMS + ticket)
+        lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
         if has_client:
             lock.take()
         self._fill(entry, request, ticket, has_client)

@@ -86,7 +86,7 @@ class Writer:
         """Messages that injected faults hold back."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
-        self._claim = ByteLock(segment, segment.map.mailboxes[name] + 8 * Box.CLAIM)
+        self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         if not self._claim.take():
             pid = self._slots.box[Box.WRITER_PID]
             self._claim.close()

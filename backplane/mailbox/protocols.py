@@ -37,7 +37,7 @@ class MailboxLock:
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
         address = segment.map.mailboxes[name]
         self._semaphore = lock_semaphore(segment.rack, name)
-        self._owner = ByteLock(segment, address + 8 * Box.OWNER)
+        self._owner = ByteLock(segment.fd, address + 8 * Box.OWNER)
         self._box = segment.words[address // 8 : address // 8 + len(Box)]
         self._pid = os.getpid()
         self._wait_s = wait_s

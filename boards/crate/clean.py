@@ -40,7 +40,7 @@ def _remove(segment: Segment) -> bool:
         raise SegmentError(
             f"rack '{rack}' is already running, launched by process {segment.launcher}; stop it, or choose another name"
         )
-    removal = ByteLock(segment, 8 * Head.MAGIC)
+    removal = ByteLock(segment.fd, 8 * Head.MAGIC)
     try:
         # If two programs find the same dead rack, only one removes it. Otherwise the slower one would remove the rack
         # that the faster one has meanwhile launched under the same name.

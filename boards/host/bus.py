@@ -170,7 +170,7 @@ class HostInlet:
 
 
 def _claim(segment: Segment, board: str) -> ByteLock:
-    claim = ByteLock(segment, segment.map.blocks[board] + WORD * Block.PID)
+    claim = ByteLock(segment.fd, segment.map.blocks[board] + WORD * Block.PID)
     if not claim.take():
         claim.close()
         pid = segment.block(board)[Block.PID]

@@ -16,7 +16,7 @@ ADDRESS = 24
 
 def test_two_holders_in_one_process_exclude_each_other(make_bus: MakeBus) -> None:
     segment = make_bus()
-    first, second = ByteLock(segment, ADDRESS), ByteLock(segment, ADDRESS)
+    first, second = ByteLock(segment.fd, ADDRESS), ByteLock(segment.fd, ADDRESS)
     assert first.take()
     assert not second.take()
     first.release()
@@ -25,26 +25,26 @@ def test_two_holders_in_one_process_exclude_each_other(make_bus: MakeBus) -> Non
 
 def test_neighbouring_bytes_are_locks_of_their_own(make_bus: MakeBus) -> None:
     segment = make_bus()
-    locks = [ByteLock(segment, ADDRESS + i) for i in range(3)]
+    locks = [ByteLock(segment.fd, ADDRESS + i) for i in range(3)]
     assert all(lock.take() for lock in locks)
 
 
 def test_a_closed_lock_is_free_and_leaves_no_file_open(make_bus: MakeBus) -> None:
     segment = make_bus()
     before = descriptors()
-    first = ByteLock(segment, ADDRESS)
+    first = ByteLock(segment.fd, ADDRESS)
     first.take()
     first.close()
     assert descriptors() == before
-    assert ByteLock(segment, ADDRESS).take()
+    assert ByteLock(segment.fd, ADDRESS).take()
 
 
 def test_a_lock_ends_with_its_process(make_bus: MakeBus) -> None:
     segment = make_bus()
-    mine = ByteLock(segment, ADDRESS)
+    mine = ByteLock(segment.fd, ADDRESS)
 
     def hold() -> None:
-        ByteLock(segment, ADDRESS).take()
+        ByteLock(segment.fd, ADDRESS).take()
         segment.words[ADDRESS] = 1
         time.sleep(60)
 

@@ -147,7 +147,7 @@ def test_a_rack_removed_and_launched_meanwhile_is_not_removed(spec: Layout, monk
 def test_a_removal_under_way_is_left_alone(spec: Layout) -> None:
     leave_dead(spec)
     found = Segment.open(spec.rack)
-    other = ByteLock(found, 8 * Head.MAGIC)
+    other = ByteLock(found.fd, 8 * Head.MAGIC)
     assert other.take()
     assert not remove_dead(spec.rack)
     assert found.has_its_name
