@@ -18,12 +18,13 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.lab.benches.observed import Runs, missed_share, record
-from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, Systems
+from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures
 from rack.tools.lab.benches.systems.hold import held, hold_for
 from rack.tools.lab.benches.systems.kills import kill_each, kills_s
 from rack.tools.lab.benches.systems.motion import LONGEST_S, PosesBench, poses_config
 from rack.tools.lab.benches.systems.prediction import prediction
 from rack.tools.lab.benches.systems.realtime import ages_ms, board_loads, bus_traffic, cycles_in, plan_latencies
+from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.live.launch import RunResult
 from rack.tools.recording.cycles import cycles_of
 from rack.tools.recording.recording import Recording

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from rack.levels.timing.trace_times import Distribution
-from rack.tools.lab.benches.comparison import Absent
-from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond
+from rack.tools.lab.benches.cyclictest import MissesBeyond
 from rack.tools.lab.benches.systems.hold import HoldResponse
 from rack.tools.lab.benches.systems.kills import KilledBoards
 from rack.tools.lab.benches.systems.motion import PosesRun
@@ -63,45 +60,3 @@ class SystemFigures:
     def worked(self) -> bool:
         """Whether all its runs worked."""
         return not self.failure
-
-
-@dataclass(frozen=True)
-class Systems:
-    """The figures of every rack; `seconds` is the length of a run, `absent` the peer that this machine lacks."""
-
-    figures: tuple[SystemFigures, ...]
-    seconds: float
-    absent: Absent | None
-
-    @property
-    def worked(self) -> bool:
-        """Whether all of them worked."""
-        return all(one.worked for one in self.figures)
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return {
-            "bench": "systems",
-            "seconds": self.seconds,
-            "systems": [_document(one) for one in self.figures],
-            "permitted_beyond": BEYOND,
-            "absent": [] if self.absent is None else [asdict(self.absent)],
-        }
-
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the tables for people, a theme each, fitted to `width`."""
-        from rack.tools.lab.benches.systems.tables import lines_of
-
-        yield from lines_of(self, width)
-
-    def plot(self, folder: Path) -> list[Path]:
-        """Write systems.png and systems.svg, a row a rack, into `folder`; return their paths."""
-        from rack.tools.lab.benches.systems.picture import plot
-
-        return plot(self.figures, folder)
-
-
-def _document(one: SystemFigures) -> dict[str, Any]:
-    found = asdict(one) | {"worked": one.worked}
-    found["realtime"] |= {name: getattr(one.realtime, name) for name in ("beyond", "held")}
-    return found

@@ -4,23 +4,64 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.console.tables import decimal, figure, table
-from rack.tools.lab.benches.comparison import shown
+from rack.tools.lab.benches.comparison import Absent, shown
+from rack.tools.lab.benches.cyclictest import BEYOND
+from rack.tools.lab.benches.systems.figures import SystemFigures
 from rack.tools.lab.benches.systems.kills import KillDetection, KilledBoards
 from rack.tools.lab.benches.systems.motion import Stop
-
-if TYPE_CHECKING:
-    from rack.tools.lab.benches.systems.figures import SystemFigures, Systems
 
 NARROW = ("processes", "hosts", "R_max", "sum, eq. 3.3", "status age", "command age")
 """Columns that a narrow terminal leaves out, in this order."""
 PAGE = 118
 """Characters in a line of text."""
 NO_ARM = "no PUMA"
+
+
+@dataclass(frozen=True)
+class Systems:
+    """The figures of every rack; `seconds` is the length of a run, `absent` the peer that this machine lacks."""
+
+    figures: tuple[SystemFigures, ...]
+    seconds: float
+    absent: Absent | None
+
+    @property
+    def worked(self) -> bool:
+        """Whether all of them worked."""
+        return all(one.worked for one in self.figures)
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {
+            "bench": "systems",
+            "seconds": self.seconds,
+            "systems": [_document(one) for one in self.figures],
+            "permitted_beyond": BEYOND,
+            "absent": [] if self.absent is None else [asdict(self.absent)],
+        }
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield the tables for people, a theme each, fitted to `width`."""
+        yield from lines_of(self, width)
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write systems.png and systems.svg, a row a rack, into `folder`; return their paths."""
+        from rack.tools.lab.benches.systems.picture import plot
+
+        return plot(self.figures, folder)
+
+
+def _document(one: SystemFigures) -> dict[str, Any]:
+    found = asdict(one) | {"worked": one.worked}
+    found["realtime"] |= {name: getattr(one.realtime, name) for name in ("beyond", "held")}
+    return found
 
 
 def lines_of(found: Systems, width: int | None) -> Iterator[str]:

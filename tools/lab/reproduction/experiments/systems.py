@@ -11,7 +11,7 @@ from rack.boards.config import load
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.observed import Runs
 from rack.tools.lab.benches.systems.bench import measure, systems
-from rack.tools.lab.benches.systems.figures import Systems
+from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
 
 SECONDS = 4.0

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rack.tools.lab.benches.comparison import Absent
-from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, Systems
+from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures
 from rack.tools.lab.benches.systems.hold import HoldResponse
 from rack.tools.lab.benches.systems.kills import KillDetection, KilledBoards
 from rack.tools.lab.benches.systems.motion import PosesRun, Stop
 from rack.tools.lab.benches.systems.prediction import SystemPrediction
 from rack.tools.lab.benches.systems.realtime import BusTraffic, PlanLatency
+from rack.tools.lab.benches.systems.tables import Systems
 
 PROMISED = SystemPrediction(("top", "low"), 2, 0, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True)
 TIMES = {"min": 20.0, "p50": 22.5, "p99": 22.5, "p99_9": 22.5, "max": 25.0}
