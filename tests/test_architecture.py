@@ -1,4 +1,4 @@
-"""The house: imports point downward only, folders form no circle, and files stay small."""
+"""The house: imports point downward only, folders and files form no circle, rooms are closed, and files stay small."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ast
 import sys
 import tomllib
 from collections import defaultdict
+from collections.abc import Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -15,6 +16,13 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("backplane", "levels", "boards", "tools")
 """From the ground up; each may import itself and those before it."""
+ROOMS = (
+    ("tools/lab", "", {"tools/commands/bench.py", "tools/commands/reproduce.py"}),
+    ("levels/systems", "levels", set()),
+)
+"""A room, the floor whose other files do not import it, and those that do."""
+PARTS = {Path("boards/config/rules"): Path("boards/config")}
+"""Folders that are parts of others: a config is resolved by rules, and these rest on its tables and wiring."""
 LONGEST_FILE = 400
 SOURCES = sorted(path for floor in FLOORS for path in (ROOT / floor).rglob("*.py"))
 
@@ -60,12 +68,43 @@ def test_folders_form_no_circle() -> None:
     needs: defaultdict[Path, set[Path]] = defaultdict(set)
     for path in SOURCES:
         if path.name != "__init__.py":
-            found = {file.parent for name in imported(path) if (file := file_of(name))}
-            needs[path.parent.relative_to(ROOT)] |= {folder.relative_to(ROOT) for folder in found - {path.parent}}
+            found = {folder_of(file) for name in imported(path) if (file := file_of(name))}
+            needs[folder_of(path)] |= found - {folder_of(path)}
+    refuse_circle(needs)
+
+
+def test_files_form_no_circle() -> None:
+    # Imports for types and inside functions count: a file that needs another to be understood needs it.
+    refuse_circle(
+        {
+            path.relative_to(ROOT): {file.relative_to(ROOT) for name in imported(path) if (file := file_of(name))}
+            for path in SOURCES
+        }
+    )
+
+
+def folder_of(file: Path) -> Path:
+    folder = file.parent.relative_to(ROOT)
+    return PARTS.get(folder, folder)
+
+
+def refuse_circle(needs: Mapping[Path, set[Path]]) -> None:
     try:
         TopologicalSorter(needs).prepare()
     except CycleError as error:
-        pytest.fail(" -> ".join(str(folder) for folder in reversed(error.args[1])))
+        pytest.fail(" -> ".join(str(place) for place in reversed(error.args[1])))
+
+
+@pytest.mark.parametrize(("room", "floor", "guests"), ROOMS)
+def test_a_room_is_entered_only_by_its_own_files_and_by_its_commands(room: str, floor: str, guests: set[str]) -> None:
+    module = f"rack.{room.replace('/', '.')}"
+    outside = {path for path in SOURCES if path.is_relative_to(ROOT / floor) and not path.is_relative_to(ROOT / room)}
+    entering = {
+        str(path.relative_to(ROOT))
+        for path in outside
+        if any(f"{name}.".startswith(f"{module}.") for name in imported(path))
+    }
+    assert entering == guests
 
 
 @pytest.mark.slow

@@ -1,48 +1,32 @@
-"""From a config to its layout: all mailboxes and tasks of a rack, as plain data for its segment."""
+"""From the wiring of a rack to its layout: all mailboxes and tasks, as plain data for its segment."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from rack.backplane.address_map import CLOCK, AddressMap
-from rack.backplane.errors import MailboxError
-from rack.backplane.layout import ExchangeSpec, FieldSpec, Layout, MailboxSpec, Protocol, TaskSpec, Wake, depth_for
+from rack.backplane.address_map import CLOCK
+from rack.backplane.layout import ExchangeSpec, FieldSpec, InterruptSpec, Layout, MailboxSpec, TaskSpec, depth_for
 from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
-from rack.boards.config.commands import commandable
-from rack.boards.config.interrupts import interrupt_mistakes, is_exempt, with_interrupts
-from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.ports import TaskPorts, all_ports, table_of
 from rack.boards.config.protocols import UNREAD
-from rack.boards.config.queues import queue_mistakes, queue_slots
-from rack.boards.config.rules.lan import entry_mistakes, is_taken
-from rack.boards.config.rules.protocols import asynchronous_mistakes, exchanges, strict_mistakes
-from rack.boards.config.rules.reads import Sides, key_of
-from rack.boards.config.schema import LAN, RackConfig, TaskPlace
-from rack.boards.errors import Mistake
-from rack.levels.level import Output
-from rack.levels.operator import OPERATOR_COMMAND
-from rack.levels.tables import GoalConfig
+from rack.boards.config.schema import RackConfig, TaskPlace
+from rack.boards.config.wiring import TaskPorts, Wiring
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""
-NOT_OPERATED = {
-    "lock": "the clock writes it and must not wait",
-    "queue": "it keeps every command already",
-    "interrupt": "the clock writes it, not a board",
-}
-"""Protocols that an operator's mailbox cannot have, and why."""
-MAX_SEGMENT_BYTES = 2**30
 KEPT_S = 2.0
 """Simulated time that mailboxes and trace rings retain for a recorder, which real-time boards may starve for 1 s."""
+SUSTAINED = 4
+"""Messages a cycle of the writer, on average, of which a recorder loses none however deep the queue is."""
+WORD_BYTES = 4
+"""Bytes of a word of `[protocol.interrupt]`: of the 68020's bus."""
+NS_PER_US, NS_PER_MS = 1e3, 1e6
 
 
 def obtained_core(core: int) -> int:
@@ -64,185 +48,125 @@ def shared_out(config: RackConfig) -> list[str]:
     ]
 
 
-class Wiring:
-    """The ports of all tasks, connected: the writer and the readers of each mailbox.
+def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
+    """Return how an executor reads the ports listed in its board's table, by port; times in ticks."""
+    board = ports.place.board
+    every, phase = wiring.every[board], wiring.config.board[board].phase
+    return {
+        port: ExchangeSpec(board, every * entry.every, phase + every * entry.phase, entry.asynchronous)
+        for port, entry in ports.exchange.items()
+    }
 
-    `writers` holds the writing task and its declaration by mailbox, `operated` the message types of operators'
-    mailboxes. `mistakes` holds every mistake in them. Nothing that depends on the tables in `broken`, which have
-    mistakes of their own, is checked.
-    """
 
-    def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
-        self.config = config
-        self.mistakes: list[Mistake] = [*strict_mistakes(config)]
-        self._ports = all_ports(config, self.mistakes)
-        self.tasks = [ports for ports in self._ports if ports.place.role != "host"]
-        self.hosts = [ports for ports in self._ports if ports.place.role == "host"]
-        self.sides = Sides(self._ports)
-        places = [*config.tasks(), *config.hosts()]
-        found = {ports.task for ports in self._ports if ports.is_whole}
-        # The mailboxes of such boards are unknown, so a reader that lacks one is not at fault.
-        self._unknown = {place.board for place in places if place.name not in found}
-        self._unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
-        self._unknown |= {LAN} if "adapter" in broken or is_taken(config) else set()
-        self.writers: dict[str, tuple[TaskPorts, Output]] = {}
-        for ports in self._ports:
-            self._add_writer(ports)
-        self.operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
-        self._check_operated()
-        for ports in self._ports:
-            self._check_reads(ports)
-        self._check_rest()
-        self.mistakes += entry_mistakes(self, has_clock="clock" not in broken)
-        crossing = list(self.sides.mistakes(self._unknown))
-        self.mistakes += crossing or queue_mistakes(self)
-        self.mistakes += [*asynchronous_mistakes(self), *interrupt_mistakes(self)]
-        self._check_params()
-        self.goals: list[GoalConfig] = []  # of the programs
-        if not broken & {"robot", "scene", "task"}:
-            self._check_programs()
+class LayoutMaker:
+    """Makes the layout of a wiring without mistakes; `sizes` are the symbolic ones of messages."""
 
-    def _add_writer(self, ports: TaskPorts) -> None:
-        for port, mailbox in ports.writes.items():
-            if mailbox in self.writers:
-                first = self.writers[mailbox][0].task
-                self.mistakes.append(Mistake(f"mailbox {mailbox}", ports.task, f"already written by {first}"))
-            else:
-                self.writers[mailbox] = ports, ports.outputs[port]
+    def __init__(self, wiring: Wiring, sizes: Mapping[str, int]) -> None:
+        self._wiring = wiring
+        self._config = wiring.config
+        self._sizes = sizes
+        self._kept = round(KEPT_S * 1e9 / wiring.config.clock_ns)
+        self._tasks = {ports.task: self._task(ports.place) for ports in wiring.tasks}
+        self._hosts = {ports.task: self._host(ports.place) for ports in wiring.hosts}
+        self._both = {**self._tasks, **self._hosts}
 
-    def _check_operated(self) -> None:
-        """Check that only the clock writes operators' mailboxes, never waits, and never finds one full."""
-        for mailbox in self.operated:
-            if mailbox in self.writers:
-                first = self.writers[mailbox][0].task
-                self.mistakes.append(
-                    Mistake(f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox")
-                )
-            given = self.config.protocol.mailbox.get(mailbox)
-            if why := NOT_OPERATED.get(given or ""):
-                why += "; permitted: time-slice, double-buffer"
-                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", given, why))
-
-    def _check_reads(self, ports: TaskPorts) -> None:
-        for port, mailbox in ports.sources:
-            place, wanted = f"{table_of(ports.place)}.{key_of(ports)}.{port}", ports.inputs[port].type
-            if not self.is_known(mailbox):
-                why = f"no task writes it; mailboxes: {self.names()}"
-                self.mistakes.append(Mistake(place, mailbox, why))
-            elif ports.is_whole and (found := self._kind(mailbox)) is not None and found != wanted:
-                why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
-                self.mistakes.append(Mistake(place, mailbox, why))
-
-    def _check_rest(self) -> None:
-        for mailbox in self.config.protocol.mailbox:
-            if not self.is_known(mailbox):
-                why = f"no such mailbox; mailboxes: {self.names()}"
-                self.mistakes.append(Mistake(f"protocol.mailbox.{mailbox}", None, why))
-        for name, board in self.config.board.items():
-            if board.ends_run and not self.is_known(f"{name}.status"):
-                self.mistakes.append(Mistake(f"board.{name}.ends_run", True, "its executor writes no status"))
-
-    def _check_params(self) -> None:
-        """Check each board's parameters against the declarations of its executor's and planner's classes."""
-        kinds = [(table_of(ports.place), ports.kind.params) for ports in self._ports if ports.kind.params is not None]
-        for table, kind in dict.fromkeys(kinds):
-            tables, _, board = table.partition(".")
-            params = getattr(self.config, tables)[board].params
-            try:
-                kind.model_validate(params)
-            except ValidationError as error:
-                self.mistakes += mistakes_of(error, kind, params, f"{table}.params")
-
-    def _check_programs(self) -> None:
-        """Check `[task]` against the programs declared by the levels' classes."""
-        for kind in dict.fromkeys(ports.kind.program for ports in self._ports if ports.kind.program is not None):
-            try:
-                program = kind.model_validate(self.config.task)
-            except ValidationError as error:
-                self.mistakes += mistakes_of(error, kind, self.config.task, "task")
-            else:
-                misfits = program.misfits(self.config.robot, self.config.scene)
-                self.mistakes += [Mistake(f"task.{key}", value, why) for key, value, why in misfits]
-                self.goals += program.goals()
-
-    @property
-    def has_unknown(self) -> bool:
-        """Whether the ports of some boards are not known, since these have mistakes of their own."""
-        return bool(self._unknown)
-
-    def is_known(self, mailbox: str) -> bool:
-        """Say whether a mailbox exists, or may: its board has mistakes of its own."""
-        return mailbox in self.writers or mailbox in self.operated or mailbox.partition(".")[0] in self._unknown
-
-    def _kind(self, mailbox: str) -> MessageType | None:
-        return self.writers[mailbox][1].type if mailbox in self.writers else self.operated.get(mailbox)
-
-    def names(self) -> str:
-        """Return the names of all mailboxes, as a list to read."""
-        return ", ".join([*self.writers, *self.operated])
-
-    def check_sizes(self, sizes: Mapping[str, int]) -> list[Mistake]:
-        """Return a mistake for every message that needs a size unknown to the rack."""
-        found = []
-        for mailbox, (ports, output) in self.writers.items():
-            try:
-                output.type.dtype(sizes)
-            except MailboxError as error:
-                found.append(Mistake(f"mailbox {mailbox}", ports.task, str(error)))
-        return found
-
-    def layout(self, sizes: Mapping[str, int]) -> Layout:
-        """Return the layout of a config without mistakes."""
-        tasks = tuple(self._task(ports) for ports in self.tasks)
-        hosts = tuple(self._host(ports.place) for ports in self.hosts)
-        by_name = {task.name: task for task in tasks + hosts}
-        mailboxes: list[MailboxSpec] = []
-        for name, (ports, output) in self.writers.items():
-            if name in self.sides.from_host:
-                mailboxes.append(self._ring(name, ports.task, output.type, sizes))
-                continue
-            writer = by_name[ports.task]
-            every = writer.every * output.cycles
-            delay = writer.every * writer.within_cycles
-            # A reader may read as late as the end of its slice a message that was visible at its start.
-            readers = [by_name[reader] for reader in self.readers(name)]
-            slowest = max((reader.every * reader.within_cycles for reader in readers), default=0)
-            depth = depth_for(max(slowest + delay, self._kept_ticks), every)
-            rests_on = tuple(box for box in ports.rests_on(name.partition(".")[2]) if self.protocol(box) != "queue")
-            spec = partial(MailboxSpec, writer=writer.name, every=every, delay=delay, depth=depth, rests_on=rests_on)
-            max_age = round(output.max_age_s * 1e9 / self.config.clock_ns)
-            box = self._mailbox(name, output.type, sizes, partial(spec, phase=writer.phase, max_age=max_age))
-            if box.protocol == "interrupt":
-                box = with_interrupts(self.config, box, by_name, self._kept_ticks)
-            mailboxes += self._queue(box, readers[0], writer) if box.protocol == "queue" else [box]
+    def layout(self) -> Layout:
+        """Return the layout."""
+        wiring = self._wiring
+        mailboxes = [box for name in wiring.writers for box in self._written(name)]
         # The clock passes an operator's commands on.
-        operators = partial(MailboxSpec, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
-        mailboxes += [self._mailbox(name, kind, sizes, operators) for name, kind in self.operated.items()]
-        return Layout(self.config.name, self.config.clock_ns, tasks, tuple(mailboxes), hosts)
+        for name, kind in wiring.operated.items():
+            mailboxes.append(self._mailbox(name, kind, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH))
+        tasks = tuple(self._tasks.values())
+        hosts = tuple(self._hosts.values())
+        return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
 
-    def _ring(self, name: str, host: str, kind: MessageType, sizes: Mapping[str, int]) -> MailboxSpec:
-        """Return the mailbox of a host board: a queue that is not by ticks."""
-        capacity = self.config.protocol.depth.get(name, UNREAD)
-        depth = depth_for(capacity + SPARE, 1)
-        return self._mailbox(
-            name, kind, sizes, partial(MailboxSpec, writer=host, every=1, delay=0, capacity=capacity, depth=depth)
+    def _written(self, name: str) -> Iterator[MailboxSpec]:
+        """Yield a mailbox that a task or host board writes; with a queue the one of its reader's position."""
+        ports, output = self._wiring.writers[name]
+        if name in self._wiring.from_host:
+            # The ring of a host board: a queue that is not by ticks.
+            capacity = self._capacity(name)
+            depth = depth_for(capacity + SPARE, 1)
+            yield self._mailbox(name, output.type, writer=ports.task, every=1, delay=0, capacity=capacity, depth=depth)
+            return
+        writer = self._tasks[ports.task]
+        every = writer.every * output.cycles
+        delay = _slice(writer)
+        # A reader may read as late as the end of its slice a message that was visible at its start.
+        readers = [self._both[reader] for reader in self._wiring.readers(name)]
+        slowest = max(map(_slice, readers), default=0)
+        box = self._mailbox(
+            name,
+            output.type,
+            writer=writer.name,
+            every=every,
+            delay=delay,
+            depth=depth_for(max(slowest + delay, self._kept), every),
+            rests_on=tuple(
+                box for box in ports.rests_on(name.partition(".")[2]) if self._wiring.protocol(box) != "queue"
+            ),
+            phase=writer.phase,
+            max_age=round(output.max_age_s * 1e9 / self._config.clock_ns),
         )
+        if box.protocol == "interrupt":
+            yield self._with_interrupts(box, writer, readers)
+        elif box.protocol == "queue":
+            yield from self._queue(box, readers[0], writer)
+        else:
+            yield box
 
     def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for the writer."""
-        delay, slowest = reader.every * reader.within_cycles, writer.every * writer.within_cycles
+        delay = _slice(reader)
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        capacity = self.config.protocol.depth.get(box.name, UNREAD)
-        slots = queue_slots(capacity, box.every, box.delay + delay, self._kept_ticks)
+        capacity = self._capacity(box.name)
+        # From its release until it can know what the reader has taken, the writer can send no more than the capacity.
+        most = capacity * (1 + self._kept // (box.delay + delay))
+        # A deep queue keeps fewer.
+        slots = depth_for(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
         yield replace(box, capacity=capacity, depth=slots)
-        depth = depth_for(max(slowest + delay, self._kept_ticks), read.every)
+        depth = depth_for(max(_slice(writer) + delay, self._kept), read.every)
         visible = (read.phase + delay) % read.every
-        spec = partial(MailboxSpec, writer=reader.name, every=read.every, delay=delay, depth=depth, phase=visible)
-        position = self._mailbox(taken_name(box.name), TAKEN, {}, spec)
+        place = {"writer": reader.name, "every": read.every, "delay": delay, "depth": depth, "phase": visible}
+        position = self._mailbox(taken_name(box.name), TAKEN, **place)
         yield replace(position, readers=(writer.name,), protocol="time-slice")
 
-    def _task(self, ports: TaskPorts) -> TaskSpec:
-        place, every = ports.place, self.config.every(ports.place.board)
+    def _capacity(self, queue: str) -> int:
+        return self._config.protocol.depth.get(queue, UNREAD)
+
+    def _with_interrupts(self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]) -> MailboxSpec:
+        """Return a mailbox of protocol interrupt with what its messages cost, and when they are sent and visible.
+
+        Between tasks of one slot, and into the network adapter, which reads shared memory, nothing is interrupted.
+        """
+        clock_ns, table = self._config.clock_ns, self._config.protocol.interrupt
+        spared = {task.slot for task in readers if task.role == "host" or self._wiring.is_of_network(task.board)}
+        words = -(-box.size // WORD_BYTES)
+        service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
+        sent_ns = self._sent_ns(writer)
+        slots = tuple(sorted({task.slot for task in readers} - spared - {writer.slot}))
+        delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
+        interrupt = InterruptSpec(sent_ns, service_ns, table.depth, -(-sent_ns // clock_ns), box.delay, slots)
+        # As late as it is served, a message is still in its slot.
+        waits = -(-(table.depth + 1) * service_ns // clock_ns)
+        slowest = max(map(_slice, readers), default=0)
+        depth = depth_for(max(slowest + delay + waits, self._kept), box.every)
+        return replace(box, delay=delay, depth=depth, interrupt=interrupt)
+
+    def _sent_ns(self, writer: TaskSpec) -> int:
+        """Return the time from a release until its messages are sent: its budget, or a tick; a plan's: its slice."""
+        longest_ns = _slice(writer) * self._config.clock_ns
+        if writer.role == "planner":
+            return longest_ns
+        budget = self._config.board[writer.board].budget
+        parts = () if budget is None else (budget.exchange_ms, budget.read_ms, budget.process_ms, budget.write_ms)
+        return min(round(sum(parts) * NS_PER_MS) or self._config.clock_ns, longest_ns)
+
+    def _task(self, place: TaskPlace) -> TaskSpec:
+        board, every = self._config.board[place.board], self._wiring.every[place.board]
+        wake = board.wake or self._config.clock.wake
+        is_planner = place.role == "planner"
         return TaskSpec(
             name=place.name,
             board=place.board,
@@ -251,79 +175,49 @@ class Wiring:
             core=obtained_core(place.core),
             priority=place.priority,
             every=every,
-            within_cycles=self.config.board[place.board].within_cycles if place.role == "planner" else 1,
-            depth=depth_for(self._kept_ticks, every),
-            wake=self._wake(place),
-            phase=self.config.board[place.board].phase,
+            within_cycles=board.within_cycles if is_planner else 1,
+            depth=depth_for(self._kept, every),
+            # The planner of a polling executor must not poll too.
+            wake="timer" if wake == "poll" and is_planner else wake,
+            phase=board.phase,
         )
 
     def _host(self, place: TaskPlace) -> TaskSpec:
         """Return the record of a host board: it has no rate, and leaves no trace."""
-        is_external = self.config.host[place.board].external
+        is_external = self._config.host[place.board].external
         return TaskSpec(
             place.name, place.board, place.role, place.slot, place.core, 0, 1, 1, 0, is_external=is_external
         )
 
-    def _wake(self, place: TaskPlace) -> Wake:
-        """Return how a task waits for its next cycle. The planner of a polling executor must not poll too."""
-        wake = self.config.board[place.board].wake or self.config.clock.wake
-        return "timer" if wake == "poll" and place.role == "planner" else wake
-
-    @property
-    def _kept_ticks(self) -> int:
-        return round(KEPT_S * 1e9 / self.config.clock_ns)
-
-    def _mailbox(
-        self, name: str, kind: MessageType, sizes: Mapping[str, int], spec: Callable[..., MailboxSpec]
-    ) -> MailboxSpec:
-        """Complete the record of a mailbox by its message, readers and protocol."""
-        return spec(
+    def _mailbox(self, name: str, kind: MessageType, **times: Any) -> MailboxSpec:
+        """Return the record of a mailbox: its message, readers and protocol, and the other fields as given."""
+        reading = self._wiring.reading.get(name, ())
+        dtype = kind.dtype(self._sizes)
+        return MailboxSpec(
             name=name,
-            readers=self.readers(name),
-            exchanges=tuple(self._exchanges(name)),
-            protocol=self.protocol(name),
+            readers=self._wiring.readers(name),
+            exchanges=tuple(exchanges(self._wiring, p)[port] for p, port in reading if port in p.exchange),
+            protocol=self._wiring.protocol(name),
             message=kind.name,
             version=kind.version,
-            size=kind.dtype(sizes).itemsize,
-            fields=field_specs(kind, sizes),
+            size=dtype.itemsize,
+            fields=_specs(kind, dtype),
+            **times,
         )
 
-    def readers(self, mailbox: str) -> tuple[str, ...]:
-        """Return the tasks and host boards that read a mailbox."""
-        return tuple(ports.task for ports in self._ports if any(mailbox == box for _, box in ports.sources))
 
-    def _exchanges(self, mailbox: str) -> Iterator[ExchangeSpec]:
-        for ports in self.tasks:
-            found = exchanges(self.config, ports.place.board) if ports.place.role == "executor" else {}
-            yield from (found[port] for port, box in ports.sources if box == mailbox and port in found)
-
-    def protocol(self, mailbox: str) -> Protocol:
-        """Return the protocol of a mailbox."""
-        if mailbox in self.sides.to_host:
-            # Host boards read the newest message at once, whatever the protocol.
-            return "time-slice"
-        if mailbox in self.sides.from_host or (mailbox in self.writers and self.writers[mailbox][1].queued):
-            return "queue"
-        protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
-        if protocol == "interrupt" and is_exempt(self, mailbox):
-            return "time-slice"
-        # A lock would make the clock wait for readers.
-        return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
-
-
-def too_large(layout: Layout) -> Iterable[Mistake]:
-    """Yield a mistake that names the largest mailbox if the segment is too large."""
-    size = AddressMap(layout).size
-    if size > MAX_SEGMENT_BYTES:
-        box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
-        why = f"{box.depth} messages are kept for its slowest reader, so the segment needs {size} bytes"
-        advice = f"permitted: {MAX_SEGMENT_BYTES}; shorten cycles or within_cycles"
-        yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
+def _slice(task: TaskSpec) -> int:
+    """Return the time that a task has for one cycle, or one plan, ticks."""
+    return task.every * task.within_cycles
 
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
     """Return the fields of a message type with offsets, shapes and numpy types, for tools that attach by name."""
-    offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
+    return _specs(kind, kind.dtype(sizes))
+
+
+def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
+    offsets: Mapping[str, Any] = of.fields or {}
     specs = []
     for field in kind.fields:
         dtype, offset = offsets[field.name][:2]
@@ -337,7 +231,7 @@ def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec,
                 offset=offset,
                 unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
                 meaning=field.meaning,
-                fields=field_specs(field.kind, sizes) if isinstance(field.kind, MessageType) else (),
+                fields=_specs(field.kind, scalar) if isinstance(field.kind, MessageType) else (),
                 values=() if isinstance(field.unit, str) else tuple((n.name.lower(), int(n)) for n in field.unit),
                 length=field.length,
             )

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from rack.boards.config.files import EXTENDS
-from rack.boards.config.ports import all_ports, table_of
+from rack.boards.config.rules.mailboxes import exchange, ports
 from rack.boards.config.schema import LAN, RackConfig
-from rack.boards.errors import ConfigError, Mistake, shown
+from rack.boards.config.wiring import Wiring
+from rack.boards.errors import ConfigError, shown
 from rack.boards.faults.kind import KINDS
 
 UNIT = re.compile(
@@ -68,20 +69,18 @@ class Place(NamedTuple):
 
 def key_tables(config: RackConfig) -> list[KeyTable]:
     """Return every table that a config of these boards may contain. Raises `ConfigError` for a missing class."""
-    mistakes: list[Mistake] = []
-    ports = all_ports(config, mistakes)
-    if mistakes:
+    wiring = Wiring(config)
+    if mistakes := [*ports(wiring), *exchange(wiring)]:
         raise ConfigError(mistakes)
     whole, *found = _tables(RackConfig, WHOLE, Place(""))
     extends = Key("extends", "list of strings", "", "", "", EXTENDS)
     found = [replace(whole, keys=(extends, *whole.keys)), *found, *_fault_kinds()]
-    for program in dict.fromkeys(p.kind.program for p in ports if p.kind.program is not None):
+    for program in wiring.programs:
         found += _tables(program, "task", Place("task"))
-    # Of the network adapter's board the table is `[adapter.lan]`.
-    own = [p for p in ports if config.adapter.lan is None or p.place.board != LAN]
-    for board, params in dict.fromkeys((table_of(p.place), p.kind.params) for p in own if p.kind.params is not None):
-        name = f"{board}.params"
-        found += _tables(params, name, Place(name))
+    for board, params in wiring.params:
+        # Of the network adapter's board the table is `[adapter.lan]`.
+        if config.adapter.lan is None or board != f"board.{LAN}":
+            found += _tables(params, f"{board}.params", Place(f"{board}.params"))
     return found
 
 

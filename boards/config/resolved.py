@@ -22,23 +22,25 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes
-from rack.boards.config.commands import command_mistakes, requests
-from rack.boards.config.faults import fault_mistakes, injections, places
+from rack.boards.config.commands import requests
+from rack.boards.config.faults import injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
-from rack.boards.config.layout import KEPT_S, Wiring, obtained_core, shared_out, too_large
-from rack.boards.config.mistakes import disagreements, mistakes_of
-from rack.boards.config.ports import TaskPorts, reference
-from rack.boards.config.rules.lan import at_adapter
-from rack.boards.config.rules.network import credential_mistakes, network_notes
-from rack.boards.config.rules.protocols import exchanges
+from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
+from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.rules import broken_rules
+from rack.boards.config.rules.commands import command_mistakes
+from rack.boards.config.rules.faults import fault_mistakes
+from rack.boards.config.rules.lan import at_adapter, credential_mistakes, network_notes
+from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import Tables, parse
+from rack.boards.config.wiring import TaskPorts, Wiring, reference
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import BusTimes, ClockWiring, Entries, HostWiring, TaskWiring, mailboxes_of
-from rack.levels.level import Executor, LevelContext, Pace
+from rack.levels.level import LevelContext, Pace
 from rack.levels.tables import GoalConfig, RobotConfig, Table
 
 LINGER_S = 0.5
@@ -220,32 +222,21 @@ class _Examined:
         broken: frozenset[str] = frozenset(),
     ) -> None:
         self._config = config
-        self.mistakes = disagreements(config, broken)
-        tables = {mistake.place.partition(".")[0] for mistake in self.mistakes} | broken
         self._wiring = Wiring(config, broken)
-        self.mistakes += self._wiring.mistakes
-        self._sizes = cell_sizes(config, self.mistakes, is_whole=not tables & {"robot", "scene"})
         self._layout: Layout | None = None
-        if not self.mistakes and not broken:
-            self.mistakes += self._wiring.check_sizes(self._sizes)
-        if not self.mistakes and not broken:
-            self._layout = self._wiring.layout(self._sizes)
-            self.mistakes += [*too_large(self._layout), *self._misfits()]
-        boards = frozenset(place.removeprefix("board.") for place in broken if place.startswith("board."))
-        self.mistakes += fault_mistakes(faults, config, None if self.mistakes else self._layout, boards)
-        self.mistakes += command_mistakes(commands, config, boards)
+        self.mistakes = broken_rules(self._wiring)
+        is_whole = not self.mistakes and not broken
+        self._sizes = cell_sizes(config) if is_whole else {}
+        if is_whole:
+            self.mistakes += sizes(self._wiring, self._sizes)
+        if is_whole and not self.mistakes:
+            layout = LayoutMaker(self._wiring, self._sizes).layout()
+            self._contexts = self._contexts_of_boards()
+            self.mistakes += [*memory(layout), *neighbours(self._wiring, self._contexts)]
+            self._layout = None if self.mistakes else layout
+        self.mistakes += fault_mistakes(faults, config, self._layout, self._wiring.broken_boards)
+        self.mistakes += command_mistakes(commands, config, self._wiring.broken_boards)
         self.mistakes = [at_adapter(mistake, config) for mistake in self.mistakes]
-
-    def _misfits(self) -> Iterator[Mistake]:
-        """Yield what levels find wrong with their neighbours."""
-        contexts = {name: self._context(name) for name in self._config.board}
-        for ports in self._wiring.tasks:
-            if issubclass(ports.kind, Executor):
-                name = ports.place.board
-                near = self._config.board[name]
-                above, below = ([contexts[other] for other in others] for others in (near.above, near.below))
-                for key, value, why in ports.kind.misfits(contexts[name], above, below):
-                    yield Mistake(f"board.{name}.{key}", value, why)
 
     def resolved(self) -> Resolved:
         """Return everything derived from a config without mistakes."""
@@ -257,8 +248,10 @@ class _Examined:
         hosts = tuple(self._host(ports) for ports in self._wiring.hosts)
         # A goal that the config states replaces that of the program.
         rows = config.scene.objects.index
-        goals = {rows(goal.object): goal for goal in (*self._wiring.goals, *config.scene.goal)}
-        return Resolved(config, layout, tasks, hosts, faults, requests(config, layout), goals)
+        programs = [program.model_validate(config.task) for program in self._wiring.programs]
+        goals = [goal for program in programs for goal in program.goals()]
+        at = {rows(goal.object): goal for goal in (*goals, *config.scene.goal)}
+        return Resolved(config, layout, tasks, hosts, faults, requests(config, layout), at)
 
     def _host(self, ports: TaskPorts) -> HostWiring:
         config, name = self._config, ports.place.board
@@ -267,7 +260,7 @@ class _Examined:
             target=reference(config, ports.place),
             inputs=dict(ports.sources),
             outputs=dict(ports.writes),
-            context=self._context_of(name, 1, config.host[name].params),
+            context=self._context(name, config.host[name].params, every=1, within_cycles=1),
             is_external=config.host[name].external,
             computing=round(config.host[name].computing_ms * 1e6 / config.clock_ns),
         )
@@ -276,7 +269,7 @@ class _Examined:
         board, spec = self._config.board[ports.place.board], layout.task(ports.task)
         is_executor = spec.role == "executor"
         # What is on the host side, a bus adapter exchanges by itself.
-        of_host, from_host = self._wiring.sides.of_host, self._wiring.sides.from_host
+        of_host, from_host = self._wiring.of_host, self._wiring.from_host
         critical = not is_executor and is_critical(self._config, layout, spec.board)
         return TaskWiring(
             task=ports.task,
@@ -285,33 +278,35 @@ class _Examined:
                 port: source for port, source in ports.reads.items() if not from_host.intersection(mailboxes_of(source))
             },
             outputs={port: box for port, box in ports.writes.items() if box not in of_host},
-            context=self._context(spec.board),
+            context=self._contexts[spec.board],
             critical_priority=board.priority if critical else 0,
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
-            guards_clock=is_executor and spec.every == min(task.every for task in layout.tasks),
+            guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
-            exchange=exchanges(self._config, spec.board) if is_executor else {},
+            exchange=exchanges(self._wiring, ports),
             transfer=BusTimes(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
         )
 
-    def _context(self, name: str) -> LevelContext:
-        config, board = self._config, self._config.board[name]
-        paces = {name: Pace(config.every(name), other.within_cycles) for name, other in config.board.items()}
-        return replace(
-            self._context_of(name, config.every(name), board.params),
-            phase=board.phase,
-            within_cycles=board.within_cycles,
-            above={other: paces[other] for other in board.above},
-            below={other: paces[other] for other in board.below},
-        )
+    def _contexts_of_boards(self) -> dict[str, LevelContext]:
+        every, boards = self._wiring.every, self._config.board
+        paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
+        return {
+            name: self._context(
+                name,
+                board.params,
+                every=every[name],
+                phase=board.phase,
+                within_cycles=board.within_cycles,
+                above={other: paces[other] for other in board.above},
+                below={other: paces[other] for other in board.below},
+            )
+            for name, board in boards.items()
+        }
 
-    def _context_of(self, name: str, every: int, params: Mapping[str, Any]) -> LevelContext:
-        """Return the context of a board without neighbours."""
+    def _context(self, name: str, params: Mapping[str, Any], **times: Any) -> LevelContext:
         config = self._config
         return LevelContext(
             board=name,
-            every=every,
-            within_cycles=1,
             clock_ns=config.clock_ns,
             seed=config.seed,
             # In a rack without an arm no level uses it.
@@ -321,6 +316,7 @@ class _Examined:
             sizes=self._sizes,
             params=params,
             rack=config.name,
+            **times,
         )
 
 

@@ -9,15 +9,16 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
-from rack.boards.config.mistakes import PLANNER_BUDGET
-from rack.boards.config.rules.schedule import frames
-from rack.boards.config.schema import BoardConfig, BudgetConfig, RackConfig
+from rack.boards.config.schema import BoardConfig, BudgetConfig, CommandConfig, RackConfig, ScheduleConfig
+from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.interrupts import InboxTiming
-from rack.levels.timing.rack import BoardTiming, RackTiming
+from rack.levels.timing.rack import BoardTiming, CyclicSchedule, RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
 PARTS = tuple(field.name for field in fields(Budget))
+PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
+"""Keys of a budget that only a board with a planner has."""
 
 
 def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None) -> RackTiming:
@@ -37,6 +38,11 @@ def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] 
         inboxes=inboxes(layout),
         schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
     )
+
+
+def frames(table: ScheduleConfig, clock_ns: int) -> CyclicSchedule:
+    """Return the frames, rounded to ticks."""
+    return CyclicSchedule(*(round(ms * 1e6 / clock_ns) for ms in (table.minor_ms, table.major_ms)))
 
 
 def inboxes(layout: Layout) -> dict[str, InboxTiming]:
@@ -101,6 +107,13 @@ def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
 def tick_ns(config: RackConfig) -> int:
     """Return one tick of the wall clock, ns."""
     return round(config.clock_ns / config.clock.speed)
+
+
+def first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
+    """Return the tick from which a command or a fault is due; -1: at once."""
+    if entry.at is not None:
+        return round(entry.at * 1e9 / clock_ns)
+    return -1 if entry.tick is None else entry.tick
 
 
 def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:

@@ -12,7 +12,7 @@ from rack.backplane.mailbox.slots import message_dtype
 from rack.boards.config import load, resolve, shared_out, wire
 from rack.boards.config import resolved as resolved
 from rack.boards.config.layout import field_specs, obtained_core
-from rack.boards.config.mistakes import disagreements
+from rack.boards.config.rules import broken_rules
 from rack.levels.level import Pace
 from rack.levels.messages import TASK_COMMAND, TASK_PLAN
 
@@ -102,7 +102,7 @@ def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
 
 def test_a_launch_resolves_and_checks_everything_once(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checked = []
-    monkeypatch.setattr(resolved, "disagreements", lambda *of: checked.append(of) or disagreements(*of))
+    monkeypatch.setattr(resolved, "broken_rules", lambda *of: checked.append(of) or broken_rules(*of))
     settings = ["fault=[{ kind = 'self-test', board = 'upper' }]", "board.lower.transfer.read_ms=0.5"]
     found = resolve(load(small, settings))
     assert len(checked) == 1

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.boards.config.mistakes import disagreements
+from rack.boards.config.rules.boards import schedule
+from rack.boards.config.wiring import Wiring
 from rack.boards.errors import ConfigError
 
 FIT = "does not fit the schedule, a multiple of the minor frame, 4 ms, that divides the major one,"
@@ -42,7 +43,7 @@ def test_a_rate_is_refused_with_the_nearest_rates() -> None:
     config = load(
         "nasrem", ["schedule={ minor_ms = 2.5, major_ms = 1000 }", "board.primitive.rate_hz=57.142857142857146"]
     )
-    (found,) = disagreements(config)
+    (found,) = schedule(Wiring(config))
     assert found.place == "board.primitive.rate_hz"
     assert found.why.startswith("a cycle of 17.5 ms does not fit the schedule")
     assert found.why.endswith("nearest: 12.5 ms, 80 Hz or 20 ms, 50 Hz")

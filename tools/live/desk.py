@@ -18,7 +18,8 @@ from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestSt
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
-from rack.boards.config.commands import asked, commandable, request, takes
+from rack.boards.config.commands import asked, request, takes
+from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
 from rack.levels.operator import Answer, Operation

@@ -1,1 +1,63 @@
-"""The rules of a config, a file a subject."""
+"""The rules that the tables of a config keep between them, a file a subject: functions from the wiring to mistakes.
+
+All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes are already reported.
+Faults and commands, which may come live too, have rules of their own in `faults` and `commands`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+from rack.boards.config.rules import boards, lan, levels, mailboxes
+from rack.boards.config.wiring import Wiring
+from rack.boards.errors import Mistake
+
+Rule = Callable[[Wiring], Iterator[Mistake]]
+RULES: tuple[Rule, ...] = (
+    boards.boards,
+    boards.hosts,
+    boards.circles,
+    boards.slots,
+    boards.ends,
+    lan.lan,
+    lan.network,
+    levels.scene,
+    levels.robot,
+    boards.clock,
+    boards.rates,
+    boards.polling,
+    boards.schedule,
+    mailboxes.strict,
+    mailboxes.ports,
+    mailboxes.exchange,
+    mailboxes.writers,
+    mailboxes.operated,
+    mailboxes.reads,
+    mailboxes.mailboxes,
+    mailboxes.statuses,
+    lan.entries,
+    mailboxes.sides,
+    mailboxes.queues,
+    mailboxes.asynchronous,
+    mailboxes.interrupts,
+    levels.params,
+    levels.programs,
+    levels.cell,
+)
+"""Every rule, in the order in which mistakes are listed."""
+NEEDS: Mapping[Rule, set[str]] = {
+    levels.scene: {"scene"},
+    levels.robot: {"robot"},
+    boards.clock: {"clock"},
+    boards.rates: {"clock"},
+    boards.polling: {"clock"},
+    boards.schedule: {"clock"},
+    levels.programs: {"robot", "scene", "task"},
+}
+"""The tables without which a rule says nothing."""
+
+
+def broken_rules(wiring: Wiring) -> list[Mistake]:
+    """Return every mistake in a wiring."""
+    kept = (rule for rule in RULES if not wiring.broken & NEEDS.get(rule, set()))
+    return [mistake for rule in kept for mistake in rule(wiring)]

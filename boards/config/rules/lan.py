@@ -1,4 +1,4 @@
-"""Mistakes in `[adapter.lan]` that concern what is exchanged, and the places of all mistakes of its board.
+"""`[adapter.lan]`: what is exchanged with other racks, and how safely; where mistakes of its board are shown.
 
 The table makes a board, `lan`, which is checked like any other. A user knows it as `adapter.lan`.
 """
@@ -6,24 +6,24 @@ The table makes a board, `lan`, which is checked like any other. A user knows it
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.errors import ClockError
 from rack.boards.config.files import LAN_ADAPTER
-from rack.boards.config.schema import LAN, RackConfig
+from rack.boards.config.mistakes import repeats
+from rack.boards.config.schema import LAN, LanConfig, RackConfig
+from rack.boards.config.wiring import Wiring, is_taken
 from rack.boards.errors import Mistake
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
+from rack.boards.lan.credentials import Credentials
+from rack.boards.lan.endpoint import Endpoint
 from rack.levels.peer import peer_port
-
-if TYPE_CHECKING:
-    from rack.boards.config.layout import Wiring
-    from rack.boards.config.schema import LanConfig
 
 PLACE = "adapter.lan"
 ITSELF = f"board.{LAN}"
@@ -33,9 +33,9 @@ _OWN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
 _MAILBOX = f"mailbox {LAN}."
 
 
-def lan_mistakes(config: RackConfig) -> Iterator[Mistake]:
-    """Yield the mistakes that show without the ports of the boards."""
-    table = config.adapter.lan
+def lan(wiring: Wiring) -> Iterator[Mistake]:
+    """Check what shows without the ports of the boards."""
+    config, table = wiring.config, wiring.config.adapter.lan
     for name, board in config.board.items():
         if board.executor == LAN_ADAPTER and (table is None or name != LAN):
             yield Mistake(f"board.{name}.executor", board.executor, f"permitted: [{PLACE}], which makes its board")
@@ -55,12 +55,6 @@ def lan_mistakes(config: RackConfig) -> Iterator[Mistake]:
             yield Mistake(PLACE, None, f'{why}; permitted: clock.mode = "lockstep"')
 
 
-def is_taken(config: RackConfig) -> bool:
-    """Say whether another board has the name of the adapter's."""
-    # If the others are broken, its own is not there either.
-    return config.adapter.lan is not None and LAN in config.board and config.board[LAN] != config.adapter.lan.board()
-
-
 def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
     """Check names of racks and ports: none twice, none of this rack, none that the adapter itself needs."""
     taken = {STATUS: "its status", **{peer_port(other): f"what it knows of rack '{other}'" for other in table.racks}}
@@ -71,17 +65,15 @@ def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
         if entry.rack == rack:
             yield Mistake(f"{place}.from", entry.source, "a mailbox of this rack itself: levels here read it directly")
     for key, entries in (("export", table.exports), ("import", table.imports)):
-        for source, count in Counter(entry.source for entry in entries.values()).items():
-            if count > 1:
-                ports = ", ".join(port for port, entry in entries.items() if entry.source == source)
-                yield Mistake(f"{PLACE}.{key}", source, f"listed {count} times: {ports}; any number of levels may read")
+        for source, count in repeats(entry.source for entry in entries.values()):
+            ports = ", ".join(port for port, entry in entries.items() if entry.source == source)
+            yield Mistake(f"{PLACE}.{key}", source, f"listed {count} times: {ports}; any number of levels may read")
     if rack in table.peers:
         yield Mistake(f"{PLACE}.peers", rack, "the name of this rack itself")
-    for port, count in Counter(map(peer_port, table.racks)).items():
-        if count > 1:
-            alike = [other for other in table.racks if peer_port(other) == port]
-            why = f"these names differ in '-' and '_' alone, so their mailboxes {LAN}.{port} are one; rename a rack"
-            yield Mistake(f"{PLACE}.peers", alike, why)
+    for port, _ in repeats(map(peer_port, table.racks)):
+        alike = [other for other in table.racks if peer_port(other) == port]
+        why = f"these names differ in '-' and '_' alone, so their mailboxes {LAN}.{port} are one; rename a rack"
+        yield Mistake(f"{PLACE}.peers", alike, why)
 
 
 def _rate(place: str, entry: ExportConfig | ImportConfig, table: LanConfig) -> Iterator[Mistake]:
@@ -107,32 +99,33 @@ def _priority(config: RackConfig, table: LanConfig) -> Iterator[Mistake]:
         yield Mistake(f"{PLACE}.priority", table.priority, f"{why}: else they keep it from its signs of life")
 
 
-def entry_mistakes(wiring: Wiring, has_clock: bool) -> Iterator[Mistake]:
-    """Yield the mistakes in what the entries name: mailboxes of this rack, and message types."""
-    config = wiring.config
-    table = config.adapter.lan
-    for port, export in table.exports.items() if table is not None else ():
-        for why in _export(wiring, export.source, has_clock):
+def entries(wiring: Wiring) -> Iterator[Mistake]:
+    """Check what the entries name: mailboxes of this rack, and message types."""
+    table = wiring.config.adapter.lan
+    if table is None:
+        return
+    for port, export in table.exports.items():
+        for why in _export(wiring, export.source):
             yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
-    for port, entry in table.imports.items() if table is not None else ():
+    for port, entry in table.imports.items():
         try:
             entry.message_type()
         except LookupError as error:
             yield Mistake(f"{PLACE}.import.{port}.type", entry.type, str(error))
 
 
-def _export(wiring: Wiring, source: str, has_clock: bool) -> Iterator[str]:
+def _export(wiring: Wiring, source: str) -> Iterator[str]:
     """Yield why a mailbox cannot be exported. A queue is found with the other queues."""
-    config, board = wiring.config, source.partition(".")[0]
+    board = source.partition(".")[0]
     if board == LAN:
         yield "written by the adapter itself; permitted: mailboxes that levels write"
     elif source in wiring.operated:
         yield "what an operator commands stays in its rack; permitted: mailboxes that levels write"
     elif not wiring.is_known(source):
         yield f"no such mailbox; mailboxes: {wiring.names()}"
-    elif source in wiring.writers and has_clock and board in config.board:
-        every = config.every(board) * wiring.writers[source][1].cycles
-        rate_hz = 1e9 / (every * config.clock_ns)
+    elif source in wiring.writers and board in wiring.every:
+        every = wiring.every[board] * wiring.writers[source][1].cycles
+        rate_hz = 1e9 / (every * wiring.config.clock_ns)
         if rate_hz > FASTEST_HZ * (1 + 1e-9):
             why = f"written at {rate_hz:g} Hz, and a loop that fast must not wait for a network"
             yield f"{why}; permitted: up to {FASTEST_HZ:g} Hz: {SLOWER}"
@@ -149,3 +142,61 @@ def at_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
     if port != mistake.place and port in table.imports:
         return Mistake(f"{PLACE}.import.{port}.type", table.imports[port].type, mistake.why)
     return replace(mistake, place=_OWN.sub(PLACE, mistake.place), why=_OWN.sub(PLACE, mistake.why))
+
+
+SOON = timedelta(days=30)
+"""Time before the end of certificates from which a launch warns."""
+
+
+def network(wiring: Wiring) -> Iterator[Mistake]:
+    """Check the endpoints, judged by the config alone."""
+    table = wiring.config.adapter.lan
+    if table is None:
+        return
+    for key, endpoint in table.endpoints:
+        if why := _why_not(endpoint, table, connects=key.startswith("connect")):
+            yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
+    if table.has_tls and table.certificates is None:
+        yield Mistake(f"{PLACE}.certificates", None, "missing; TLS needs them: see rack lan certificates --help")
+    if table.has_tls and table.exports and not table.racks:
+        yield Mistake(f"{PLACE}.peers", None, "missing; with TLS only racks that it names may import from this one")
+
+
+def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
+    if endpoint.has_tls and connects and ":" in endpoint.host:
+        return "zenoh checks no certificate for an address of IPv6; permitted: a host name, or an address of IPv4"
+    if not endpoint.has_tls and table.has_tls:
+        return "without TLS, which others have: who comes here is not known; permitted: all with TLS, or none"
+    if not endpoint.has_tls and not endpoint.is_loopback and not table.insecure:
+        return (
+            "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an address of loopback, or "
+            f"by name, {PLACE}.insecure = true"
+        )
+    return ""
+
+
+def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
+    """Yield what is wrong with the files of the credentials on this machine, now."""
+    table = config.adapter.lan
+    if table is None or table.certificates is None:
+        return
+    heard = [Endpoint.of(text) for text in table.listen]
+    addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
+    for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
+        # The file first: a long path is cut short.
+        yield Mistake(f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}")
+
+
+def network_notes(config: RackConfig) -> list[str]:
+    """Return what a launch says of the network: endpoints without TLS that others can reach, certificates that end."""
+    table = config.adapter.lan
+    if table is None:
+        return []
+    far = [str(endpoint) for _, endpoint in table.endpoints if not (endpoint.has_tls or endpoint.is_loopback)]
+    may = "read and forge" if table.certificates is None else "read"
+    notes = [f"without TLS: whoever reaches {', '.join(far)} may {may} what is exchanged"] if far else []
+    if table.certificates is not None and table.has_tls:
+        expires = Credentials(Path(table.certificates), config.name).expires
+        if expires - datetime.now(UTC) < SOON:
+            notes.append(f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC: the other racks are lost then")
+    return notes

@@ -36,6 +36,10 @@ MISTAKES = {
         ["adapter.lan.import.other.rate_hz=60"],
         "adapter.lan.import.other.rate_hz = 60: should be less than or equal to 50; rate of the exchange",
     ),
+    "a rate off the grid of a board that is exported": (
+        ["board.pulse.rate_hz=33"],
+        "board.pulse.rate_hz: level 'pulse': 33 Hz does not divide the 400 Hz clock",
+    ),
     "a servo loop": (
         ["board.pulse.rate_hz=400"],
         'adapter.lan.export.pulse.from = "pulse.status": written at 400 Hz, and a loop that fast must not wait for a '

@@ -9,7 +9,7 @@ import pytest
 
 from rack.boards.config import load, loads, resolve, wire
 from rack.boards.config.files import CONFIGS
-from rack.boards.config.rules.network import network_notes
+from rack.boards.config.rules.lan import network_notes
 from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import rack_text

@@ -9,13 +9,12 @@ from typing import Any, Literal
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.queue import is_position
-from rack.boards.config.ports import all_ports
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.toml import to_toml
+from rack.boards.config.wiring import executors
 from rack.boards.faults.bounds import between_reads, cycle_ticks
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind
-from rack.levels.level import Executor
 from rack.tools.console.answer import Failure
 from rack.tools.faults.ending import EXTERNAL, record_of
 
@@ -86,9 +85,7 @@ class Targets:
         self.layout = layout
         self.joints = len(config.robot.joints) if config.robot is not None else 0
         self._roles = {task.name: task.role for task in layout.tasks}
-        self._driving = {
-            ports.task: ports.kind.faults for ports in all_ports(config, []) if issubclass(ports.kind, Executor)
-        }
+        self._driving = {name: kind.faults for name, kind in executors(config).items() if kind is not None}
         self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
         # The clock's process can be killed like any other.
         self.by_kind[EXTERNAL] = [Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]]

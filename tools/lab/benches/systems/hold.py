@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig
-from rack.boards.config.commands import commandable
 from rack.boards.config.schema import CommandConfig
+from rack.boards.config.wiring import commandable
 from rack.levels.operator import Operation
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import CommandPath, command_paths

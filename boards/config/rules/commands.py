@@ -1,0 +1,112 @@
+"""Operator commands: what a level takes, with which goal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import partial
+
+from rack.backplane.address_map import OPERATOR_ENTRIES
+from rack.boards.classes import find_class
+from rack.boards.config.cell import built_cell
+from rack.boards.config.mistakes import at_key
+from rack.boards.config.schema import CommandConfig, RackConfig
+from rack.boards.config.wiring import commandable
+from rack.boards.errors import Mistake
+from rack.levels.errors import LevelError, RobotError
+from rack.levels.level import Executor
+from rack.levels.operator import NAMED, Commands, Goal, goal_names, listed
+
+
+def command_mistakes(
+    commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, broken: Collection[str] = ()
+) -> list[Mistake]:
+    """Return every mistake in commands, given with their places in a config; a live command has an empty place.
+
+    Commands for `broken` boards, which have mistakes of their own, are not checked.
+    """
+    given = list(commands)
+    checked = [(place, command) for place, command in given if command.level not in broken]
+    found = [mistake for place, command in checked for mistake in _mistakes(place, command, config)]
+    if len(given) > OPERATOR_ENTRIES:
+        found.append(Mistake("command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"))
+    return found
+
+
+def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+    at = partial(at_key, place)
+    if command.tick is not None and command.at is not None:
+        yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
+    levels = commandable(config)
+    if command.level not in levels:
+        why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
+        yield Mistake(at("level"), command.level, why)
+        return
+    known = levels[command.level]
+    if command.said not in known:
+        why = f"'{command.level}' does not take {command.what}; it takes: {listed(known)}"
+        yield Mistake(at("what"), command.what, why)
+        return
+    yield from _goal(at, command, known)
+    yield from _name(at("name"), command, config)
+    if command.joints is not None and Goal.JOINTS in known[command.said]:
+        yield from _joints(at("joints"), command.joints, config)
+    for key in ("quaternion", "direction"):
+        if getattr(command, key) is not None and not any(getattr(command, key)):
+            yield Mistake(at(key), list(getattr(command, key)), "all zero; its length must not be zero")
+
+
+def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
+    """Check that there is one goal, of a form that the level accepts."""
+    wanted, given = known[command.said], command.goals
+    what = f"{command.what} of '{command.level}'"
+    if not wanted:
+        for goal in given:
+            yield Mistake(at(_key(goal)), None, f"{command.what} takes no goal; remove it")
+    elif len(given) != 1:
+        why = "missing" if not given else f"several given: {goal_names(given)}"
+        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(wanted)}")
+    elif given[0] not in wanted:
+        yield Mistake(at(_key(given[0])), None, f"not a goal for {what}; permitted: {goal_names(wanted)}")
+    elif command.position is None and given[0] in (Goal.POSE, Goal.DIRECTION):
+        yield Mistake(at("position"), None, "missing; tool position, m")
+    elif command.quaternion is not None and command.direction is not None:
+        why = "quaternion is also given; permitted: one of quaternion, direction"
+        yield Mistake(at("direction"), list(command.direction), why)
+
+
+def _key(goal: Goal) -> str:
+    keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
+    return keys.get(goal, goal.name.lower())
+
+
+def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+    """Check that an operation that gives a name, and no other, gives one that its level knows."""
+    if command.said not in NAMED:
+        if command.name is not None:
+            yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
+        return
+    board = config.board[command.level]
+    try:
+        known = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
+    except LevelError:
+        return  # reported elsewhere
+    if command.name not in known:
+        yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
+
+
+def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:
+    robot = config.robot
+    if robot is None:
+        yield Mistake(place, list(joints), "the rack has no arm")
+        return
+    if len(joints) != len(robot.joints):
+        why = f"{len(joints)} values; permitted: {len(robot.joints)}, one per joint: {', '.join(robot.joints)}"
+        yield Mistake(place, list(joints), why)
+        return
+    try:
+        ranges = built_cell(robot, config.scene, config.clock_ns).limits.position
+    except RobotError:
+        return  # reported elsewhere
+    for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
+        if not low <= value <= high:
+            yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")

@@ -1,0 +1,136 @@
+"""What the levels' classes demand of their boards, and what arm and scene must be for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from pydantic import ValidationError
+
+from rack.backplane.address_map import AddressMap
+from rack.backplane.errors import MailboxError
+from rack.backplane.layout import Layout
+from rack.boards.config.cell import cell_sizes
+from rack.boards.config.files import file_at
+from rack.boards.config.mistakes import mistakes_of, repeated
+from rack.boards.config.wiring import Wiring
+from rack.boards.errors import Mistake
+from rack.levels.errors import RobotError
+from rack.levels.level import Executor, LevelContext
+from rack.levels.tables import RobotConfig, SceneConfig
+
+MAX_SEGMENT_BYTES = 2**30
+
+
+def params(wiring: Wiring) -> Iterator[Mistake]:
+    """Check each board's parameters against the declarations of its executor's and planner's classes."""
+    for table, kind in wiring.params:
+        tables, _, board = table.partition(".")
+        given = getattr(wiring.config, tables)[board].params
+        try:
+            kind.model_validate(given)
+        except ValidationError as error:
+            yield from mistakes_of(error, kind, given, f"{table}.params")
+
+
+def programs(wiring: Wiring) -> Iterator[Mistake]:
+    """Check `[task]` against the programs declared by the levels' classes."""
+    config = wiring.config
+    for kind in wiring.programs:
+        try:
+            program = kind.model_validate(config.task)
+        except ValidationError as error:
+            yield from mistakes_of(error, kind, config.task, "task")
+        else:
+            for key, value, why in program.misfits(config.robot, config.scene):
+                yield Mistake(f"task.{key}", value, why)
+
+
+def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Iterator[Mistake]:
+    """Check that the rack knows each size that a message needs."""
+    for mailbox, (ports, output) in wiring.writers.items():
+        try:
+            output.type.dtype(sizes)
+        except MailboxError as error:
+            yield Mistake(f"mailbox {mailbox}", ports.task, str(error))
+
+
+def memory(layout: Layout) -> Iterator[Mistake]:
+    """Check the size of the segment, and name the largest mailbox."""
+    size = AddressMap(layout).size
+    if size > MAX_SEGMENT_BYTES:
+        box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
+        why = f"{box.depth} messages are kept for its slowest reader, so the segment needs {size} bytes"
+        advice = f"permitted: {MAX_SEGMENT_BYTES}; shorten cycles or within_cycles"
+        yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
+
+
+def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Iterator[Mistake]:
+    """Ask each level whether its neighbours suit it; `contexts` by board."""
+    for ports in wiring.tasks:
+        if issubclass(ports.kind, Executor):
+            board = wiring.config.board[ports.task]
+            above, below = ([contexts[other] for other in others] for others in (board.above, board.below))
+            for key, value, why in ports.kind.misfits(contexts[ports.task], above, below):
+                yield Mistake(f"board.{ports.task}.{key}", value, why)
+
+
+def scene(wiring: Wiring) -> Iterator[Mistake]:
+    """Check the names of objects and obstacles."""
+    scene = wiring.config.scene
+    for kind, key, those in (
+        ("motion", "body", "obstacles"),
+        ("push", "body", "objects"),
+        ("goal", "object", "objects"),
+    ):
+        for at, entry in enumerate(getattr(scene, kind)):
+            name, known = getattr(entry, key), getattr(scene, those)
+            if name not in known:
+                why = f"no such {those[:-1]}; scene.{those}: {', '.join(known) or 'none'}"
+                yield Mistake(f"scene.{kind}[{at}].{key}", name, why)
+    yield from repeated("scene.objects and scene.obstacles", scene.bodies)
+
+
+def robot(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that the model is there, and that each list has a value per joint."""
+    robot = wiring.config.robot
+    if robot is None:
+        return
+    joints = len(robot.joints)
+    if file_at(robot.model) is None:
+        yield Mistake("robot.model", str(robot.model), "no such file")
+    for key in ("home", "velocity", "acceleration", "jerk", "torque", "position"):
+        values = getattr(robot, key)
+        if values is not None and len(values) != joints:
+            yield Mistake(f"robot.{key}", values, f"{len(values)} values; permitted: {joints}, one per joint")
+    for key, values in robot.sensors:
+        if isinstance(values, tuple) and len(values) != joints:
+            why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
+            yield Mistake(f"robot.sensors.{key}", values, why)
+    yield from repeated("robot.joints", robot.joints)
+
+
+def cell(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only names are checked."""
+    config, found = wiring.config, ""
+    if config.robot is None:
+        return
+    if not wiring.broken & {"robot", "scene"} and not [*robot(wiring), *scene(wiring)]:
+        try:
+            cell_sizes(config)
+            return
+        except RobotError as error:
+            found = str(error)
+    for line in _unknown_names(config.robot, config.scene) or filter(None, [found]):
+        place, colon, why = line.partition(": ")
+        is_key = colon and place.startswith(("robot", "scene"))
+        yield Mistake(place, None, why) if is_key else Mistake("robot", None, line)
+
+
+def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
+    """Return a line for every name missing from the model; none if the model cannot be read."""
+    from rack.levels.robot.lookup import unknown_names
+
+    try:
+        return tuple(unknown_names(robot, scene))
+    except RobotError:
+        return ()

@@ -1,0 +1,226 @@
+"""Mailboxes: who writes and reads them, on which side of the rack, and how they are shared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rack.backplane.layout import BY_TICKS
+from rack.backplane.mailbox.queue import taken_name
+from rack.boards.config.schema import LAN
+from rack.boards.config.wiring import TaskPorts, Wiring, class_key, key_of, reference, rewired, table_of
+from rack.boards.errors import Mistake
+from rack.boards.exchange import EXCHANGE, exchange_message
+from rack.boards.host.bus_adapter import BusAdapter
+
+PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
+
+
+def ports(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that each class is there, and that its inputs are connected as it declares."""
+    config = wiring.config
+    for place in (*config.tasks(), *config.hosts()):
+        table = table_of(place)
+        if place in wiring.missing:
+            yield Mistake(f"{table}.{class_key(place)}", reference(config, place), wiring.missing[place])
+        else:
+            yield from _connected(wiring, table, wiring.ports[place])
+
+
+def _connected(wiring: Wiring, table: str, ports: TaskPorts) -> Iterator[Mistake]:
+    role, inputs = ports.place.role, ", ".join(ports.kind.inputs) or "none"
+    for output, told in ports.outputs.items():
+        if told.rests_on and told.rests_on not in ports.inputs:
+            why = f"its output '{output}' rests on '{told.rests_on}'; inputs: {inputs}"
+            yield Mistake(f"{table}.{role}", reference(wiring.config, ports.place), why)
+    for port, given in rewired(wiring.config, ports.place).items():
+        if port not in ports.kind.inputs:
+            key = f"{key_of(ports.place)}.{port}"
+            yield Mistake(f"{table}.{key}", given, f"the {role} has no such port; ports: {inputs}")
+    for port, entry, key, given, mailboxes, _ in (found for found in ports.connections if not found.fits):
+        if mailboxes:
+            why = f"port '{port}' of the {role} reads one mailbox, not {len(mailboxes)}"
+            yield Mistake(f"{table}.{key}", given, why)
+        else:
+            start = entry.source.partition(".")[0]
+            yield Mistake(f"{table}.{start}", None, f"missing; port '{port}' of the {role} needs it")
+
+
+def writers(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that each mailbox has one writer."""
+    for ports in wiring.ports.values():
+        for mailbox in ports.writes.values():
+            first = wiring.writers[mailbox][0]
+            if first is not ports:
+                yield Mistake(f"mailbox {mailbox}", ports.task, f"already written by {first.task}")
+
+
+def reads(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that each mailbox that is read exists, and carries what the port needs."""
+    for ports in wiring.ports.values():
+        for port, mailbox in ports.sources:
+            place, wanted = ports.wired_at(port), ports.inputs[port].type
+            if not wiring.is_known(mailbox):
+                yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
+            elif ports.is_whole and (found := wiring.type_of(mailbox)) is not None and found != wanted:
+                why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
+                yield Mistake(place, mailbox, why)
+
+
+def statuses(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that the board that ends the run has a status."""
+    for name, board in wiring.config.board.items():
+        if board.ends_run and not wiring.is_known(f"{name}.status"):
+            yield Mistake(f"board.{name}.ends_run", True, "its executor writes no status")
+
+
+def sides(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that only bus adapters read mailboxes of the other side."""
+    for task in wiring.ports.values():
+        for port, mailbox in task.sources:
+            if mailbox.partition(".")[0] not in wiring.unknown and (why := _reason(wiring, task, mailbox)):
+                yield Mistake(task.wired_at(port), mailbox, why)
+
+
+def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
+    """Return why a task or host board must not read a mailbox; empty if it may."""
+    is_host, is_of_host = task.place.role == "host", mailbox in wiring.of_host
+    if issubclass(task.kind, BusAdapter):
+        return "it is on the host side already" if mailbox in wiring.to_host else ""
+    if is_host == is_of_host:
+        return ""
+    if (source := wiring.passed.get(mailbox)) is None:
+        return f"it is on the {'host' if is_of_host else 'real-time'} side; {PASS_IT}"
+    writer, same = source.partition(".")[0], "host" if is_host else "real-time"
+    return f"a bus adapter joins the two sides; '{writer}' and '{task.place.board}' are both on the {same} side"
+
+
+NOT_OPERATED = {
+    "lock": "the clock writes it and must not wait",
+    "queue": "it keeps every command already",
+    "interrupt": "the clock writes it, not a board",
+}
+"""Protocols that an operator's mailbox cannot have, and why."""
+
+
+def strict(wiring: Wiring) -> Iterator[Mistake]:
+    """Refuse everything that makes a run depend on timing, if the config says so."""
+    config = wiring.config
+    if not config.protocol.strict:
+        return
+    why = "makes a run depend on timing, refused by protocol.strict = true; permitted"
+    if config.protocol.default not in BY_TICKS:
+        yield Mistake("protocol.default", config.protocol.default, f"{why}: time-slice, interrupt")
+    for mailbox, protocol in config.protocol.mailbox.items():
+        if protocol not in BY_TICKS:
+            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, f"{why}: {', '.join(BY_TICKS)}")
+    for name in config.host:
+        yield Mistake(f"host.{name}", None, f"a board without real time {why}: boards with a rate")
+    for name, board in config.board.items():
+        for port, entry in board.exchange.items():
+            if entry.asynchronous:
+                yield Mistake(f"board.{name}.exchange.{port}.asynchronous", True, f"{why}: false")
+
+
+def exchange(wiring: Wiring) -> Iterator[Mistake]:
+    """Check when boards read their ports, and that a mailbox is free for what they record of it."""
+    for ports in wiring.tasks:
+        if not ports.exchange or not ports.is_whole:
+            continue
+        for port, entry in ports.exchange.items():
+            place = f"board.{ports.task}.exchange.{port}"
+            if port not in ports.inputs:
+                yield Mistake(place, None, f"no such port of the executor; ports: {', '.join(ports.inputs) or 'none'}")
+            if entry.asynchronous and entry.every > 1:
+                yield Mistake(
+                    f"{place}.every", entry.every, "an asynchronous port is read in every cycle; permitted: 1"
+                )
+            elif entry.phase >= entry.every:
+                why = f"must be less than every; permitted: 0 to {entry.every - 1} cycles"
+                yield Mistake(f"{place}.phase", entry.phase, why)
+        if ports.outputs[EXCHANGE].type != exchange_message(ports.reads):
+            why = "the executor writes a mailbox of that name itself; rename its output"
+            yield Mistake(f"board.{ports.task}.exchange", None, why)
+
+
+def operated(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that only the clock writes operators' mailboxes, never waits, and never finds one full."""
+    for mailbox in wiring.operated:
+        if mailbox in wiring.writers:
+            first = wiring.writers[mailbox][0].task
+            yield Mistake(f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox")
+        given = wiring.config.protocol.mailbox.get(mailbox)
+        if why := NOT_OPERATED.get(given or ""):
+            yield Mistake(f"protocol.mailbox.{mailbox}", given, f"{why}; permitted: time-slice, double-buffer")
+
+
+def mailboxes(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that the mailboxes exist whose protocol the config gives."""
+    for mailbox in wiring.config.protocol.mailbox:
+        if not wiring.is_known(mailbox):
+            yield Mistake(f"protocol.mailbox.{mailbox}", None, f"no such mailbox; mailboxes: {wiring.names()}")
+
+
+def queues(wiring: Wiring) -> Iterator[Mistake]:
+    """Check which mailboxes are queues, their readers and their depths, if the two sides are apart."""
+    if any(sides(wiring)):
+        return
+    table = wiring.config.protocol
+    for mailbox, (ports, output) in wiring.writers.items():
+        given = table.mailbox.get(mailbox, "queue")
+        if output.queued and given != "queue":
+            why = f"'{ports.task}' sends any number of messages in a cycle; permitted: queue"
+            yield Mistake(f"protocol.mailbox.{mailbox}", given, why)
+        elif wiring.protocol(mailbox) == "queue":
+            yield from _queue(wiring, mailbox)
+    for mailbox, depth in table.depth.items():
+        if not wiring.is_known(mailbox):
+            yield Mistake(f"protocol.depth.{mailbox}", depth, f"no such mailbox; mailboxes: {wiring.names()}")
+        elif wiring.protocol(mailbox) != "queue":
+            queues = [name for name in wiring.writers if wiring.protocol(name) == "queue"]
+            why = f"not a queue: it holds one message; queues: {', '.join(queues) or 'none'}"
+            yield Mistake(f"protocol.depth.{mailbox}", depth, why)
+
+
+def _queue(wiring: Wiring, mailbox: str) -> Iterator[Mistake]:
+    """Check one queue: exactly one port reads it, and its reader's position has a name of its own."""
+    if taken_name(mailbox) in wiring.writers:
+        why = f"the reader of the queue '{mailbox}' writes its position under this name; rename the port"
+        yield Mistake(f"mailbox {taken_name(mailbox)}", None, why)
+    reading = [(task.task, port) for task, port in wiring.reading.get(mailbox, ()) if task.place.role != "host"]
+    readers = [f"{task} ({port})" for task, port in reading]
+    exports = [port for task, port in reading if task == LAN]
+    if wiring.config.adapter.lan is not None and exports:
+        why = "a queue gives each message once, to its one reader here; permitted: mailboxes that hold one message"
+        yield Mistake(f"adapter.lan.export.{exports[0]}.from", mailbox, why)
+    elif len(readers) > 1:
+        why = f"a queue gives each message once, so it has one reader, not {len(readers)}: {', '.join(readers)}"
+        yield Mistake(f"mailbox {mailbox}", None, why)
+    elif not readers and not wiring.unknown:
+        why = "no task reads this queue, so it would fill and stay full; permitted: one reader"
+        yield Mistake(f"mailbox {mailbox}", None, why)
+
+
+def asynchronous(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that what a port reads asynchronously can be read at once."""
+    for ports in wiring.tasks:
+        for port, mailbox in ports.sources:
+            why = {
+                "queue": f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false",
+                "interrupt": f"the messages of '{mailbox}' interrupt the board as they come already; permitted: false",
+            }.get(wiring.protocol(mailbox))
+            if port in ports.exchange and ports.exchange[port].asynchronous and why is not None:
+                yield Mistake(f"board.{ports.task}.exchange.{port}.asynchronous", True, why)
+
+
+def interrupts(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that messages of which the config demands it can interrupt."""
+    for mailbox, given in wiring.config.protocol.mailbox.items():
+        why = ""
+        if given != "interrupt":
+            continue
+        if mailbox in wiring.of_host:
+            why = "it is on the host side, where nothing is interrupted; permitted: no entry"
+        elif wiring.is_of_network(mailbox):
+            why = "the network adapter writes it as messages come in; permitted: time-slice, double-buffer"
+        if why:
+            yield Mistake(f"protocol.mailbox.{mailbox}", given, why)
