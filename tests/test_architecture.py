@@ -163,3 +163,30 @@ def test_every_room_has_quick_tests() -> None:
         marks = {test.name: " ".join(map(ast.unparse, test.decorator_list)) for test in tests}
         quick[path.parent] += [name for name, found in marks.items() if not is_slow and "mark.slow" not in found]
     assert not [str(folder.relative_to(ROOT)) for folder, names in quick.items() if not names]
+
+
+CORE = ("run", "check", "inject", "report")
+"""Commands that make up the core, with the processes and the levels of the NASREM rack."""
+OUTSIDE = ("tools/viewer", "tools/network", "tools/lab", "levels/systems")
+
+
+def test_the_core_needs_no_viewer_no_network_no_lab_and_no_other_system() -> None:
+    starts = [ROOT / "tools" / "commands" / f"{name}.py" for name in CORE]
+    starts += [ROOT / "boards/crate/__main__.py", ROOT / "tools/recording/recorder/__main__.py"]
+    starts += [
+        path
+        for room in ("servo", "primitive", "elemental_move", "task")
+        for path in (ROOT / "levels" / room).glob("*.py")
+    ]
+    core, found = set(starts), list(starts)
+    while found:
+        needed = {file for name in imported(found.pop()) if (file := file_of(name))} - core
+        core |= needed
+        found += needed
+    outside = {
+        str(path.relative_to(ROOT))
+        for path in core
+        if path.is_relative_to(ROOT) and str(path.relative_to(ROOT)).startswith(OUTSIDE)
+    }
+    # The viewer's window is a process of its own.
+    assert outside <= {"tools/viewer/__init__.py", "tools/viewer/window.py"}
