@@ -56,8 +56,12 @@ BLOCK_S = 1.0
 """Simulated time in one block: a call costs the same for 4 rows as for 400."""
 
 
+PART_S = 180.0
+"""Simulated time in one file. Until a file is finished, its index is in memory: 0.65 MB a second of the NASREM rack."""
+
+
 def next_file(folder: Path) -> Path:
-    """Return the file to write: a restarted recorder does not overwrite run.rrd, and writes run-2.rrd."""
+    """Return the file to write: run.rrd, then run-2.rrd and so on; a restarted recorder overwrites none."""
     names = chain([FILE], (f"run-{part}.rrd" for part in count(2)))
     return next(folder / name for name in names if not (folder / name).is_file())
 
@@ -132,7 +136,10 @@ class RackWriter:
 
 
 class ViewSink:
-    """Writes run.rrd of one rack into `folder`; with a port, also serves it to a viewer on this machine."""
+    """Writes run.rrd of one rack into `folder`, a long run in parts; with a port, also serves it to a viewer.
+
+    The server of a viewer cannot change files: what it shows live is one part, however long.
+    """
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
         layout, launch = segment.layout, segment.launch
@@ -145,6 +152,9 @@ class ViewSink:
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = block_of(layout)
         self._written = segment.words[System.TICK]
+        self._folder = folder
+        self._part = round(PART_S * 1e9 / layout.clock_ns)
+        self._part_ends = self._written + self._part if port is None else None
 
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Take rows of a ring, shape (rows,)."""
@@ -159,6 +169,9 @@ class ViewSink:
         if tick - self._written >= self._block:
             self._write(tick, lost)
             self._stream.flush()
+            if self._part_ends is not None and tick >= self._part_ends:
+                self._part_ends = tick + self._part
+                self._stream.continue_in(next_file(self._folder))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write what waits and finish the file. Raises `RuntimeError` when it cannot be written."""

@@ -226,6 +226,10 @@ class Stream:
         """Write everything to the file. Raises `RuntimeError` when that fails."""
         self._recording.flush(timeout_sec=FLUSH_S)
 
+    def continue_in(self, file: Path) -> None:
+        """Finish the file and go on in another, which is of the same run."""
+        self._recording.set_sinks(rr.FileSink(str(file)))
+
     def close(self) -> None:
         """Finish the file."""
         self._recording.disconnect()

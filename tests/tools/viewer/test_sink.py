@@ -1,0 +1,45 @@
+"""The viewer's file of a long run: in parts, so that what the library keeps of one is given back."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.tools.recording.spool import rings
+from rack.tools.viewer import sink
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.sink import ViewSink
+from rack.tools.viewer.window import executable
+
+TICKS = 600
+"""1.5 s: the rings hold two."""
+BLOCK, PART = 40, 200
+
+
+def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
+    small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sink, "BLOCK_S", BLOCK * 2.5e-3)
+    monkeypatch.setattr(sink, "PART_S", PART * 2.5e-3)
+    with Rack(load(small, [f"name={rack_name}"])) as rack:
+        view = ViewSink(rack.segment, tmp_path, None)
+        rack.run(TICKS * 2.5e-3)
+        taken = {name: ring.drain().rows for name, ring in rings(rack.segment).items()}
+        for end in range(BLOCK, TICKS + 1, BLOCK):
+            for name, rows in taken.items():
+                view.add(name, rows[(rows["tick"] >= end - BLOCK) & (rows["tick"] < end)])
+            view.advance(end, {})
+            parts = [tmp_path / name for name in ("run.rrd", "run-2.rrd", "run-3.rrd", "run-4.rrd")]
+            assert [part.exists() for part in parts] == [end >= place * PART for place in range(4)]
+            # All but the newest are complete.
+            for part in parts[: end // PART]:
+                subprocess.run([executable(), "rrd", "verify", part], check=True, capture_output=True, timeout=60)
+        view.close(TICKS, {})
+    ticks = [read(part, "/signals/lower.status/count").ticks for part in parts[:3]]
+    assert [len(part) for part in ticks] == [PART] * 3
+    assert np.array_equal(np.concatenate(ticks), np.arange(TICKS))
