@@ -137,7 +137,9 @@ def run_rack(
         rack.close()
         recording, rows_lost = "none", dict[str, int]()
         if folder is not None and recorder is not None:
-            recording, rows_lost = _compared(folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0))
+            recording, rows_lost = _compared(
+                folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0), outcome.ticks
+            )
         _log_news(news, segment, log)
         blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
         result = RunResult(
@@ -180,7 +182,7 @@ def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, n
     return rack.outcome
 
 
-def _compared(folder: Path, segment: Segment, why: str) -> tuple[str, dict[str, int]]:
+def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str, dict[str, int]]:
     """Compare the files with what the rings say was written; `why` is how the recorder ended.
 
     Return "complete" or what is missing, and the rows missing by task and by mailbox.
@@ -189,16 +191,18 @@ def _compared(folder: Path, segment: Segment, why: str) -> tuple[str, dict[str, 
     from rack.tools.recording.recording import Recording
 
     try:
-        missing = Recording(folder).missing(segment)
+        found = Recording(folder)
+        missing = found.missing(segment)
+        if not missing:
+            return "complete", {}
+        gaps = found.gaps({name: rows for name, (rows, _) in missing.items()}, ticks)
     except Failure as error:
         return f"{why}; {error}", {}
-    if not missing:
-        return "complete", {}
     most, name = max((found, name) for name, found in missing.items())
     text = f"{most.rows:,} of {most.written:,} rows of {name} are missing"
     if len(missing) > 1:
         text += f" (and rows of {len(missing) - 1} more tasks and mailboxes)"
-    return f"{text}; {why}", {name: found.rows for name, found in missing.items()}
+    return "; ".join((text, *map(str, gaps), why)), {name: found.rows for name, found in missing.items()}
 
 
 def _log_news(news: list[News], segment: Segment, log: EventLog) -> None:

@@ -66,10 +66,13 @@ class CyclesFile:
         self._writer.write_batch(pa.record_batch(arrays, schema=TRACE_SCHEMA), row_group_size=len(rows))
         self._waiting, self._rows = [], 0
 
-    def close(self, lost: Mapping[str, int], cores: CoreRecord = UNMEASURED) -> None:
-        """Finish the file; store the rows lost by task, and what the machine did to its cores, as metadata."""
+    def close(
+        self, lost: Mapping[str, int], cores: CoreRecord = UNMEASURED, gaps: Sequence[tuple[str, int, int]] = ()
+    ) -> None:
+        """Finish the file; store as metadata the rows lost by task, what the machine did to its cores, and the gaps."""
         self._flush()
-        self._writer.add_key_value_metadata({"lost": json.dumps(lost), "cores": cores.text()})
+        metadata = {"lost": json.dumps(lost), "cores": cores.text(), "gaps": json.dumps(gaps)}
+        self._writer.add_key_value_metadata(metadata)
         self._writer.close()
 
 

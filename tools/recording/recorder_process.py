@@ -59,6 +59,7 @@ class RecorderProcess:
         self._lines: list[str] = []
         self._has_begun = False
         self._is_gone = False
+        self._is_killed = False
         self._used_ns = 0
         self._idle_looks = 0
 
@@ -111,7 +112,8 @@ class RecorderProcess:
         self._idle_looks = self._idle_looks + 1 if used_ns == self._used_ns else 0
         self._used_ns = used_ns
         bound = STOPPED_LOOKS if state_of(self.pid) in STOPPED else IDLE_LOOKS
-        if self._idle_looks > bound:
+        if self._idle_looks > bound and not self._is_killed:
+            self._is_killed = True
             self._lines.append("the recorder is not responding: killed")
             self._process.kill()
 

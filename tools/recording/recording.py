@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,19 @@ class Missing(NamedTuple):
 
     rows: int
     written: int
+
+
+class Gap(NamedTuple):
+    """Ticks of which a recording lacks rows, from the first to the last, and of which tasks and mailboxes."""
+
+    first: int
+    last: int
+    rings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return it as text."""
+        more = f" and {len(self.rings) - 3} more" if len(self.rings) > 3 else ""
+        return f"ticks {self.first:,} to {self.last:,} of {', '.join(self.rings[:3])}{more} are not recorded"
 
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
@@ -136,11 +149,47 @@ class Recording:
     @cached_property
     def lost(self) -> dict[str, int]:
         """Rows that were written and are not in the files, by task and by mailbox."""
-        if "rows_lost" in self.ended:
-            return dict(self.ended["rows_lost"])
+        return dict(self.ended["rows_lost"]) if "rows_lost" in self.ended else self._lost_before_the_end
+
+    @cached_property
+    def _lost_before_the_end(self) -> dict[str, int]:
         with _naming(self.folder):
             texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
             return {name: count for text in texts for name, count in json.loads(text).items()}
+
+    def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
+        """Return where rows are missing, in order; gaps that overlap are one.
+
+        `lost` (default: as known at the end) counts them by ring, for a run of `ticks`: what the files do not know of
+        was lost after their last row.
+        """
+        lost = self.lost if lost is None else lost
+        ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
+        with _naming(self.folder / "cycles.parquet"):
+            found = json.loads(self._cycles.metadata.metadata.get(b"gaps", b"[]"))
+        for name, count in lost.items():
+            if count > self._lost_before_the_end.get(name, 0):
+                recorded = name in self.cycles or name in self.mailboxes
+                found.append((name, int(self.rows(name)["tick"][-1]) + 1 if recorded else 0, ticks - 1))
+        merged: list[Gap] = []
+        for ring, first, last in sorted(found, key=lambda gap: gap[1]):
+            if merged and first <= merged[-1].last + 1:
+                before = merged.pop()
+                rings = tuple(dict.fromkeys((*before.rings, ring)))
+                merged.append(Gap(before.first, max(before.last, last), rings))
+            else:
+                merged.append(Gap(first, last, (ring,)))
+        return merged
+
+    def untraced(self) -> dict[str, tuple[int, int]]:
+        """Return the tasks with cycles that are not recorded: how many are, and of how many."""
+        ran = {name: task["plans" if name.endswith(".planner") else "cycles"] for name, task in self._counts.items()}
+        return {name: (len(self.cycles.get(name, ())), count) for name, count in ran.items() if self.lost.get(name)}
+
+    @property
+    def _counts(self) -> dict[str, dict[str, int]]:
+        found: dict[str, dict[str, int]] = self.ended.get("tasks", {})
+        return found
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what the files lack of the rings of a rack that has ended, by task and by mailbox."""

@@ -52,13 +52,17 @@ class Frame(NamedTuple):
 class RunFiles:
     """cycles.parquet and signals.parquet of a folder, being written.
 
-    By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far.
+    By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far. `gaps` holds where they
+    were lost: ring, first and last tick without rows.
     """
 
     def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
         self.tasks = [task.name for task in layout.tasks]
         self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
         self.taken = dict(self.lost)
+        self.gaps: list[tuple[str, int, int]] = []
+        self._reached = dict.fromkeys(self.lost, (-1, 0))
+        """Of each ring the newest tick, and the rows lost by then."""
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}")
         self._signals = SignalsFile(folder / f"{SIGNALS}{suffix}", layout, launch)
 
@@ -67,6 +71,11 @@ class RunFiles:
         name, rows, lost = frame
         self.lost[name] += lost
         self.taken[name] += lost + len(rows)
+        if len(rows):
+            tick, before = self._reached[name]
+            if self.lost[name] > before:
+                self.gaps.append((name, tick + 1, int(rows["tick"][0]) - 1))
+            self._reached[name] = int(rows["tick"][-1]), self.lost[name]
         if name in self.tasks:
             self._cycles.add(name, rows)
         elif len(rows):
@@ -77,7 +86,7 @@ class RunFiles:
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
         """Finish both files; the trace keeps what the machine did to its cores."""
         tasks = set(self.tasks)
-        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks}, cores)
+        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks}, cores, self.gaps)
         self._signals.close({name: count for name, count in self.lost.items() if name not in tasks})
 
 

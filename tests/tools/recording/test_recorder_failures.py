@@ -30,7 +30,9 @@ from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.spool import SPOOL, mend
+from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.analysis.tables import text as analysis_text
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import executable
 from tests.processes import children_of
@@ -321,11 +323,20 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     assert missing["lower"] > ticks / 4
     assert {name: result.rows_lost[name] for name in missing} == missing == {n: recording.lost[n] for n in missing}
     worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
+    (gap,) = recording.gaps()
+    # Slow rings lack what came since their last message.
+    assert (gap.first <= taken["lower"], gap.last) == (True, ticks - 1)
+    assert set(gap.rings) == set(result.rows_lost)
     assert result.recording == (
         f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing (and rows of {len(result.rows_lost) - 1} more "
-        "tasks and mailboxes); the recorder ended with status -9"
+        f"tasks and mailboxes); {gap}; the recorder ended with status -9"
     )
     assert result.failure().endswith(result.recording)
+    report, text = write_report(tmp_path / "run")
+    assert f"Times of lower are from {taken['lower']:,} of {ticks:,} cycles." in text
+    assert f"- {gap}" in text
+    assert report["gaps"] == [{"first": gap.first, "last": gap.last, "rings": gap.rings}]
+    assert f"lower: judged by {taken['lower']:,} of {ticks:,} cycles" in analysis_text(Analysis.of(recording))
 
 
 @pytest.mark.slow

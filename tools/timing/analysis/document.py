@@ -37,6 +37,8 @@ def document(analysis: Analysis) -> Document:
         "percentile": analysis.percentile,
         "start_up_s": START_UP_S,
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
+        "gaps": [gap._asdict() for gap in recording.gaps()],
+        "untraced": recording.untraced(),
         "holds": analysis.holds,
         "levels": {name: _level(analysis, name) for name in config.board},
         "tasks": {name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()},

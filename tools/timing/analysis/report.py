@@ -101,6 +101,8 @@ def report_of(recording: Recording) -> Report:
         "interrupts": interrupts(recording),
         "recording": ended.get("recording", "without the end of the run"),
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
+        "gaps": [gap._asdict() for gap in recording.gaps()],
+        "untraced": recording.untraced(),
     }
 
 
@@ -110,7 +112,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
         *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
         *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
         *("task", "motion", "hand", "force", "queues", "interrupts"),
-        "rows_lost",
+        *("rows_lost", "gaps", "untraced"),
     )
     layout = wire(config)
     tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}

@@ -12,6 +12,7 @@ from rack.boards.events import Braking, braked_text
 from rack.tools.console.tables import decimal, figure, markdown_table, table
 from rack.tools.live.holds import resume_command
 from rack.tools.recording.history import counted
+from rack.tools.recording.recording import Gap
 
 Report = dict[str, Any]
 
@@ -84,6 +85,7 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
         yield f"- recording: {report['recording']}"
     if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
         yield f"- the recorder lost rows: {lost}"
+        yield from (f"- {Gap(**gap)}" for gap in report["gaps"])
     yield from _against(report.get("against"))
     yield from _task(report["task"])
     yield from _objects(report["objects"])
@@ -108,6 +110,8 @@ def _times(report: Report) -> Iterator[str | Grid]:
     if is_lockstep:
         yield "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no lateness, no residuals."
         yield ""
+    for name, (traced, ran) in report["untraced"].items():
+        yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
     head = (*COUNTS, *(() if is_lockstep else BY_THE_CLOCK), *USED)
     cells = [_times_row(name, task) for name, task in report["tasks"].items()]
     yield Grid(head, [[row[name] for name in head] for row in cells], DROPPED)

@@ -74,7 +74,10 @@ def _head(analysis: Analysis) -> Iterator[str]:
     yield f"the first {START_UP_S:g} s of each process are not judged; t_cs is {config.timing.context_switch_ms:g} ms"
     if stalled := ", ".join(f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled):
         yield f"cycles with a stall in them are not judged: {stalled}"
+    for name, (traced, ran) in analysis.recording.untraced().items():
+        yield f"{name}: judged by {traced:,} of {ran:,} cycles"
     yield from (f"{count} rows of {name} were lost" for name, count in analysis.recording.lost.items() if count)
+    yield from map(str, analysis.recording.gaps())
 
 
 def _named(pairs: list[Pair]) -> str:
