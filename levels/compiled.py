@@ -13,14 +13,20 @@ state of the sources has its own folder.
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar
 
+DIGEST = 16
+CURE = "XDG_CACHE_HOME=FOLDER names one that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
 
@@ -47,17 +53,90 @@ def _jit(function: Any) -> Any:
     """Compile a function; those that it calls, if marked, are replaced by their compiled selves."""
     from numba import njit
 
-    _use_cache()
+    folder = _use_cache()
     names, known = function.__code__.co_names, function.__globals__
     called = {name: known[name].load() for name in names if isinstance(known.get(name), compiled)}
     bound = FunctionType(function.__code__, known | called, function.__name__, function.__defaults__)
     bound.__module__, bound.__qualname__ = function.__module__, function.__qualname__
-    return njit(cache=True, error_model="numpy")(bound)
+    function = njit(cache=bool(folder), error_model="numpy")(bound)
+    if folder:
+        _forgive(function._cache)
+    else:
+        _tell(bound)
+    return function
+
+
+NEWS: list[Callable[[str], object]] = []
+"""Called with the name of each function before it is compiled."""
+
+
+def _forgive(kept: Any) -> None:
+    """Let a function do without what is kept of it where that is damaged or cannot be written, and say so."""
+    load, save, files = kept.load_overload, kept.save_overload, kept._cache_file
+
+    def save_sealed(name: str, found: Any) -> None:
+        content: bytes = files._dump(found)
+        with files._open_for_write(files._data_path(name)) as file:
+            file.write(_digest(content) + content)
+
+    def load_sealed(name: str) -> Any:
+        sealed = Path(files._data_path(name)).read_bytes()
+        # Damaged machine code must never run.
+        if _digest(sealed[DIGEST:]) != sealed[:DIGEST]:
+            raise ValueError(f"{name} is not what was written")
+        return pickle.loads(sealed[DIGEST:])
+
+    def load_or_compile(signature: Any, context: Any) -> Any:
+        found = None
+        try:
+            found = load(signature, context)
+        except Exception as error:
+            _say(f"{files._index_path}: damaged ({error or type(error).__name__}); compiled again")
+            _remove(Path(files._index_path))
+        if found is None:
+            _tell(kept._py_func)
+        return found
+
+    def save_if_possible(signature: Any, data: Any) -> None:
+        try:
+            save(signature, data)
+        except Exception as error:
+            _say(f"{kept.cache_path}: compiled code cannot be kept: {error}; {CURE}")
+
+    files._load_data, files._save_data = load_sealed, save_sealed
+    kept.load_overload, kept.save_overload = load_or_compile, save_if_possible
+
+
+def _tell(function: FunctionType) -> None:
+    for tell in NEWS:
+        tell(function.__qualname__)
+
+
+def _digest(content: bytes) -> bytes:
+    return blake2b(content, digest_size=DIGEST).digest()
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 @cache
-def _use_cache() -> None:
-    """Make numba cache its code in a folder for the present sources; remove the folders of earlier ones."""
+def _say(text: str) -> None:
+    """Print a line, once."""
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
+
+
+@cache
+def _use_cache() -> str:
+    """Make numba cache its code in a folder for the present sources; remove the folders of earlier ones.
+
+    Return the folder; an empty text if it cannot be written.
+    """
     import numba
 
     levels = Path(__file__).parent
@@ -67,7 +146,15 @@ def _use_cache() -> None:
     here = blake2b(bytes(levels), digest_size=8).hexdigest()
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
     folder = home / f"{here}-{sources.hexdigest()}"
-    if not folder.exists():
-        for old in home.glob(f"{here}-*"):
-            shutil.rmtree(old, ignore_errors=True)
+    try:
+        if not folder.exists():
+            for old in home.glob(f"{here}-*"):
+                shutil.rmtree(old, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        _say(f"{folder}: compiled code cannot be kept, and every launch compiles: {error.strerror}; {CURE}")
+        return ""
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba makes it from its environment
+    return str(folder)

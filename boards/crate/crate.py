@@ -30,6 +30,7 @@ from rack.boards.crate.line import received
 from rack.boards.crate.output import HostOutput
 from rack.boards.crate.requests import (
     CellConfig,
+    Compiling,
     Ended,
     Forked,
     ForkFailed,
@@ -47,6 +48,7 @@ from rack.boards.faults.tasks import hog
 from rack.boards.host.board import run_host_board
 from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
+from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
@@ -122,11 +124,13 @@ class Crate:
     def _preload(self, wanted: Preload) -> None:
         """Load what boards share with the crate. Mistakes in the config are left for the Rack to report."""
         sys.path[:] = wanted.path
+        compiled.NEWS[:] = [lambda function: self._line.send(Compiling(function))]
         for reference in wanted.classes:
             if reference not in self._preloaded and not self._is_preloaded(reference):
                 return
         if wanted.cell is not None:
             _compile_cell(wanted.cell)
+        compiled.NEWS.clear()
         gc.freeze()
         gc.enable()
 

@@ -7,11 +7,13 @@ import time
 
 from rack.backplane.segment import Segment
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.requests import Opened, PreloadFailed, Preloading
+from rack.boards.crate.requests import Compiling, Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
 from rack.boards.events import Journal
 from rack.boards.lan.awaited import awaited
 
+COMPILE_S = 300.0
+"""Time limit of the compilation of one function: thirty times what the longest takes, for a machine under load."""
 PATIENCE_S = 2.0
 """Time after which a launch reports what it waits for; it does so again each time the wait has doubled."""
 
@@ -20,7 +22,8 @@ class Patience:
     """One wait of at most `limit_s`. A long one is reported to `journal`."""
 
     def __init__(self, journal: Journal, limit_s: float) -> None:
-        self._journal, self._limit_s = journal, limit_s
+        self._journal = journal
+        self.limit_s = self._limit_s = limit_s
         self._began = time.monotonic()
         self._report_s = PATIENCE_S
 
@@ -33,6 +36,11 @@ class Patience:
     def left_s(self) -> float:
         """Time until the next report or the time limit, s."""
         return max(0.0, min(self._report_s, self._limit_s) - self._waited_s)
+
+    def renew(self, limit_s: float) -> None:
+        """Begin the time limit again, of another length; reports go on as before."""
+        self.limit_s = limit_s
+        self._limit_s = self._waited_s + limit_s
 
     def report(self, doing: str) -> None:
         """Report what the launch waits for, if that is due."""
@@ -77,9 +85,12 @@ def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
             case Opened():
                 return
             case Preloading(kind):
-                patience, doing = Patience(journal, limit_s), f"preloading '{kind}', whose first launch compiles code"
+                patience, doing = Patience(journal, limit_s), f"preloading '{kind}'"
+            case Compiling(function):
+                patience.renew(COMPILE_S)
+                doing = f"compiling '{function}', which is kept for later launches"
             case PreloadFailed(kind, why):
                 raise LaunchError(f"'{kind}' cannot be preloaded: {why}")
             case None:
                 raise LaunchError("\n".join(crate.printed()) or "the crate has ended")
-    raise LaunchError("\n".join(crate.printed()) or f"{doing}: not done within {limit_s:g} s")
+    raise LaunchError("\n".join(crate.printed()) or f"{doing}: not done within {patience.limit_s:g} s")

@@ -75,6 +75,13 @@ class Preloading:
 
 
 @dataclass(frozen=True)
+class Compiling:
+    """The crate begins to compile a function: its code is not kept from an earlier launch."""
+
+    function: str
+
+
+@dataclass(frozen=True)
 class PreloadFailed:
     """A class raised an error while it was preloaded; no board can be forked."""
 
