@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import os
+import select
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from types import ModuleType
+
+SLOW_S, IMPORT_S = 2.0, 60.0
+"""Time after which a user hears that a module is still being imported, and after which the process is ended."""
 
 MOVED = {
     "rack.boards.adapters": "rack.boards.host",
@@ -35,7 +44,47 @@ def current(reference: str) -> str:
 def module_and_name(reference: str) -> tuple[ModuleType, str]:
     """Return the module that "package.module:Name" names, imported, and the name in it. Raises `LookupError`."""
     module, _, name = current(reference).partition(":")
+    is_ours = module in sys.modules or module.startswith("rack.")
     try:
-        return importlib.import_module(module), name
+        with nullcontext() if is_ours else _watched(module):
+            return importlib.import_module(module), name
     except (Exception, SystemExit) as error:  # a user's module may raise anything while it is imported
         raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+
+
+@contextmanager
+def _watched(module: str) -> Iterator[None]:
+    """Let a process watch the import of a user's module: one that ends this process, or loops, could not be named."""
+    asked, told = os.pipe()
+    watcher = os.fork()
+    if watcher == 0:
+        os.close(told)
+        _watch(module, asked)
+        os._exit(0)
+    os.close(asked)
+    try:
+        yield
+    finally:
+        os.write(told, b"done")
+        os.close(told)
+        os.waitpid(watcher, 0)
+
+
+def _watch(module: str, asked: int) -> None:
+    """Wait until the parent has imported the module, or is gone; end it if it takes too long."""
+    # Ctrl-C reaches the whole group, but the parent decides how it ends.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if not select.select([asked], [], [], SLOW_S)[0]:
+        _say(f"importing '{module}', at most {IMPORT_S:g} s")
+        if not select.select([asked], [], [], IMPORT_S - SLOW_S)[0]:
+            _say(f"'{module}' was not imported within {IMPORT_S:g} s")
+            os.kill(os.getppid(), signal.SIGTERM)
+            if not select.select([asked], [], [], SLOW_S)[0]:
+                os.kill(os.getppid(), signal.SIGKILL)
+            return
+    if not os.read(asked, 1):
+        _say(f"'{module}' ended the process while it was imported")
+
+
+def _say(text: str) -> None:
+    os.write(2, f"{text}\n".encode())

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from rack.boards import Rack
 from rack.boards.config import CONFIGS, load, loads, wire
 from rack.boards.config.schema import RackConfig
 from rack.levels.references import MOVED, current, module_and_name
+from tests.processes import BOUND_S, RACK
 
 SYSTEMS = ("fig2", "nist-state-table", "rccl", "hic", "penn", "chimera", "cell/puma", "cell")
 
@@ -52,3 +58,39 @@ def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
         with Rack(each) as rack:
             digests.append(rack.run(0.2).digest)
     assert digests[0] == digests[1]
+
+
+def importing(folder: Path, source: str, *setup: str) -> subprocess.Popen[str]:
+    """Return a process that imports a user's module of this source."""
+    (folder / "theirs.py").write_text(source)
+    lines = ("from rack.levels import references", *setup, "references.module_and_name('theirs:Level')")
+    return subprocess.Popen(
+        [sys.executable, "-c", "\n".join(lines)], cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+def test_a_module_that_ends_the_process_is_named(tmp_path: Path) -> None:
+    process = importing(tmp_path, "import os\nos._exit(5)\n")
+    assert process.communicate(timeout=BOUND_S) == (None, "'theirs' ended the process while it was imported\n")
+    assert process.returncode == 5
+
+
+def test_a_module_that_takes_long_is_named_and_ended(tmp_path: Path) -> None:
+    setup = "references.SLOW_S, references.IMPORT_S = 0.1, 0.2"
+    process = importing(tmp_path, "while True:\n    pass\n", setup)
+    said = process.communicate(timeout=BOUND_S)[1]
+    assert said == "importing 'theirs', at most 0.2 s\n'theirs' was not imported within 0.2 s\n"
+    assert process.returncode == -signal.SIGTERM
+
+
+@pytest.mark.slow
+def test_an_import_that_loops_is_interrupted_by_ctrl_c(tmp_path: Path, small: Path) -> None:
+    (tmp_path / "looping.py").write_text("while True:\n    pass\n")
+    text = small.read_text().replace("python_path = [", f'python_path = ["{tmp_path}", ')
+    small.write_text(text.replace("two_levels:Upper", "looping:Upper"))
+    process = subprocess.Popen([*RACK, "check", str(small)], stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert process.stderr.readline() == "importing 'looping', at most 60 s\n"
+    process.send_signal(signal.SIGINT)
+    assert process.wait(BOUND_S) == 130
+    process.stderr.close()
