@@ -153,7 +153,8 @@ class FaultTable:
 
 
 def _fill(entry: FaultEntry, injection: Injection) -> None:
-    words, when = entry.words, injection.when or (-1, 0, 0)
+    words = entry.words
+    when = injection.when or (-1, 0, 0)
     for word, value in (
         (Entry.KIND, injection.kind),
         (Entry.TASK, injection.task),

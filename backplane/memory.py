@@ -22,9 +22,12 @@ import numpy as np
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_MCL_CURRENT = 1
+_MCL_FUTURE = 2
+_MCL_ONFAULT = 4
 _POPULATE_READ, _POPULATE_WRITE = 22, 23  # MADV_*, since Linux 5.14; without them pages are touched by the first cycles
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_MAX = -4
 RESERVE = 4 << 20
 """Bytes of heap kept beyond those in use."""
 GAP = 16
@@ -86,6 +89,7 @@ def _used(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
     if not len(used):
         return
     breaks = np.flatnonzero(np.diff(used) > GAP)
-    firsts, lasts = used[np.append(0, breaks + 1)], used[np.append(breaks, len(used) - 1)] + 1
+    firsts = used[np.append(0, breaks + 1)]
+    lasts = used[np.append(breaks, len(used) - 1)] + 1
     for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
         yield start + first * page, start + last * page

@@ -91,7 +91,8 @@ class OperatorTable:
     """The table of one rack. `entries` holds all entries, free ones too."""
 
     def __init__(self, segment: Segment) -> None:
-        self._segment, self._words = segment, segment.words
+        self._segment = segment
+        self._words = segment.words
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
     def add(self, request: Request) -> RequestEntry:

@@ -80,7 +80,10 @@ def pin(core: int) -> None:
 
 LATENCY_REQUEST = Path("/dev/cpu_dma_latency")
 """Device that takes the longest permitted wake-up time of a core, us, while it is open."""
-_PR_SET_NAME, _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK, _PR_SET_CHILD_SUBREAPER = 15, 1, 29, 36
+_PR_SET_NAME = 15
+_PR_SET_PDEATHSIG = 1
+_PR_SET_TIMERSLACK = 29
+_PR_SET_CHILD_SUBREAPER = 36
 _libc = ctypes.CDLL(None, use_errno=True)
 
 

@@ -27,8 +27,10 @@ class Ring:
         self, memory: memoryview, dtype: np.dtype, head: memoryview, oldest: Callable[[], int] = lambda: 0
     ) -> None:
         # As plain bytes: copying by field would skip the padding, and checksums would not match.
-        self._rows, self._dtype = np.frombuffer(memory, dtype=f"V{dtype.itemsize}"), dtype
-        self._head, self._oldest = head, oldest
+        self._rows = np.frombuffer(memory, dtype=f"V{dtype.itemsize}")
+        self._dtype = dtype
+        self._head = head
+        self._oldest = oldest
         self._depth = len(self._rows)
         self._taken = 0
 

@@ -78,7 +78,9 @@ class Segment:
             # Otherwise a full /dev/shm would raise SIGBUS at the first access to a page.
             os.posix_fallocate(fd, 0, size)
             segment = cls(layout.rack, mmap.mmap(fd, size), fd)
-            segment.layout, segment.config, segment.map = layout, config, places
+            segment.layout = layout
+            segment.config = config
+            segment.map = places
             segment._fill_head(texts)
             segment._take_name()
         except OSError as error:
@@ -272,7 +274,8 @@ def _shm_name(rack: str) -> str:
 
 
 def _field(entry: dict[str, Any]) -> FieldSpec:
-    shape, fields = tuple(entry["shape"]), tuple(_field(f) for f in entry["fields"])
+    shape = tuple(entry["shape"])
+    fields = tuple(_field(f) for f in entry["fields"])
     values = tuple((name, number) for name, number in entry["values"])
     length = entry.get("length") and tuple(entry["length"])
     return FieldSpec(**{**entry, "shape": shape, "fields": fields, "values": values, "length": length})

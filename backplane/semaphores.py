@@ -23,8 +23,10 @@ from rack.backplane.layout import Layout
 from rack.backplane.segment import PREFIX, SHM_FOLDER, no_room
 
 _libc = ctypes.CDLL(None)
-_sem_open, _sem_clockwait = _libc.sem_open, _libc.sem_clockwait
-_sem_open.argtypes, _sem_open.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
+_sem_open = _libc.sem_open
+_sem_clockwait = _libc.sem_clockwait
+_sem_open.argtypes = (ctypes.c_char_p, ctypes.c_int)
+_sem_open.restype = ctypes.c_void_p
 _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 
 

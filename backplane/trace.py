@@ -56,7 +56,8 @@ _TICK, _END, _FLAGS = (FIELDS.index(name) for name in ("tick", "end_ns", "flags"
 _RECORD = TRACE_RECORD_SIZE // 8
 # Native alignment: each number is stored whole.
 _PACK = Struct(f"@{len(FIELDS)}q").pack_into
-_TRACE_HEAD, _BUS_ERROR = int(Block.TRACE_HEAD), int(Flag.BUS_ERROR)
+_TRACE_HEAD = int(Block.TRACE_HEAD)
+_BUS_ERROR = int(Flag.BUS_ERROR)
 
 
 class TraceWriter:
@@ -98,7 +99,8 @@ class CycleRecord:
         """Newest release whose cycle has ended with every access done; -1: none, or not known."""
         count = self._block[_TRACE_HEAD]
         at = self._at(count)
-        flags, tick = self._words[at + _FLAGS], self._words[at + _TICK]
+        flags = self._words[at + _FLAGS]
+        tick = self._words[at + _TICK]
         return tick if count and not flags & _BUS_ERROR and self._keeps(count) else -1
 
     def ended_ns(self, tick: int) -> int | None:
@@ -106,7 +108,8 @@ class CycleRecord:
         count = self._block[_TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)
-            found, ended_ns = self._words[at + _TICK], self._words[at + _END]
+            found = self._words[at + _TICK]
+            ended_ns = self._words[at + _END]
             if not self._keeps(number) or found < tick:
                 return None
             if found == tick:

@@ -43,7 +43,8 @@ class Event:
     since: int = -1
 
 
-DEMANDED, NO_TORQUE = "a stop is demanded", "no torque"
+DEMANDED = "a stop is demanded"
+NO_TORQUE = "no torque"
 """Reasons for which brakes engage: on a demand, of which other events say why, or because no torque came in time."""
 HELD_MS = 5e3
 """Time on end for which an arm may be braked, or a level held, in a run that succeeds, without a cause in sight."""
@@ -155,7 +156,9 @@ class Ending:
     """Judges the end of a run. `ends_run` and `silent` are as in `ClockWiring`."""
 
     def __init__(self, segment: Segment, ends_run: str | None, silent: int) -> None:
-        self._segment, self._ends_run, self._silent = segment, ends_run, silent
+        self._segment = segment
+        self._ends_run = ends_run
+        self._silent = silent
         self._observer = None if ends_run is None else open_observer(segment, ends_run)
 
     def final_state(self) -> tuple[str, str]:
@@ -181,7 +184,8 @@ class Ending:
         segment = self._segment
         if segment.words[System.DEMAND] or any(event.kind in ("fault", "command") for event in events):
             return
-        never, held = [], []
+        never = []
+        held = []
         for name, status in statuses(segment, "state"):
             block = segment.block(name)
             since = block[Block.LEVEL_SINCE]
@@ -208,7 +212,8 @@ class Ending:
         """Return the cause of the end of a run that was not stopped."""
         if self._observer is None or self._ends_run is None:
             return "time over"
-        status, fields = self._observer.peek().value, self._segment.layout.mailbox(self._ends_run).fields
+        status = self._observer.peek().value
+        fields = self._segment.layout.mailbox(self._ends_run).fields
         if status.state != State.ERROR and not self._silence():
             return "task done" if status.state == State.DONE else "time over"
         # The field `moves` of a status counts the moves of its program: none if it was refused.

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 EXCHANGE = "exchange"
 """Port, and message type, of the exchange."""
-AGE, TAKEN = "age", "taken"
+AGE = "age"
+TAKEN = "taken"
 """Ends of the names of its fields."""
 _NEW = Verdict.NEW  # for the hot path
 NEVER = -1
@@ -53,7 +54,8 @@ class PortAge:
 
 def ages_of(exchange: Message) -> dict[str, PortAge]:
     """Return the inputs of an exchange message that have a message in use, by label."""
-    names, values = exchange.record.dtype.names or (), iter(exchange.raw.cast("q"))
+    names = exchange.record.dtype.names or ()
+    values = iter(exchange.raw.cast("q"))
     labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
     found = {label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)}
     return {label: port for label, port in found.items() if port.taken != NEVER}
@@ -79,7 +81,8 @@ class ExchangeRecord:
 
     def fill(self, tick: int) -> None:
         """Note the messages in use, after the reads of the cycle released at `tick`."""
-        values, at = self._values, 0
+        values = self._values
+        at = 0
         for readings, key, reader in self._inputs:
             if readings[key].verdict is _NEW:
                 values[at + 1] = tick

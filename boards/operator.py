@@ -26,7 +26,8 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
 
 def describe(message: Message) -> str:
     """Return a command as one line: its verb, what it names, and its goal."""
-    what, goal = Operation(message.what).name.lower(), message.goal
+    what = Operation(message.what).name.lower()
+    goal = message.goal
     if goal == Goal.JOINTS:
         return f"{what} joints {_numbers(message.joints[: message.count])}"
     if goal == Goal.POSE:

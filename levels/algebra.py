@@ -52,7 +52,8 @@ def gram(matrix: Array) -> Array:
 
 def solve(matrix: Array, vector: Array) -> Array:
     """Return x (n,) with `matrix` x = `vector`; `matrix` (n, n) is symmetric and positive definite, like an inertia."""
-    factor, solution = matrix.copy(), np.empty(len(vector))
+    factor = matrix.copy()
+    solution = np.empty(len(vector))
     mujoco.mju_cholFactor(factor, LEAST_PIVOT)
     mujoco.mju_cholSolve(solution, factor, vector)
     return solution
@@ -62,7 +63,8 @@ def solve(matrix: Array, vector: Array) -> Array:
 def cholesky_solve(matrix: Array, vector: Array) -> Array:
     """Return the same as `solve`, to compiled callers."""
     size = len(vector)
-    factor, solution = np.zeros((size, size)), vector.copy()
+    factor = np.zeros((size, size))
+    solution = vector.copy()
     for row in range(size):
         for column in range(row + 1):
             rest = matrix[row, column]

@@ -54,10 +54,12 @@ def _jit(function: Any) -> Any:
     from numba import njit
 
     folder = _use_cache()
-    names, known = function.__code__.co_names, function.__globals__
+    names = function.__code__.co_names
+    known = function.__globals__
     called = {name: known[name].load() for name in names if isinstance(known.get(name), compiled)}
     bound = FunctionType(function.__code__, known | called, function.__name__, function.__defaults__)
-    bound.__module__, bound.__qualname__ = function.__module__, function.__qualname__
+    bound.__module__ = function.__module__
+    bound.__qualname__ = function.__qualname__
     function = njit(cache=bool(folder), error_model="numpy")(bound)
     if folder:
         _forgive(function._cache)
@@ -72,7 +74,9 @@ NEWS: list[Callable[[str], object]] = []
 
 def _forgive(kept: Any) -> None:
     """Let a function do without what is kept of it where that is damaged or cannot be written, and say so."""
-    load, save, files = kept.load_overload, kept.save_overload, kept._cache_file
+    load = kept.load_overload
+    save = kept.save_overload
+    files = kept._cache_file
 
     def save_sealed(name: str, found: Any) -> None:
         content: bytes = files._dump(found)
@@ -103,8 +107,10 @@ def _forgive(kept: Any) -> None:
         except Exception as error:
             _say(f"{kept.cache_path}: compiled code cannot be kept: {error}; {CURE}")
 
-    files._load_data, files._save_data = load_sealed, save_sealed
-    kept.load_overload, kept.save_overload = load_or_compile, save_if_possible
+    files._load_data = load_sealed
+    files._save_data = save_sealed
+    kept.load_overload = load_or_compile
+    kept.save_overload = save_if_possible
 
 
 def _tell(function: FunctionType) -> None:

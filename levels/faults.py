@@ -126,7 +126,8 @@ def sample_missing(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
 
 def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
     """Keep positions and velocities as they were when the fault began."""
-    first, truth = fault.first(sample), (sample.position, sample.velocity)
+    first = fault.first(sample)
+    truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)
     off = np.abs(stuck - truth)
     return sample._replace(position=stuck[0], velocity=stuck[1]), bool((off > APART).any()) if off.any() else None

@@ -161,8 +161,11 @@ class Orders:
         if message.id <= self.serial:
             return False
         self._before = self.basis, self.standing
-        self.serial, self._objection, self._reported = message.id, "", None
-        what, goal = message.what, message.goal
+        self.serial = message.id
+        self._objection = ""
+        self._reported = None
+        what = message.what
+        goal = message.goal
         if what not in self._commands or goal not in (self._commands[Operation(what)] or (Goal.NONE,)):
             self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
             return False
@@ -199,7 +202,9 @@ class Orders:
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
     def _answer(self, answer: Answer, why: str = "") -> None:
-        self.answer, self._objection, self._reported = answer, why, None
+        self.answer = answer
+        self._objection = why
+        self._reported = None
 
     def rests_on(self, above: int) -> int:
         """Return the newest command that this cycle rests on; `above` is that of the command from above."""
@@ -209,8 +214,11 @@ class Orders:
         """Fill the fields of `ANSWER` when they change."""
         rests_on = max(self.basis, above)
         if rests_on != self._reported:
-            status.operator, status.order, status.answer = rests_on, self.serial, self.answer
-            status.standing, status.objection = self.standing, self._objection
+            status.operator = rests_on
+            status.order = self.serial
+            status.answer = self.answer
+            status.standing = self.standing
+            status.objection = self._objection
             self._reported = rests_on
 
 

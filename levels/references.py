@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from types import ModuleType
 
-SLOW_S, IMPORT_S = 2.0, 60.0
+SLOW_S = 2.0
+IMPORT_S = 60.0
 """Time after which a user hears that a module is still being imported, and after which the process is ended."""
 
 MOVED = {

@@ -41,7 +41,8 @@ class WorldModel(Executor):
         self._params = read_params(WorldParams, context.params)
         bodies = context.sizes["bodies"]
         self._last, self._rest = np.zeros((2, bodies, 7))  # poses in the last scene, and in which bodies rested: m, 1
-        self._moving, self._slow_s = np.zeros(bodies, dtype=bool), np.zeros(bodies)
+        self._moving = np.zeros(bodies, dtype=bool)
+        self._slow_s = np.zeros(bodies)
         self._find = find_motion.load()
         self._seen_tick, self._interval = -1, 0  # tick of the last scene, and ticks since the one before it
         self._started = False
@@ -49,7 +50,8 @@ class WorldModel(Executor):
     @classmethod
     def preload(cls) -> None:
         """Load the compiled function."""
-        poses, rules = np.zeros((1, 7)), (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+        poses = np.zeros((1, 7))
+        rules = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
         vectors = np.zeros((1, 3))
         find_motion.load()(
             vectors, np.zeros((1, 4)), poses, poses, np.zeros(1, dtype=bool), np.zeros(1), vectors, rules
@@ -74,7 +76,8 @@ class WorldModel(Executor):
             self._interval = tick - self._seen_tick
             if self._follow(scene, model.velocity, self._interval * self.context.tick_s):
                 model.revision = tick + 1
-        model.position, model.quaternion = scene.position, scene.quaternion
+        model.position = scene.position
+        model.quaternion = scene.quaternion
         model.sensed = self._seen_tick = tick
 
     def _follow(self, scene: Message, velocity: Array, elapsed_s: float) -> bool:
@@ -119,7 +122,9 @@ def find_motion(
 @compiled
 def distance(position: Array, pose: Array) -> float:
     """Return the distance, m, of a position (3,) from that of a pose (7,)."""
-    x, y, z = position[0] - pose[0], position[1] - pose[1], position[2] - pose[2]
+    x = position[0] - pose[0]
+    y = position[1] - pose[1]
+    z = position[2] - pose[2]
     return math.sqrt(x * x + y * y + z * z)
 
 

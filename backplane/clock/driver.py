@@ -196,7 +196,8 @@ class RealtimeDriver(ClockDriver):
 
     def _release(self, tick: int, last: int) -> None:
         """Give every task its release in (last, tick]: those that sleep in time, the others at the grid point."""
-        due, point = self.due(tick, last), self._time_of(tick)
+        due = self.due(tick, last)
+        point = self._time_of(tick)
         sleeping = [task for task in due if task.sleeps]
         for task in sleeping:
             task.release(tick)
@@ -228,7 +229,8 @@ class RealtimeDriver(ClockDriver):
 
         The clock preempts all else on its core: if it wakes late, that core was away. Reports tell stalls by it.
         """
-        due_ns, has_ticked = self._time_of(tick + 1), self._woke_ns
+        due_ns = self._time_of(tick + 1)
+        has_ticked = self._woke_ns
         self._sleep_until(due_ns - self._lead_ns)
         self._woke_ns = time.monotonic_ns()
         now = (self._woke_ns + self._lead_ns - self._epoch_ns) // self._period_ns

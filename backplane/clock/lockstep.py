@@ -22,7 +22,8 @@ from rack.backplane.words import Run, System
 IDLE_S = 30.0
 """Bound of the wait for a recorder that is stopped, or dead and not replaced. Its launcher replaces it much sooner."""
 # Plain integers for the hot path.
-_FOLLOWER_PID, _FOLLOWER_TICK = int(System.FOLLOWER_PID), int(System.FOLLOWER_TICK)
+_FOLLOWER_PID = int(System.FOLLOWER_PID)
+_FOLLOWER_TICK = int(System.FOLLOWER_TICK)
 _HOLD_AT = int(System.HOLD_AT)
 LOOK_S = 0.001
 """Time between looks at what posts no semaphore: recorder and host, which must not be able to disturb the clock."""
@@ -70,7 +71,8 @@ class LockstepDriver(ClockDriver):
 
     def _wait_for_all(self, tick: int) -> bool:
         """Wait until `tick` may begin; False when the launcher is gone."""
-        order, slowest = self._last_first, None
+        order = self._last_first
+        slowest = None
         for task in order:
             if task.deadline > tick:
                 continue

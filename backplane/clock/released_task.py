@@ -45,7 +45,8 @@ class ReleasedTask:
         self.missed = 0
         self.is_stopped = False
         self.deadline = self.block[_DEADLINE]
-        self._every, self._phase = spec.every, spec.phase
+        self._every = spec.every
+        self._phase = spec.phase
         self._early = spec.every - segment.layout.due(spec)
         self._done = self.block[_DONE]
         self.wake: Callable[[], None] = wake_semaphore(segment.rack, spec.name).release
@@ -58,7 +59,8 @@ class ReleasedTask:
 
     def release(self, tick: int) -> None:
         """Give the task its newest release."""
-        block, every = self.block, self._every
+        block = self.block
+        every = self._every
         release = tick - (tick - self._phase) % every
         if self.is_stopped:
             self.check_stopped()
@@ -113,7 +115,8 @@ class ReleasedTask:
         block = self.block
         block[_DONE] = block[_RELEASED]
         block[_DEADLINE] = 0
-        self.missed, self.is_stopped = 0, False
+        self.missed = 0
+        self.is_stopped = False
         block[_LOST] = 0
 
 
@@ -133,7 +136,8 @@ class Watchdog:
 
     def check(self, task: ReleasedTask, tick: int) -> None:
         """Raise the alarms for a task that has missed a release by `tick`, and find out whether it hangs."""
-        missed, spec = task.missed, task.spec
+        missed = task.missed
+        spec = task.spec
         if missed == 1:
             late = Alarm.LATE if spec.role == "executor" else Alarm.PLAN_LATE
             self._alarms.ring(tick, late, task.index, missed, task.block[Block.DONE])
@@ -149,7 +153,8 @@ class Watchdog:
             self._alarms.ring(tick, Alarm.STARVED, task.index, missed, tick - missed * spec.every)
 
     def _hangs(self, task: ReleasedTask) -> bool:
-        spec, pid = task.spec, task.block[Block.PID]
+        spec = task.spec
+        pid = task.block[Block.PID]
         state = state_of(pid)
         if state in STOPPED:
             return True

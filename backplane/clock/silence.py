@@ -20,7 +20,9 @@ class SilentClock:
     """One task's check of a clock that makes no ticks."""
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
-        self._words, self._clock, self._alarms = segment.words, SystemClock(segment), alarms
+        self._words = segment.words
+        self._clock = SystemClock(segment)
+        self._alarms = alarms
         self._is_reported = False
         self._waited_at = -1
 
@@ -35,7 +37,8 @@ class SilentClock:
 
     def check(self) -> None:
         """Raise one alarm for a clock that makes no ticks: its process is stopped, dead, or silent for too long."""
-        now, newest = self._clock.now(), self._words[System.TICK]
+        now = self._clock.now()
+        newest = self._words[System.TICK]
         if now - newest < CLOCK_TICKS:
             self._is_reported = False
             return

@@ -27,8 +27,11 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, Head, Run, System
 
 # Plain integers for the hot path.
-_RELEASED, _STATE, _STOPPED = int(Block.RELEASED), int(System.STATE), int(Run.STOPPED)
-_EPOCH, _PERIOD = int(System.EPOCH_NS), int(System.PERIOD_NS)
+_RELEASED = int(Block.RELEASED)
+_STATE = int(System.STATE)
+_STOPPED = int(Run.STOPPED)
+_EPOCH = int(System.EPOCH_NS)
+_PERIOD = int(System.PERIOD_NS)
 CHECK_S = 0.25
 """A longer wait checks whether the launcher is still alive."""
 NEAR_NS = 25_000_000
@@ -72,7 +75,9 @@ class NextCycle:
 
         Sets `skipped` to the releases that passed since the last one.
         """
-        words, block, is_posted = self._words, self._block, self._is_posted
+        words = self._words
+        block = self._block
+        is_posted = self._is_posted
         while True:
             # Read first: a task that is late for the run's last release still takes it, so that the miss is seen.
             is_over = words[_STATE] == _STOPPED
@@ -92,7 +97,8 @@ class NextCycle:
 
     def _take(self, newest: int) -> int:
         """Take the oldest release that has not passed."""
-        every, expected = self._spec.every, self._due
+        every = self._spec.every
+        expected = self._due
         release = max(expected, newest - self._slack)
         self.skipped = (release - expected) // every
         self._due = release + every
@@ -107,12 +113,14 @@ class NextCycle:
 
     def _sleep(self) -> bool:
         """Sleep to the next release's grid point or, if that has passed, to the task's next one or a late release."""
-        words, now = self._words, monotonic_ns()
+        words = self._words
+        now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
         is_due = False
         # Before its start the clock has no grid. It then wakes every task once.
         if epoch := words[_EPOCH]:
-            point, step = epoch + self._due * words[_PERIOD], self._spec.every * words[_PERIOD]
+            point = epoch + self._due * words[_PERIOD]
+            step = self._spec.every * words[_PERIOD]
             if now < point < now + NEAR_NS:
                 sleep((point - now) * 1e-9)
                 return True
@@ -134,7 +142,8 @@ class NextCycle:
         return not self._semaphore.wait() or self._look_around()
 
     def _spin(self) -> bool:
-        block, due = self._block, self._due
+        block = self._block
+        due = self._due
         for _ in range(SPINS):
             if block[_RELEASED] >= due:
                 return True

@@ -31,7 +31,8 @@ class MailboxRing(Ring):
 
     def __init__(self, segment: Segment, name: str) -> None:
         spec = segment.layout.mailbox(name)
-        address, self._stride = segment.map.mailboxes[name], slot_stride(spec)
+        address = segment.map.mailboxes[name]
+        self._stride = slot_stride(spec)
         self._box = segment.words[address // 8 : address // 8 + len(Box)]
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
         oldest = partial(segment.oldest, address + 8 * Box.HEAD)
@@ -44,7 +45,8 @@ class MailboxRing(Ring):
         if not len(rows):
             return Drained(rows, lost)
         serials = np.arange(self._taken - len(rows), self._taken) + 1
-        holder, signatures = self._box[Box.CLAIMANT], rows["epoch"]
+        holder = self._box[Box.CLAIMANT]
+        signatures = rows["epoch"]
         lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < epoch_of(holder))
         if not lawful[-1]:
             # The writer does not know of this message, and will write its own in that place.

@@ -22,7 +22,9 @@ from rack.backplane.words import Box
 
 SPARE = 2
 """Slots more than messages may wait: the one being written, and one that the adapter copies meanwhile."""
-_HEAD, _TAKEN, _REFUSED = int(Box.HEAD), int(Box.TAKEN), int(Box.REFUSED)
+_HEAD = int(Box.HEAD)
+_TAKEN = int(Box.TAKEN)
+_REFUSED = int(Box.REFUSED)
 
 
 class HostWriter(DoubleBufferWriter):
@@ -75,7 +77,8 @@ class HostReader:
 
     def take(self) -> Message | None:
         """Take the oldest message that waits; None if it is bad. Valid until the next call."""
-        head, oldest = self._box[_HEAD], self._box[_TAKEN] + 1
+        head = self._box[_HEAD]
+        oldest = self._box[_TAKEN] + 1
         # Only a writer that does not keep to the rules overwrites what waits.
         serial = max(oldest, head - self.spec.depth + SPARE)
         self.superseded += serial - oldest
@@ -84,7 +87,8 @@ class HostReader:
 
     def take_newest(self, most: int) -> Message | None:
         """Take all that wait and return the newest good one, looking at no more than `most`; None: there is none."""
-        waiting, head = self.waiting, self._box[_HEAD]
+        waiting = self.waiting
+        head = self._box[_HEAD]
         self._box[_TAKEN] = head
         for back in range(min(waiting, most)):
             if (message := self._fetched(head - back)) is not None:

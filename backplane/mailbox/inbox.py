@@ -72,14 +72,17 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
     load = sum(source.service_ns / source.every_ns for source in sources)
     if load >= FULL_LOAD:
         return Burst(load, None, None)
-    inbox, free_ns, longest_ns = Inbox(1 << 62), 0, 0
+    inbox = Inbox(1 << 62)
+    free_ns = 0
+    longest_ns = 0
     for at_ns, service_ns in merge(*(_arrivals(source) for source in sources)):
         # The arrivals of one instant come together: the first period ends where the next one begins idle.
         if at_ns and at_ns >= free_ns:
             break
         end_ns = inbox.arrive(at_ns, service_ns)
         assert end_ns is not None, "it has room for all"
-        free_ns, longest_ns = end_ns, max(longest_ns, end_ns - at_ns)
+        free_ns = end_ns
+        longest_ns = max(longest_ns, end_ns - at_ns)
     return Burst(load, inbox.most_waiting, longest_ns)
 
 

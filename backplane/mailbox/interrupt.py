@@ -33,7 +33,9 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Slot
 
 # Plain integers for the hot path.
-_EPOCH, _SERIAL, _VISIBLE = int(Slot.EPOCH), int(Slot.SERIAL), int(Slot.VISIBLE_AT)
+_EPOCH = int(Slot.EPOCH)
+_SERIAL = int(Slot.SERIAL)
+_VISIBLE = int(Slot.VISIBLE_AT)
 
 
 def how_sent(spec: MailboxSpec) -> InterruptSpec:
@@ -80,7 +82,9 @@ class InterruptLine:
         self.served: deque[int] = deque(maxlen=MAX_STEP_BACK)
         """Serials served, the last few."""
         self._slots = slots = Slots(segment, spec)
-        self._box, self._heads, self._mask = slots.box, slots.heads, slots.mask
+        self._box = slots.box
+        self._heads = slots.heads
+        self._mask = slots.mask
         self._clock_ns = segment.layout.clock_ns
         self._sent_ns = sent_ns(spec, 0, self._clock_ns)
         self._passed = self._signature = self._missing = self._suspect = 0
@@ -94,7 +98,9 @@ class InterruptLine:
 
     def collect(self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]) -> None:
         """Append the messages sent up to an instant: when, `number`, and serial."""
-        head, heads, mask = self._box[0], self._heads, self._mask
+        head = self._box[0]
+        heads = self._heads
+        mask = self._mask
         serial = self._passed + 1
         self._suspect = 0
         if serial > head:
@@ -186,7 +192,8 @@ class InterruptReader(Reader):
 
     def __init__(self, segment: Segment, name: str, inbox: BoardInbox) -> None:
         super().__init__(segment, name)
-        self._inbox, self._line = inbox, inbox.lines[name]
+        self._inbox = inbox
+        self._line = inbox.lines[name]
 
     def read(self, tick: int) -> Reading:
         """Return the newest message served by the release at `tick`, with its verdict."""

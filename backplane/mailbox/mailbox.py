@@ -171,14 +171,20 @@ class Reader:
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
-        self._box, self._heads, self._places = slots.box, slots.heads, slots.places
-        self._mask, self._depth = slots.mask, slots.depth
+        self._box = slots.box
+        self._heads = slots.heads
+        self._places = slots.places
+        self._mask = slots.mask
+        self._depth = slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
         good = Slots(segment, self.spec)
-        self._record, self._covered, self._good = slots.record, slots.covered, good.record
+        self._record = slots.record
+        self._covered = slots.covered
+        self._good = good.record
         self.message = good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
-        self._new, self._unchanged = self._readings[Verdict.NEW], self._readings[Verdict.NONE]
+        self._new = self._readings[Verdict.NEW]
+        self._unchanged = self._readings[Verdict.NONE]
         self._signature = 0
         self.serial = 0
         """Serial of the last good message; 0: none."""
@@ -199,11 +205,13 @@ class Reader:
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict."""
         self.accesses += 1
-        serial, last = self._box[0], self.serial
+        serial = self._box[0]
+        last = self.serial
         if serial != last:
             # Older messages are overwritten: a serial beyond the slots fails when it is taken.
             oldest = last if serial - last < self._depth else serial - self._depth
-            heads, mask = self._heads, self._mask
+            heads = self._heads
+            mask = self._mask
             while serial > oldest and heads[serial & mask][_VISIBLE] > tick:
                 serial -= 1
         self.found = serial
@@ -231,14 +239,19 @@ class Reader:
         if epoch != self._signature:
             if not self.slots.is_lawful(self._signature):
                 return False
-            self._signature, self._unchanged = epoch, self._readings[Verdict.OLD]
+            self._signature = epoch
+            self._unchanged = self._readings[Verdict.OLD]
         self._good[:] = record
-        self.serial, self.newest, self.visible, self.basis = serial, tick, visible, basis
+        self.serial = serial
+        self.newest = tick
+        self.visible = visible
+        self.basis = basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading:
         """Take the newest good message before a lost, damaged or forged one, if it is unread."""
-        slots, tries = self.slots, MAX_STEP_BACK
+        slots = self.slots
+        tries = MAX_STEP_BACK
         for older in range(serial - 1, max(self.serial, serial - slots.depth), -1):
             if slots.holds(older) and slots.visible_at(older) <= tick:
                 if self._obtain(older):

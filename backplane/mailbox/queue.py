@@ -44,8 +44,12 @@ TAKEN = MessageType(
     ),
 )
 # Plain integers for the hot path.
-_HEAD, _REFUSED, _SENT, _POSITION = int(Box.HEAD), int(Box.REFUSED), int(Box.SENT), int(Box.POSITION)
-_EPOCH, _VISIBLE = int(Slot.EPOCH), int(Slot.VISIBLE_AT)
+_HEAD = int(Box.HEAD)
+_REFUSED = int(Box.REFUSED)
+_SENT = int(Box.SENT)
+_POSITION = int(Box.POSITION)
+_EPOCH = int(Slot.EPOCH)
+_VISIBLE = int(Slot.VISIBLE_AT)
 _PUT_POSITION = Struct("@2q").pack_into
 ALL = 1 << 62
 """Room for every message."""
@@ -118,10 +122,12 @@ class QueueWriter(Writer):
 
     def outgoing(self) -> Iterator[None]:
         """Put each message of the cycle into `message` in turn; the level finds its own content there again."""
-        slots, present = self._slots, bytes(self.message.raw)
+        slots = self._slots
+        present = bytes(self.message.raw)
         if self._shared[_HEAD] != slots.box[_HEAD]:
             self.intruder = pid_of(slots.heads[(self.serial + 1) & slots.mask][_EPOCH])
-        pending, self._pending = self._pending, []
+        pending = self._pending
+        self._pending = []
         for content in pending:
             self.message.raw[:] = content
             yield
@@ -169,8 +175,11 @@ class QueueReader(Reader):
         The newest taken is the value, the others are in `earlier`. `now`: the clock's tick, as in `Writer.write`.
         """
         self.accesses += 1
-        box, count, earlier = self._box, 0, list[Message]()
-        head, last = box[_HEAD], min(box[_SENT], self.taken + self._depth)
+        box = self._box
+        count = 0
+        earlier = list[Message]()
+        head = box[_HEAD]
+        last = min(box[_SENT], self.taken + self._depth)
         if head > last:
             self._blame_intruder(head)
         while count < most and self._sees(self.taken + 1, last, tick):
@@ -210,7 +219,8 @@ class QueueReader(Reader):
 
     def _count_bad(self, serial: int) -> None:
         """Count the fault of the message fetched last, which is not good."""
-        slots, statistics = self.slots, self.statistics
+        slots = self.slots
+        statistics = self.statistics
         statistics.bad_reads += 1
         if slots.serial != serial:
             statistics.lost += 1

@@ -116,7 +116,8 @@ class Slots:
         An intruder has published since this writer's last message; its message is overwritten. `damage`: bits of the
         message to flip in the slot.
         """
-        words, box = self.words, self.box
+        words = self.words
+        box = self.box
         before = words[_SERIAL]
         serial = before + 1
         at = serial & self.mask
@@ -195,7 +196,8 @@ class Slots:
 
         `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
         """
-        signature, holder = self.words[_EPOCH], self.box[_CLAIMANT]
+        signature = self.words[_EPOCH]
+        holder = self.box[_CLAIMANT]
         return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(holder)
 
     @property

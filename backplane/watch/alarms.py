@@ -34,7 +34,9 @@ PEER = -2
 """Subject of a demand on the arm that the loss of another rack makes."""
 
 
-BY_DEMAND, NO_TORQUE, AT_START = -1, -2, -3
+BY_DEMAND = -1
+NO_TORQUE = -2
+AT_START = -3
 """Why brakes engaged, where no error says it: on a demand, because no torque came in time, or had come at all."""
 
 

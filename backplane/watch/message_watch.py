@@ -28,7 +28,8 @@ class ReadFindings:
     """Raises alarms for the damaged and forged messages that a reader itself has found."""
 
     def __init__(self, reader: Reader, episodes: Episodes) -> None:
-        self._reader, self._episodes = reader, episodes
+        self._reader = reader
+        self._episodes = episodes
         self._corrupt = self._forged = 0
 
     def report(self, tick: int) -> None:
@@ -50,7 +51,9 @@ class MessageWatch:
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         self.seen = -1
-        self._reader, self._spec, self._episodes = reader, reader.spec, episodes
+        self._reader = reader
+        self._spec = reader.spec
+        self._episodes = episodes
         self._slots = reader.slots
         self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
@@ -94,7 +97,8 @@ class MessageWatch:
             found = slots.box[0]
         if not self._copies(found):
             return False
-        count, cycles = found - self.seen, (slots.tick - self.newest) // self._spec.every
+        count = found - self.seen
+        cycles = (slots.tick - self.newest) // self._spec.every
         if count <= cycles + 1:
             return False
         self._find(Alarm.BABBLE, tick, count / max(1, cycles))
@@ -102,8 +106,11 @@ class MessageWatch:
 
     def _walk(self, found: int, tick: int) -> None:
         """Judge the messages one by one, up to the newest found."""
-        slots, heads_and_bodies = self._slots, self._heads_and_bodies
-        mask, taken, late = slots.mask, self._reader.serial, self.late_from
+        slots = self._slots
+        heads_and_bodies = self._heads_and_bodies
+        mask = slots.mask
+        taken = self._reader.serial
+        late = self.late_from
         # A late reader cannot judge messages that are overwritten.
         for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
             head, body = heads_and_bodies[serial & mask]

@@ -23,7 +23,10 @@ MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
 STALE_CYCLES = 4
 LONG_AGO = -(1 << 62)
-_LOST, _CLAIMANT, _VOID, _KEPT = int(Block.LOST), int(Box.CLAIMANT), int(Box.VOID), int(Box.KEPT)
+_LOST = int(Block.LOST)
+_CLAIMANT = int(Box.CLAIMANT)
+_VOID = int(Box.VOID)
+_KEPT = int(Box.KEPT)
 
 
 class ReadingTask:
@@ -76,7 +79,9 @@ class SilenceWatch:
         self.quiet = 0 if spec.max_age else MUTE_CYCLES * spec.every if is_periodic else NOT_YET
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
-        self._reader, self._episodes, self._task = reader, episodes, task
+        self._reader = reader
+        self._episodes = episodes
+        self._task = task
         self._slots = reader.slots
         self._cycles = CycleRecord(segment, spec.writer)
         self._block = segment.block(spec.writer)
@@ -116,7 +121,8 @@ class SilenceWatch:
             # Messages come, but late.
             return False
         # In this order: a writer publishes before it reports the cycle as finished.
-        finished, slots = self._cycles.finished, self._slots
+        finished = self._cycles.finished
+        slots = self._slots
         head = slots.box[0]
         # A serial without a message was lost on the way, not suppressed.
         spec = self._reader.spec

@@ -17,7 +17,9 @@ from rack.backplane.words import Block, Slot
 
 # Plain integers for the hot path.
 _LOST = int(Block.LOST)
-_SERIAL, _TICK, _VISIBLE = int(Slot.SERIAL), int(Slot.TICK), int(Slot.VISIBLE_AT)
+_SERIAL = int(Slot.SERIAL)
+_TICK = int(Slot.TICK)
+_VISIBLE = int(Slot.VISIBLE_AT)
 
 
 class QueueWatch(MessageWatch):
@@ -31,7 +33,8 @@ class QueueWatch(MessageWatch):
 
     def judge(self, tick: int) -> None:
         """Judge the messages taken by the read at `tick`."""
-        queue, slots = self._queue, self._slots
+        queue = self._queue
+        slots = self._slots
         for serial in range(self.seen + 1, queue.taken + 1):
             # Its slot is the writer's again only when the writer learns that it has been taken.
             head = slots.heads[serial & slots.mask]
@@ -44,7 +47,8 @@ class QueueWatch(MessageWatch):
                 self._judge_time(released, head[_VISIBLE], tick)
         self.seen = queue.taken
         if queue.statistics.lost != self._lost:
-            lost, self._lost = queue.statistics.lost - self._lost, queue.statistics.lost
+            lost = queue.statistics.lost - self._lost
+            self._lost = queue.statistics.lost
             self._find(Alarm.GAP, tick, lost)
         self._findings.report(tick)
 
@@ -57,13 +61,15 @@ class WatchedQueue:
     ) -> None:
         self.reader = reader = QueueReader(segment, name)
         self._messages = QueueWatch(segment, reader, Episodes(segment, name, alarms))
-        self._task, self._room = task, room
+        self._task = task
+        self._room = room
         self._writer = segment.block(reader.spec.writer)
         self._bad_reads = 0
 
     def read(self, tick: int) -> Reading:
         """Take the messages visible at `tick`; the reading says whether their writer is lost."""
-        reader, messages = self.reader, self._messages
+        reader = self.reader
+        messages = self._messages
         reading = reader.take(tick, self._room(), self._task.now())
         is_bad = reader.statistics.bad_reads != self._bad_reads
         if is_bad:

@@ -55,24 +55,28 @@ class WatchedReader:
         self._messages = MessageWatch(segment, reader, episodes)
         self._silence = SilenceWatch(segment, reader, episodes, task)
         self._task = task
-        self._late_from, self._quiet = self._messages.late_from, self._silence.quiet
+        self._late_from = self._messages.late_from
+        self._quiet = self._silence.quiet
         self._writer = segment.block(reader.spec.writer)
         self._bad_reads = 0
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is lost."""
-        reader, messages = self.reader, self._messages
+        reader = self.reader
+        messages = self._messages
         reading = reader.read(tick)
         if reader.statistics.bad_reads != self._bad_reads:
             self._bad_reads = reader.statistics.bad_reads
             self._task.troubles += 1
             messages.judge(tick)
         elif reader.found != messages.seen:
-            found, newest = reader.found, reader.newest
+            found = reader.found
+            newest = reader.newest
             # The usual case of `judge`: the next message, good and in time.
             if 0 < found == messages.seen + 1 and messages.newest < newest > reader.visible - self._late_from:
-                messages.seen, messages.newest = found, newest
+                messages.seen = found
+                messages.newest = newest
             else:
                 messages.judge(tick)
         if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(tick):

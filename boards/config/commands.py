@@ -71,7 +71,8 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
     name = f"{command.level}.operator"
     index, spec = next((at, box) for at, box in enumerate(layout.mailboxes) if box.name == name)
     message = Message(message_dtype(spec.fields, spec.size))
-    message.what, message.goal = command.said, (command.goals or [Goal.NONE])[0]
+    message.what = command.said
+    message.goal = (command.goals or [Goal.NONE])[0]
     if command.joints is not None:
         message.count = len(command.joints)
         message.joints[: message.count] = command.joints

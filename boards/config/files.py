@@ -95,7 +95,8 @@ def file_at(path: Path) -> Path | None:
 def anchor(tables: Tables, folder: Path) -> Tables:
     """Return the tables with absolute paths, resolved from `folder`, or for a bundled model from configs/."""
     anchored = dict(tables)
-    robot, own = tables.get("robot"), tables.get("python_path")
+    robot = tables.get("robot")
+    own = tables.get("python_path")
     if isinstance(robot, dict) and isinstance(robot.get("model"), str):
         anchored["robot"] = {**robot, "model": str(_find(robot["model"], folder) or folder / robot["model"])}
     if isinstance(own, list) and all(isinstance(item, str) for item in own):

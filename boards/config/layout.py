@@ -26,7 +26,8 @@ SUSTAINED = 4
 """Messages a cycle of the writer, on average, of which a recorder loses none however deep the queue is."""
 WORD_BYTES = 4
 """Bytes of a word of `[protocol.interrupt]`: of the 68020's bus."""
-NS_PER_US, NS_PER_MS = 1e3, 1e6
+NS_PER_US = 1e3
+NS_PER_MS = 1e6
 
 
 def obtained_core(core: int) -> int:
@@ -51,7 +52,8 @@ def shared_out(config: RackConfig) -> list[str]:
 def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
     """Return how an executor reads the ports listed in its board's table, by port; times in ticks."""
     board = ports.place.board
-    every, phase = wiring.every[board], wiring.config.board[board].phase
+    every = wiring.every[board]
+    phase = wiring.config.board[board].phase
     return {
         port: ExchangeSpec(board, every * entry.every, phase + every * entry.phase, entry.asynchronous)
         for port, entry in ports.exchange.items()
@@ -140,7 +142,8 @@ class LayoutMaker:
 
         Between tasks of one slot, and into the network adapter, which reads shared memory, nothing is interrupted.
         """
-        clock_ns, table = self._config.clock_ns, self._config.protocol.interrupt
+        clock_ns = self._config.clock_ns
+        table = self._config.protocol.interrupt
         spared = {task.slot for task in readers if task.role == "host" or self._wiring.is_of_network(task.board)}
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
@@ -164,7 +167,8 @@ class LayoutMaker:
         return min(round(sum(parts) * NS_PER_MS) or self._config.clock_ns, longest_ns)
 
     def _task(self, place: TaskPlace) -> TaskSpec:
-        board, every = self._config.board[place.board], self._wiring.every[place.board]
+        board = self._config.board[place.board]
+        every = self._wiring.every[place.board]
         wake = board.wake or self._config.clock.wake
         is_planner = place.role == "planner"
         return TaskSpec(

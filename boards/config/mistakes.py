@@ -61,7 +61,10 @@ def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int 
 
 def _declared(model: type[BaseModel], keys: list[int | str], table: Any) -> tuple[list[str], FieldInfo | None]:
     """Return the names of all keys of the table that contains the last of `keys`, and that key's field."""
-    models, known, field, is_name = [model], dict[str, FieldInfo](), None, False
+    models = [model]
+    known = dict[str, FieldInfo]()
+    field = None
+    is_name = False
     for key in keys:
         models = [kind for kind in models if _fits(kind, table)] or models
         try:

@@ -11,7 +11,8 @@ from rack.levels.tables import Table
 
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Microseconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
-UNREAD, MOST_UNREAD = 32, 4096
+UNREAD = 32
+MOST_UNREAD = 4096
 """Default and greatest depth of a queue, messages."""
 
 

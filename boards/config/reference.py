@@ -112,7 +112,8 @@ def _tables(model: type[BaseModel], name: str, place: Place) -> Iterator[KeyTabl
 
 def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[KeyTable]:
     """Yield a table, then its subtables."""
-    properties, required = schema.get("properties", {}), schema.get("required", ())
+    properties = schema.get("properties", {})
+    required = schema.get("required", ())
     inner = {key: list(_inner(entry, known, Place(key))) for key, entry in properties.items()}
     keys = [_key(key, properties[key], key in required) for key, found in inner.items() if not found]
     if keys:

@@ -110,7 +110,8 @@ class Resolved:
 
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task ends."""
-        clock, tick_ns = self.config.clock, self.config.clock_ns
+        clock = self.config.clock
+        tick_ns = self.config.clock_ns
         return ClockWiring(
             lockstep=clock.mode == "lockstep",
             period_ns=round(tick_ns / clock.speed),
@@ -240,7 +241,8 @@ class _Examined:
 
     def resolved(self) -> Resolved:
         """Return everything derived from a config without mistakes."""
-        config, layout = self._config, self._layout
+        config = self._config
+        layout = self._layout
         assert layout is not None, "no mistakes"
         faults = injections(config, layout)
         failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
@@ -254,7 +256,8 @@ class _Examined:
         return Resolved(config, layout, tasks, hosts, faults, requests(config, layout), at)
 
     def _host(self, ports: TaskPorts) -> HostWiring:
-        config, name = self._config, ports.place.board
+        config = self._config
+        name = ports.place.board
         return HostWiring(
             board=name,
             target=reference(config, ports.place),
@@ -266,10 +269,12 @@ class _Examined:
         )
 
     def _task(self, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:
-        board, spec = self._config.board[ports.place.board], layout.task(ports.task)
+        board = self._config.board[ports.place.board]
+        spec = layout.task(ports.task)
         is_executor = spec.role == "executor"
         # What is on the host side, a bus adapter exchanges by itself.
-        of_host, from_host = self._wiring.of_host, self._wiring.from_host
+        of_host = self._wiring.of_host
+        from_host = self._wiring.from_host
         critical = not is_executor and is_critical(self._config, layout, spec.board)
         return TaskWiring(
             task=ports.task,
@@ -288,7 +293,8 @@ class _Examined:
         )
 
     def _contexts_of_boards(self) -> dict[str, LevelContext]:
-        every, boards = self._wiring.every, self._config.board
+        every = self._wiring.every
+        boards = self._config.board
         paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
         return {
             name: self._context(
@@ -328,7 +334,8 @@ def validated(tables: Tables) -> RackConfig:
         broken = _broken(error)
         config = _intact(tables, broken)
         extend_path(config.python_path)
-        faults, commands = _readable(tables, "fault", FaultConfig), _readable(tables, "command", CommandConfig)
+        faults = _readable(tables, "fault", FaultConfig)
+        commands = _readable(tables, "command", CommandConfig)
         found = mistakes_of(error, RackConfig, tables)
         raise ConfigError([*found, *_Examined(config, faults, commands, broken).mistakes]) from None
     extend_path(config.python_path)

@@ -24,7 +24,8 @@ PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None) -> RackTiming:
     """Return the timing model's record of a rack, with the budgets `found`, by board; default: the config's own."""
     found = budgets(config) if found is None else found
-    goal_ms, clock_cost_ns = config.timing.response_ms, round(config.timing.clock_ms * NS_PER_MS)
+    goal_ms = config.timing.response_ms
+    clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
     parts = (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else ()
     return RackTiming(
         is_lockstep=config.clock.mode == "lockstep",
@@ -50,7 +51,8 @@ def inboxes(layout: Layout) -> dict[str, InboxTiming]:
     found = {}
     for slot in dict.fromkeys(task.slot for task in layout.tasks):
         if boxes := layout.interrupting(slot):
-            name, names = layout.handler(slot), tuple(box.name for box in boxes)
+            name = layout.handler(slot)
+            names = tuple(box.name for box in boxes)
             how = [how_sent(box) for box in boxes]
             times = zip(boxes, how, strict=True)
             sources = [InterruptSource(box.every * layout.clock_ns, sent.service_ns) for box, sent in times]

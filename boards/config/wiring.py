@@ -183,7 +183,9 @@ def _outputs(given: Mapping[str, MessageType | Output]) -> dict[str, Output]:
 
 
 def _connections(config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input]) -> Iterator[Connection]:
-    own, wired, table = {place.board}, rewired(config, place), _own_table(config, place)
+    own = {place.board}
+    wired = rewired(config, place)
+    table = _own_table(config, place)
     neighbours = {"own": (place.board,), "above": getattr(table, "above", ()), "below": table.below}
     for port, entry in inputs.items():
         start, _, rest = entry.source.partition(".")
@@ -243,13 +245,16 @@ class Wiring:
         self.unknown |= {LAN} if "adapter" in broken or is_taken(config) else set()
 
     def _connected(self) -> dict[TaskPlace, TaskPorts]:
-        config, declared, types = self.config, dict[TaskPlace, TaskPorts](), dict[str, MessageType]()
+        config = self.config
+        declared = dict[TaskPlace, TaskPorts]()
+        types = dict[str, MessageType]()
         for place in (*config.tasks(), *config.hosts()):
             try:
                 declared[place] = declared_ports(config, place)
             except LookupError as error:
                 self.missing[place] = str(error.args[0])
-        found, before = declared, -1
+        found = declared
+        before = -1
         # What one board makes another may pass on.
         while len(types) != before:
             before = len(types)

@@ -108,7 +108,8 @@ class AlarmWatch:
 
     def __init__(self, segment: Segment, config: RackConfig) -> None:
         self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
-        robot, name = config.robot, partial(setting_name, config)
+        robot = config.robot
+        name = partial(setting_name, config)
         if robot is None:
             self._events = AlarmEvents(segment, name=name)
         else:
@@ -142,32 +143,47 @@ class AlarmEvents:
         geom: Callable[[int], str] = str,
         name: Callable[[str, int], str] = lambda board, number: str(number),
     ) -> None:
-        self._layout, self._faults, self._operator = segment.layout, FaultTable(segment), OperatorTable(segment)
-        self._joints, self._geom, self._name = joints, geom, name
+        self._layout = segment.layout
+        self._faults = FaultTable(segment)
+        self._operator = OperatorTable(segment)
+        self._joints = joints
+        self._geom = geom
+        self._name = name
 
     def of(self, row: np.void, owner: str) -> Event:
         """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring of task `owner`.
 
         The event's board is the one that raised the alarm; for a fault, restart or command, the one affected.
         """
-        alarm, number, value = Alarm(row["code"]), int(row["subject"]), float(row["value"])
-        kind, code, board, fault, since = KIND_OF.get(alarm, "detection"), alarm.name.lower(), owner, -1, row["since"]
+        alarm = Alarm(row["code"])
+        number = int(row["subject"])
+        value = float(row["value"])
+        kind = KIND_OF.get(alarm, "detection")
+        code = alarm.name.lower()
+        board = owner
+        fault = -1
+        since = row["since"]
         if kind == "fault":
-            entry, fault = self._faults.entries[number], number
-            subject, board = subject_of(entry, self._layout, self._joints), board_of(entry, self._layout)
+            entry = self._faults.entries[number]
+            fault = number
+            subject = subject_of(entry, self._layout, self._joints)
+            board = board_of(entry, self._layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
             what = describe_fault(entry, self._layout, self._joints, with_board=False)
             text = f"{what} {code}{self._duration(entry, code)}"
         elif alarm == Alarm.COMMANDED:
             request = self._operator.entries[number]
             subject = board = level_of(request, self._layout)
-            message, kind, since = message_of(request, self._layout), "command", -1
+            message = message_of(request, self._layout)
+            kind = "command"
+            since = -1
             code = Operation(message.what).name.lower()
             text = f"{describe(message)} (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
             demand = Demand(int(value))
             subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
-            kind, text = ("reaction" if demand else "recovery"), _demand(demand, subject)
+            kind = "reaction" if demand else "recovery"
+            text = _demand(demand, subject)
         else:
             subject, text = self._described(alarm, row, owner)
             text += f" for {self._span(value)}" if alarm == Alarm.BRAKES_CLOSED and value else ""
@@ -178,7 +194,9 @@ class AlarmEvents:
     def _described(self, alarm: Alarm, row: np.void, owner: str) -> tuple[str, str]:
         """Return the name of the subject of an alarm from `owner`, and its text."""
         about, text = TEXTS[alarm]
-        number, value, layout = int(row["subject"]), float(row["value"]), self._layout
+        number = int(row["subject"])
+        value = float(row["value"])
+        layout = self._layout
         subject = writer = ""
         if about == "task":
             subject = self._task(number, CLOCK)
@@ -189,9 +207,11 @@ class AlarmEvents:
         elif about == "brakes":
             subject = Error(number).name.lower() if number > 0 else ENGAGED_BY[-number]
         elif about == "geom":
-            subject, writer = self._geom(number), self._geom(int(value))
+            subject = self._geom(number)
+            writer = self._geom(int(value))
         elif about == "mailbox":
-            subject, writer = layout.mailboxes[number].name, layout.mailboxes[number].writer
+            subject = layout.mailboxes[number].name
+            writer = layout.mailboxes[number].writer
         counted = {f"{noun}s": counting(value, noun) for noun in ("release", "message", "tick")}
         named = {"subject": subject, "writer": writer, "since": int(row["since"]), **counted}
         return subject, text.format(**named, value=value, span=self._span(value), late_ms=value * 1e-6)

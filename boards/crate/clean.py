@@ -66,7 +66,9 @@ def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
 
 def clean() -> tuple[list[str], list[str], list[str]]:
     """Remove every rack that is not running; return names removed, names in use, and a line per foreign entry."""
-    removed, in_use, strange = [], [], []
+    removed = []
+    in_use = []
+    strange = []
     for rack in racks():
         try:
             if remove_dead(rack):

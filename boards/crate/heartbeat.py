@@ -56,7 +56,8 @@ class Heartbeat:
 
     def _clock_is_stuck(self) -> bool:
         """Say whether a silent clock is stopped, dead or waiting; one that is runnable is merely starved."""
-        state, tick = state_of(self._words[System.CLOCK_PID]), self._seen[CLOCK][0]
+        state = state_of(self._words[System.CLOCK_PID])
+        tick = self._seen[CLOCK][0]
         # Must be seen twice: after a pause of the whole machine the clock is about to be woken.
         waits = state in WAITING
         is_stuck = state in STOPPED + GONE or (waits and self._waited_at == tick)

@@ -28,7 +28,10 @@ class HostBoards:
         crate: CrateLine,
         journal: Journal,
     ) -> None:
-        self._segment, self._supervision, self._crate, self._journal = segment, supervision, crate, journal
+        self._segment = segment
+        self._supervision = supervision
+        self._crate = crate
+        self._journal = journal
         self._wirings = {wiring.board: wiring for wiring in wirings if not wiring.is_external}
         self._stopped: set[str] = set()
 

@@ -23,8 +23,10 @@ class HostOutput:
     """The pipe into which all processes of one host board print. The crate empties it to its own stdout."""
 
     def __init__(self, board: str) -> None:
-        self._board, self._rest = board, b""
-        self._lines, self._next = 0, MOST_LINES + 1
+        self._board = board
+        self._rest = b""
+        self._lines = 0
+        self._next = MOST_LINES + 1
         self.reader, self.writer = os.pipe()
         os.set_blocking(self.reader, False)
 

@@ -57,7 +57,8 @@ class RackAwaited:
     """Reports for which other rack an adapter waits in lockstep, which may take as long as it wants."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
-        self._segment, self._journal = segment, journal
+        self._segment = segment
+        self._journal = journal
         self._patience: Patience | None = None
 
     def look(self) -> None:
@@ -76,7 +77,8 @@ def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
 
     Raises `LaunchError` if a class cannot be preloaded, and when the time limit is exceeded.
     """
-    patience, doing = Patience(journal, limit_s), "the crate is starting"
+    patience = Patience(journal, limit_s)
+    doing = "the crate is starting"
     while not patience.is_over:
         if not crate.line.poll(patience.left_s):
             patience.report(doing)
@@ -85,7 +87,8 @@ def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
             case Opened():
                 return
             case Preloading(kind):
-                patience, doing = Patience(journal, limit_s), f"preloading '{kind}'"
+                patience = Patience(journal, limit_s)
+                doing = f"preloading '{kind}'"
             case Compiling(function):
                 patience.renew(COMPILE_S)
                 doing = f"compiling '{function}', which is kept for later launches"

@@ -150,7 +150,8 @@ class Rack:
             self._journal.add("ready", "", note)
 
     def _set_words(self) -> None:
-        words, clock = self.segment.words, self.config.clock
+        words = self.segment.words
+        clock = self.config.clock
         # The latch is set at first: until it is reset, the brakes stay engaged.
         words[System.EMERGENCY_STOP] = 1
         words[System.LOCKSTEP] = clock.mode == "lockstep"
@@ -258,7 +259,8 @@ class Rack:
 
     def _listen(self, timeout_s: float) -> None:
         """Wait for the crate or an alarm, at most `timeout_s`."""
-        line, attention = self._line.line, self._line.attention
+        line = self._line.line
+        attention = self._line.attention
         for ready in wait([line, attention], timeout_s):
             if ready == attention:
                 os.eventfd_read(attention)
@@ -360,7 +362,8 @@ class Rack:
         """End everything: no process and no segment of this rack is left."""
         if self._crate is None:
             return
-        crate, self._crate = self._crate, None
+        crate = self._crate
+        self._crate = None
         try:
             if hasattr(self, "segment"):
                 self._end_boards()

@@ -31,7 +31,8 @@ class Supervision:
     """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have the same outcome."""
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
-        self._config, self._layout = config, layout
+        self._config = config
+        self._layout = layout
         self._restarts: dict[str, list[int]] = defaultdict(list)
         self._needs: dict[str, set[str]] = {CLOCK: set()}
         for task in layout.tasks:
@@ -62,7 +63,8 @@ class Supervision:
         common = self._config.supervision
         if task == CLOCK:
             return common.restarts, common.within_s
-        spec, config = self._layout.task(task), self._config
+        spec = self._layout.task(task)
+        config = self._config
         board = config.host[task] if spec.role == "host" else config.board[spec.board]
         most = common.restarts if board.restarts is None else board.restarts
         return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
@@ -87,7 +89,10 @@ class Recovery:
         wirings: Mapping[str, TaskWiring | ClockWiring],
         crate: CrateLine,
     ) -> None:
-        self._segment, self._supervision, self._wirings, self._crate = segment, supervision, wirings, crate
+        self._segment = segment
+        self._supervision = supervision
+        self._wirings = wirings
+        self._crate = crate
         self._waiting: list[str] = []
         self._starting: list[str] = []
 
@@ -110,7 +115,8 @@ class Recovery:
     def advance(self) -> list[str]:
         """Power on the boards that are due; return them."""
         self._starting = [name for name in self._starting if self._is_absent(name)]
-        absent, in_order = [*self._waiting, *self._starting], self._supervision.in_order(self._waiting)
+        absent = [*self._waiting, *self._starting]
+        in_order = self._supervision.in_order(self._waiting)
         due = [board for board in in_order if not self._supervision.must_wait(board, absent)]
         for board in due:
             self._waiting.remove(board)

@@ -69,7 +69,8 @@ class BoundCase:
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
         """The affected mailboxes that the reader reads; without a `reader`, those that any task reads."""
-        struck, reader = struck_mailboxes(self.layout, self.injection.mailbox, self.board), self.reader
+        struck = struck_mailboxes(self.layout, self.injection.mailbox, self.board)
+        reader = self.reader
         return tuple(m for m in struck if (reader in m.readers if reader else m.readers))
 
     @property

@@ -42,7 +42,8 @@ class StruckRack:
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
-        self.segment, self.driver = segment, driver
+        self.segment = segment
+        self.driver = driver
         self.clock = SystemClock(segment)
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
@@ -169,8 +170,11 @@ class FaultStage:
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
-        self._segment, self._words = segment, segment.words
-        self._rack, self._table, self._alarms = StruckRack(segment, driver), FaultTable(segment), driver.alarms
+        self._segment = segment
+        self._words = segment.words
+        self._rack = StruckRack(segment, driver)
+        self._table = FaultTable(segment)
+        self._alarms = driver.alarms
         self._observer = cache(lambda box: open_observer(segment, segment.layout.mailboxes[box].name))
         self.injected = 0
         self.awaited: dict[int, int] = {}
@@ -233,7 +237,8 @@ class FaultStage:
         return reading.is_there and int(getattr(reading.value, field)) == entry[Entry.WHEN_VALUE]
 
     def _begin(self, entry: FaultEntry, tick: int) -> None:
-        words, kind = entry.words, KINDS[entry[Entry.KIND]]
+        words = entry.words
+        kind = KINDS[entry[Entry.KIND]]
         words[Entry.FROM] = tick
         lasts = entry[Entry.TICKS]
         # Such a fault of a task stays active until the task's next cycle.

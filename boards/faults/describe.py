@@ -35,7 +35,8 @@ def joint_name(at: int, joints: Sequence[str]) -> str:
 
 def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
     """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
-    kind, stage = KINDS[entry[Entry.KIND]], entry.stage
+    kind = KINDS[entry[Entry.KIND]]
+    stage = entry.stage
     has_begun = stage in (Stage.ACTIVE, Stage.OVER)
     return {
         "fault": entry.index,

@@ -24,7 +24,8 @@ MOTOR = Consequence(reactions=BRAKED, recovery_s=0.6, latches=True)
 COMMAND = Consequence(reactions=BRAKED)
 # Any word of the message's head may be damaged: its serial, its ticks, its writer.
 DAMAGE = Consequence(own=(Alarm.GAP, Alarm.HELD_BACK, Alarm.DISORDER, Alarm.MASQUERADE, Alarm.MUTE))
-BIAS_RAD, NOISE_RAD = 0.02, 0.005
+BIAS_RAD = 0.02
+NOISE_RAD = 0.005
 """Sensor errors of at least this size must be detected."""
 
 

@@ -52,7 +52,8 @@ class MessageStep:
     """One fault on one mailbox, at `index` in the layout; this base class changes nothing. `held`: delayed messages."""
 
     def __init__(self, entry: FaultEntry, writer: Writer, index: int) -> None:
-        self.entry, self.writer = entry, writer
+        self.entry = entry
+        self.writer = writer
         self.onward: Send
         self.held: list[Held] = []
         self._seed = f"{entry[Entry.SEED]} {index}"
@@ -135,7 +136,8 @@ class Corrupt(MessageStep):
     def send(self, message: Outgoing) -> None:
         """Damage a message, or pass it on unchanged."""
         probability, bits, *_ = self.entry.parameters
-        chance, size = self.chance(message), 8 * self.writer.spec.size
+        chance = self.chance(message)
+        size = 8 * self.writer.spec.size
         if chance.random() < probability:
             self.acts(message)
             # Each bit at most once: a second flip would restore it.
@@ -158,7 +160,8 @@ class HoldLock(MessageStep):
 
     def send(self, message: Outgoing) -> None:
         """Stop or die while holding the lock; a stopped process releases it when it continues."""
-        writer, is_killed = self.writer, bool(self.entry.parameters[0])
+        writer = self.writer
+        is_killed = bool(self.entry.parameters[0])
         if isinstance(writer, LockWriter) and not self.entry[Entry.COUNT] and writer.lock.acquire():
             self.acts(message)
             os.kill(os.getpid(), signal.SIGKILL if is_killed else signal.SIGSTOP)
@@ -170,7 +173,8 @@ class FaultyWriter:
     """Replaces the writer of a mailbox that has faults. `index` is the mailbox's in the layout."""
 
     def __init__(self, writer: Writer, index: int) -> None:
-        self._writer, self._index = writer, index
+        self._writer = writer
+        self._index = index
         self._steps: dict[int, MessageStep] = {}
         self._first = self._publish
         self._late: list[Held] = []
@@ -217,7 +221,8 @@ class FaultyWriter:
     def flush(self, tick: int, now: int | None = None) -> None:
         """Publish the delayed messages that are due."""
         visible_at = self._writer.visible_at(tick, now)
-        late, self._late = self._late, []
+        late = self._late
+        self._late = []
         for held in late:
             held.send(self._writer, tick, visible_at, self._publish)
         for step in self._steps.values():

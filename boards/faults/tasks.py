@@ -79,7 +79,9 @@ class TaskFaults:
 
     def __init__(self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner) -> None:
         self._table = FaultTable(segment)
-        self._spec, self._outputs, self._level = spec, outputs, level
+        self._spec = spec
+        self._outputs = outputs
+        self._level = level
         self._clock = SystemClock(segment)
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
@@ -124,7 +126,8 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     cannot take a core from a board.
     """
     task = segment.layout.tasks[entry[Entry.TASK]]
-    block, clock = segment.block(task.name), SystemClock(segment)
+    block = segment.block(task.name)
+    clock = SystemClock(segment)
     pin(block[Block.CORE])
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
     while entry.stage == Stage.WAITING and not clock.is_stopped:

@@ -31,7 +31,9 @@ class HostBus:
     """
 
     def __init__(self, segment: Segment, wiring: HostWiring) -> None:
-        self._segment, self._words, self._wiring = segment, segment.words, wiring
+        self._segment = segment
+        self._words = segment.words
+        self._wiring = wiring
         layout = segment.layout
         self._is_paced = self._words[System.LOCKSTEP] and layout.pacers(layout.task(wiring.board))
         self.block = segment.block(wiring.board)
@@ -135,7 +137,8 @@ class HostBus:
 
     def words(self, address: int, count: int = 1) -> list[int]:
         """Return words of the crate's memory from a bus address on. Raises `ValueError` for an address without one."""
-        size, last = self._segment.map.size, address + WORD * count
+        size = self._segment.map.size
+        last = address + WORD * count
         if address % WORD or not 0 <= address < last <= size:
             raise ValueError(f"words of {WORD} bytes at 0x{address:06x} to 0x{last:06x}: the bus has 0 to 0x{size:06x}")
         return list(self._words[address // WORD : last // WORD])

@@ -92,7 +92,8 @@ class BusAdapter(Adapter):
         for port, table in self._tables.items():
             # What the process before this one has written, if the bridge is restarted.
             own = open_observer(segment, f"{self.context.board}.{port}")
-            before, writer = own.peek(), layout.mailbox(table.source).writer
+            before = own.peek()
+            writer = layout.mailbox(table.source).writer
             entry: Crossing
             if writer not in hosts:
                 entry = Outward(segment, own.spec.name, port, table, self._counts[port])
@@ -140,12 +141,16 @@ class BusAdapter(Adapter):
         states = {name: block[Block.STATE] for name, block in self._hosts.items()}
         lost = [name for name, block in self._hosts.items() if block[Block.LOST]]
         gone = [name for name, state in states.items() if state == TaskState.GIVEN_UP]
-        status.state, status.error, status.reason = State.EXECUTING, 0, ""
+        status.state = State.EXECUTING
+        status.error = 0
+        status.reason = ""
         if lost:
             # First: in lockstep the Rack may give it up at any tick, and the clock confirms that at one.
-            status.state, status.reason = State.HOLDING, f"host board '{lost[0]}' is lost: it is being restarted"
+            status.state = State.HOLDING
+            status.reason = f"host board '{lost[0]}' is lost: it is being restarted"
         elif gone:
-            status.state, status.reason = State.ERROR, f"host board '{gone[0]}' was given up"
+            status.state = State.ERROR
+            status.reason = f"host board '{gone[0]}' was given up"
         elif states and all(state == TaskState.ENDED for state in states.values()):
             status.state = State.DONE
 

@@ -105,7 +105,8 @@ class EntryCount:
     def passes(self, tick: int, written: int) -> None:
         """Count a message that reaches the other side at `tick`."""
         self.passed += 1
-        self.arrived, self.written = tick, written
+        self.arrived = tick
+        self.written = written
 
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
@@ -125,13 +126,19 @@ class Inward:
     """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read by ticks."""
 
     def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
-        self._ring, self._port, self._table, self._count = HostReader(segment, table.source), port, table, count
-        self._refused, self._superseded = count.refused, count.superseded
+        self._ring = HostReader(segment, table.source)
+        self._port = port
+        self._table = table
+        self._count = count
+        self._refused = count.refused
+        self._superseded = count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
         """Take what waits, and check it. In lockstep what a program sends is there once its computing is over."""
-        ring, count, out = self._ring, self._count, getattr(write, self._port)
+        ring = self._ring
+        count = self._count
+        out = getattr(write, self._port)
         waiting = ring.waiting if self._writer[Block.DEADLINE] <= tick else 0
         if self._table.asynchronous:
             for _ in range(min(waiting, self._table.most, out.room())):
@@ -142,15 +149,20 @@ class Inward:
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.passes(tick, ring.written)
-        count.refused, count.superseded = self._refused + ring.refused, self._superseded + ring.superseded
-        count.full, count.waiting = ring.full, ring.waiting
+        count.refused = self._refused + ring.refused
+        count.superseded = self._superseded + ring.superseded
+        count.full = ring.full
+        count.waiting = ring.waiting
 
 
 class Outward:
     """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it wakes them."""
 
     def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount) -> None:
-        self._writer, self._port, self._table, self._count = open_writer(segment, own), port, table, count
+        self._writer = open_writer(segment, own)
+        self._port = port
+        self._table = table
+        self._count = count
         self._source = open_observer(segment, table.source)
         readers = self._writer.spec.readers
         self._readers = [(segment.block(name), wake_semaphore(segment.rack, name)) for name in readers]
@@ -185,12 +197,15 @@ class Replayed:
     """
 
     def __init__(self, rows: Rows, port: str, is_queued: bool, since: int = NEVER) -> None:
-        self._rows, self._port, self._is_queued = rows, port, is_queued
+        self._rows = rows
+        self._port = port
+        self._is_queued = is_queued
         self._at = sum(tick <= since for tick, _ in rows) if is_queued else 0
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
         """Give out what the recorded run wrote up to this cycle."""
-        out, rows = getattr(write, self._port), self._rows
+        out = getattr(write, self._port)
+        rows = self._rows
         while self._at < len(rows) and rows[self._at][0] <= tick:
             out.raw[:] = rows[self._at][1]
             self._at += 1

@@ -14,8 +14,11 @@ from typing import Any, NamedTuple
 from rack.boards.lan.config import LanTable, Right
 from rack.boards.lan.keys import ALL_ALIVE, ASKED, any_alive, ask_keys, out_key, ping_key, pong_key, step_key
 
-IN, OUT = ("ingress",), ("egress",)
-SUBSCRIBE, PUT, TOKEN = ("declare_subscriber",), ("put",), ("liveliness_token",)
+IN = ("ingress",)
+OUT = ("egress",)
+SUBSCRIBE = ("declare_subscriber",)
+PUT = ("put",)
+TOKEN = ("liveliness_token",)
 WATCH_TOKENS = ("declare_liveliness_subscriber", "liveliness_query")
 ANYONE = "*"
 """Subject of rules for everyone; no rack may have this name."""
@@ -102,7 +105,8 @@ def _asking(own: str) -> Iterator[Permission]:
 
 
 def _configured(by_subject: dict[str, list[Permission]]) -> dict[str, Any]:
-    rules, policies = [], []
+    rules = []
+    policies = []
     for subject, allowed in by_subject.items():
         ids = [f"{subject}-{at}" for at in range(len(allowed))]
         for name, rule in zip(ids, allowed, strict=True):

@@ -81,9 +81,13 @@ class LanAdapter(Adapter):
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
         """Take the segment: its grid, and the mailboxes to exchange, continued where they stand."""
-        words, board, table = segment.words, self.context.board, self._table
+        words = segment.words
+        board = self.context.board
+        table = self._table
         launch = xxh3(bytes(words[Head.LAUNCHER_PID : Head.CREATED_NS + 1])) & _LAUNCH_MASK
-        self._words, self._rack, self._launch = words, segment.rack, launch
+        self._words = words
+        self._rack = segment.rack
+        self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
         self._clocks = Clocks(segment, self._peers, launch, self._grid)
         # In the time of a lease and a connection the token of every rack that is still there has come.
@@ -113,7 +117,8 @@ class LanAdapter(Adapter):
         """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
-        barrier, way = self._barrier, self._barrier or link
+        barrier = self._barrier
+        way = self._barrier or link
         for entry in self._imports.values():
             entry.open(way, link.sealer, self._grid)
         for export in self._exports.values():

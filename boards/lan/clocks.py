@@ -28,7 +28,8 @@ from rack.levels.peer import DRIFT_PPM
 
 RECENT = 32
 """Round trips of which the best one counts."""
-PING_NS, EAGER_NS = 500_000_000, 20_000_000
+PING_NS = 500_000_000
+EAGER_NS = 20_000_000
 """Time between two pings to a rack; the second before `EAGER` round trips have come back, to know it soon."""
 EAGER = 8
 UNANSWERED = 64
@@ -90,7 +91,8 @@ class ClockOffset:
         """Take a round trip; False if it cannot be one: it would have taken less than no time."""
         if trip.lasted_ns < 0 or trip.arrived < trip.sent or trip.answered < trip.received:
             return False
-        now, best = trip.arrived, self.best
+        now = trip.arrived
+        best = self.best
         if best is not None:
             apart = abs(trip.offset_ns - best.offset_ns)
             if apart > trip.uncertainty_ns(now) + best.uncertainty_ns(now):
@@ -124,7 +126,10 @@ class PeerClock:
         """Forget what was measured, if that was another launch, or before the rack was lost."""
         met = (self.peer.launch, self.peer.losses)
         if met != self.met:
-            self.met, self.due_ns, self.epoch_ns, self.clock_ns = met, 0, 0, 0
+            self.met = met
+            self.due_ns = 0
+            self.epoch_ns = 0
+            self.clock_ns = 0
             self.offset.forget()
             self.sent.clear()
 
@@ -137,7 +142,9 @@ class Responder:
     """Answers the pings of other racks from the network's threads, each rack's at a bounded rate."""
 
     def __init__(self, segment: Segment, launch: int) -> None:
-        self._rack, self._launch, self._words = segment.rack, launch, segment.words
+        self._rack = segment.rack
+        self._launch = launch
+        self._words = segment.words
         self._clock_ns = segment.layout.clock_ns
         self._put: dict[str, Any] = {}
         self._again: dict[str, int] = {}
@@ -146,7 +153,8 @@ class Responder:
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
         """Answer from now on."""
-        self._link, self._sealer = link, sealer
+        self._link = link
+        self._sealer = sealer
         link.on(f"rack/*/ping/{self._rack}", self._on_ping)
 
     def _on_ping(self, ping: Arrived) -> None:
@@ -167,7 +175,8 @@ class Responder:
             self._answer(asker, head, received)
 
     def _answer(self, asker: str, ping: Envelope, received: int) -> None:
-        key, words = f"rack/{self._rack}/pong/{asker}", self._words
+        key = f"rack/{self._rack}/pong/{asker}"
+        words = self._words
         if asker not in self._put:
             self._put[asker] = self._link.publish(key)
         grid = words[System.EPOCH_NS], words[System.PERIOD_NS], self._clock_ns
@@ -180,7 +189,9 @@ class Clocks:
     """Compares the clocks of all peers with ours; not in lockstep, where all racks have one simulated time."""
 
     def __init__(self, segment: Segment, peers: Peers, launch: int, grid: OwnGrid) -> None:
-        self._rack, self._launch, self._grid = segment.rack, launch, grid
+        self._rack = segment.rack
+        self._launch = launch
+        self._grid = grid
         self._clocks = {peer.rack: PeerClock(peer) for peer in peers}
         self._arrived: deque[tuple[int, Arrived]] = deque(maxlen=UNREAD)
         self.taken = self.refused = 0
@@ -241,7 +252,9 @@ class Clocks:
         sent = clock.sent.pop(head.serial, None)
         if sent is None or not clock.offset.add(RoundTrip(sent, received, head.stamp_ns, arrived_ns)):
             return False
-        clock.epoch_ns, clock.period_ns, clock.clock_ns = epoch, period, clock_ns
+        clock.epoch_ns = epoch
+        clock.period_ns = period
+        clock.clock_ns = clock_ns
         return True
 
     def is_unanswered(self, peer: PeerRack, tick: int) -> bool:
@@ -263,7 +276,8 @@ class Clocks:
             out.offset = out.ahead = out.speed = 0.0
             out.uncertainty = out.round_trip = 0.0 if self._grid.is_lockstep else -1.0
             return
-        out.offset, out.round_trip = best.offset_ns * 1e-9, best.lasted_ns * 1e-9
+        out.offset = best.offset_ns * 1e-9
+        out.round_trip = best.lasted_ns * 1e-9
         out.uncertainty = best.uncertainty_ns(self._now_ns) * 1e-9
         theirs = clock.time_ns(self._grid.stamp_ns(tick) + best.offset_ns)
         out.ahead = (theirs - self._grid.time_ns(tick)) * 1e-9

@@ -45,12 +45,17 @@ class MessageOrder:
 
     def __init__(self, count: ImportCount) -> None:
         self._count = count
-        self.launch, self.number, self.serial = NONE, 0, 0
+        self.launch = NONE
+        self.number = 0
+        self.serial = 0
         self._came = 0  # bit n: message `number` - n came
 
     def resume(self, launch: int, number: int, serial: int) -> None:
         """Continue after that message; those before it count as having come."""
-        self.launch, self.number, self.serial, self._came = launch, number, serial, _WHOLE
+        self.launch = launch
+        self.number = number
+        self.serial = serial
+        self._came = _WHOLE
 
     def admits(self, head: Envelope) -> bool:
         """Say whether a message is newer than all before it; count what is missing, or why it is not."""
@@ -63,7 +68,8 @@ class MessageOrder:
         step = max(0, head.number - self.number)
         self._count.missing += max(0, step - 1)
         self._came = (self._came << min(step, WINDOW) | 1) & _WHOLE
-        self.number, self.serial = head.number, head.serial
+        self.number = head.number
+        self.serial = head.serial
         return True
 
     def _begin(self, head: Envelope) -> None:
@@ -72,7 +78,10 @@ class MessageOrder:
             # Resumed in lockstep, where launches are not on record: it is the same one.
             self.launch = head.launch
         else:
-            self.launch, self.number, self.serial, self._came = head.launch, head.number - 1, 0, 0
+            self.launch = head.launch
+            self.number = head.number - 1
+            self.serial = 0
+            self._came = 0
 
     def _note_old(self, head: Envelope) -> None:
         bit = 1 << min(max(0, self.number - head.number), WINDOW)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from cryptography.x509 import Certificate
 
 SECRET_BYTES = 32
-AUTHORITY, SECRET = "authority.pem", "secret"
+AUTHORITY = "authority.pem"
+SECRET = "secret"
 MAX_CREDENTIAL_BYTES = 100_000
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
@@ -32,7 +33,8 @@ class Credential(Exception):
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}")
-        self.path, self.why = path, why
+        self.path = path
+        self.why = why
 
 
 class Credentials:
@@ -40,8 +42,10 @@ class Credentials:
 
     def __init__(self, folder: Path, rack: str) -> None:
         self.rack = rack
-        self.authority, self.secret_file = folder / AUTHORITY, folder / SECRET
-        self.certificate, self.key = folder / f"{rack}.pem", folder / f"{rack}-key.pem"
+        self.authority = folder / AUTHORITY
+        self.secret_file = folder / SECRET
+        self.certificate = folder / f"{rack}.pem"
+        self.key = folder / f"{rack}-key.pem"
 
     @cached_property
     def secret(self) -> bytes:

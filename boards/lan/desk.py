@@ -54,7 +54,9 @@ BYTES_A_CYCLE = MOST_CONTENT
 """Bytes of content after which a cycle answers no further question to read."""
 CLIENT_S = 2.0
 """Real time without a question of a client after which it counts as gone."""
-WATCHED_S, LINGER_S, PAUSE_S = 1.0, 0.3, 0.005
+WATCHED_S = 1.0
+LINGER_S = 0.3
+PAUSE_S = 0.005
 """At the end of a run: time since the last look from which nobody watches any more, how long those who do may still
 look, and how often the desk then has a cycle; real time."""
 STALE_S = 0.5
@@ -110,9 +112,12 @@ class Desk:
     """Answers the questions to one rack. An emergency stop from another machine is one of its `findings`."""
 
     def __init__(self, segment: Segment, grid: OwnGrid, permit: Permit, findings: list[Finding]) -> None:
-        self._segment, self._grid, self._findings = segment, grid, findings
+        self._segment = segment
+        self._grid = grid
+        self._findings = findings
         self._permit, self._names = permit
-        self._lines, self._table = UtilityLines(segment), OperatorTable(segment)
+        self._lines = UtilityLines(segment)
+        self._table = OperatorTable(segment)
         boxes = enumerate(segment.layout.mailboxes)
         self._boxes = {at: box for at, box in boxes if box.writer == CLOCK and box.name.endswith(".operator")}
         self._hosts = [segment.map.blocks[host.name] + 8 * Block.PID for host in segment.layout.hosts]
@@ -126,14 +131,16 @@ class Desk:
 
     def open(self, link: LanLink, launch: int) -> None:
         """Take questions from now on."""
-        self._sealer, self._launch = link.sealer, launch
+        self._sealer = link.sealer
+        self._launch = launch
         rights: tuple[Right, ...] = ("stop", "command", "watch")
         self._channels = {right: link.answer(f"rack/{link.rack}/ask/{ASKED[right]}/*/*") for right in rights}
 
     def answer(self, tick: int) -> None:
         """Answer the questions that have come, within the bounds of a cycle."""
         self._drop_stale(tick)
-        self._sent, self._tick = 0, tick
+        self._sent = 0
+        self._tick = tick
         for right, channel in self._channels.items():
             answers = 0
             for question in islice(channel(), QUESTIONS_A_CYCLE):
@@ -150,7 +157,8 @@ class Desk:
 
     def _drop_stale(self, tick: int) -> None:
         """Drop commands that waited while the rack was held: who gave them may have gone, or asks again."""
-        now, ticks = time.monotonic_ns(), tick - self._tick
+        now = time.monotonic_ns()
+        ticks = tick - self._tick
         if now - self._cycled_ns > STALE_S * 1e9 + ticks * self._segment.words[System.PERIOD_NS]:
             self.count.dropped += sum(1 for _ in self._channels.get("command", lambda: ())())
         self._cycled_ns = now
@@ -225,7 +233,8 @@ class Desk:
         return Code.GRANTED, b""
 
     def _read(self, payload: bytes) -> tuple[Code, bytes]:
-        memory, self._watched_ns = self._segment.bytes, time.monotonic_ns()
+        memory = self._segment.bytes
+        self._watched_ns = time.monotonic_ns()
         stretches = unpacked_stretches(payload, len(memory))
         if stretches is None:
             return Code.OUTSIDE, b""
@@ -278,7 +287,8 @@ class Desk:
 
     def _dismiss(self) -> None:
         """Let go of requests that have been issued, and withdraw those of clients that are gone."""
-        now, kept = time.monotonic_ns(), []
+        now = time.monotonic_ns()
+        kept = []
         for waiting in self._waiting:
             if waiting.waits and now < waiting.until_ns:
                 kept.append(waiting)

@@ -35,19 +35,25 @@ class Export:
     def __init__(self, segment: Segment, table: ExportConfig, launch: int) -> None:
         self._source = open_observer(segment, table.source)
         spec = self._source.spec
-        self._kind, self._launch = kind_of(spec.message, spec.version, message_dtype(spec.fields, spec.size)), launch
+        self._kind = kind_of(spec.message, spec.version, message_dtype(spec.fields, spec.size))
+        self._launch = launch
         self._key = out_key(segment.rack, table.source)
-        self._rate_hz, self.every, self.is_asked = table.rate_hz, 1, False
+        self._rate_hz = table.rate_hz
+        self.every = 1
+        self.is_asked = False
         self.sent = self.serial = 0
         self._put: Callable[[bytes, bytes], None]
 
     def resume(self, record: Any) -> None:
         """Continue with the counts in the status of an adapter before this one."""
-        self.sent, self.serial = int(record["sent"]), int(record["serial"])
+        self.sent = int(record["sent"])
+        self.serial = int(record["serial"])
 
     def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
         """Publish it."""
-        self._put, self._sealer, self._grid = way.publish(self._key), sealer, grid
+        self._put = way.publish(self._key)
+        self._sealer = sealer
+        self._grid = grid
         self.every = grid.cycles(self._rate_hz)
 
     def recall(self, tick: int, ticks: int) -> None:
@@ -58,22 +64,26 @@ class Export:
         before = self._source.serial
         self._source.read(tick)
         if self._source.serial == self.serial != before:
-            self.sent, self.serial = self.sent - 1, before
+            self.sent = self.sent - 1
+            self.serial = before
             self.exchange(tick)
 
     def exchange(self, tick: int) -> None:
         """Send the newest message, if it is new or asked for."""
         # Not the reading of the port: it does not say which message it is, and when that was written.
-        source, grid = self._source, self._grid
+        source = self._source
+        grid = self._grid
         reading = source.read(tick)
         if not reading.is_there:
             return
         if source.serial != self.serial:
-            self.sent, self.serial = self.sent + 1, source.serial
+            self.sent = self.sent + 1
+            self.serial = source.serial
         elif not self.is_asked or grid.is_lockstep:
             return
         self.is_asked = False
-        written, payload = source.newest, bytes(reading.value.raw)
+        written = source.newest
+        payload = bytes(reading.value.raw)
         times = written, grid.time_ns(written), grid.stamp_ns(written)
         head = Envelope(self._kind, self._launch, self.serial, self.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
@@ -93,13 +103,18 @@ class Import:
     def __init__(self, segment: Segment, own: str, table: ImportConfig, peer: PeerRack) -> None:
         spec = segment.layout.mailbox(own)
         dtype = message_dtype(spec.fields, spec.size)
-        self._kind, self._is_proper = kind_of(spec.message, spec.version, dtype), ProperContent(spec.fields)
+        self._kind = kind_of(spec.message, spec.version, dtype)
+        self._is_proper = ProperContent(spec.fields)
         self._buffer, self._key = Message(dtype), out_key(table.rack, table.mailbox)
-        self._max_age, self._delay, self._peer = spec.max_age, spec.delay, peer
+        self._max_age = spec.max_age
+        self._delay = spec.delay
+        self._peer = peer
         self._box = Slots(segment, spec).box
         self._word = int(Box.KEPT if peer.goes_on else Box.VOID)
-        self._is_away, self._losses = bool(self._box[self._word] & 1), peer.losses
-        self._rate_hz, self.every = table.rate_hz, 1
+        self._is_away = bool(self._box[self._word] & 1)
+        self._losses = peer.losses
+        self._rate_hz = table.rate_hz
+        self.every = 1
         self._basis: int | None = None
         # What came before its time, with the tick at which it came.
         self._early: list[tuple[int, Arrived]] = []
@@ -115,7 +130,9 @@ class Import:
 
     def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
         """Subscribe to it."""
-        self._arrived, self._sealer, self._grid = way.subscribe(self._key), sealer, grid
+        self._arrived = way.subscribe(self._key)
+        self._sealer = sealer
+        self._grid = grid
         self.every = grid.cycles(self._rate_hz)
 
     def is_old(self, tick: int) -> bool:
@@ -134,7 +151,8 @@ class Import:
 
     def exchange(self, out: Message, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
-        early, self._early = self._early, []
+        early = self._early
+        self._early = []
         newest: Envelope | None = None
         for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
             head = self._opened(arrived)
@@ -209,5 +227,6 @@ class Import:
         """Write its counts into the group of a status."""
         age = NEVER if self._basis is None else tick - self._basis
         age_s = -1.0 if age == NEVER else age * self._grid.tick_s
-        order, launch = self._order, NONE if self._grid.is_lockstep else self._order.launch
+        order = self._order
+        launch = NONE if self._grid.is_lockstep else self._order.launch
         fill_counts(record, (*self.count.values, launch, order.number, order.serial, age, age_s))

@@ -53,7 +53,8 @@ class Sealer:
     """Seals and opens envelopes with one secret. `flaws`: how often it has found each flaw."""
 
     def __init__(self, secret: bytes = b"", most_bytes: int = 1 << 20) -> None:
-        self._secret, self._most = secret, most_bytes
+        self._secret = secret
+        self._most = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
 
     def taking(self, most_bytes: int) -> Sealer:

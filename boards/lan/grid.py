@@ -17,7 +17,8 @@ class OwnGrid:
     """
 
     def __init__(self, segment: Segment, every: int = 1) -> None:
-        self._clock, self._clock_ns = SystemClock(segment), segment.layout.clock_ns
+        self._clock = SystemClock(segment)
+        self._clock_ns = segment.layout.clock_ns
         self._cycle_ns = every * self._clock_ns
         self.is_lockstep = self._clock.is_lockstep
         self.tick_s = self._clock_ns * 1e-9

@@ -131,7 +131,8 @@ class LanLink:
                 if (query := queryable.try_recv()) is None:
                     return
                 with query:
-                    asked, content = str(query.key_expr), _bytes_of(query.payload) or b""
+                    asked = str(query.key_expr)
+                    content = _bytes_of(query.payload) or b""
                     if "*" not in asked:
                         yield Question(asked, _bytes_of(query.attachment), content, _reply(query))
 
@@ -209,7 +210,8 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:
-    certificate, key = str(credentials.certificate), str(credentials.key)
+    certificate = str(credentials.certificate)
+    key = str(credentials.key)
     return {
         "root_ca_certificate": str(credentials.authority),
         "enable_mtls": True,

@@ -49,12 +49,14 @@ class Partner:
     """
 
     def __init__(self, rack: str, place: int) -> None:
-        self.rack, self.place = rack, place
+        self.rack = rack
+        self.place = place
         self.forget()
 
     def forget(self) -> None:
         """Await it anew."""
-        self.launch, self.time_ns = NONE, NEVER
+        self.launch = NONE
+        self.time_ns = NEVER
         self.steps: deque[Step] = deque()
         self.is_out = self.is_there = False
         self.gone_s: float | None = None
@@ -104,14 +106,17 @@ class Barrier:
         self._is_restarted = self.done >= 0
         # What has been passed on does not come again.
         self._passed_ns = self.done * self._tick_ns if self._is_restarted else NEVER
-        self._is_first, self._has_begun, self._has_refused = True, self._is_restarted, False
+        self._is_first = True
+        self._has_begun = self._is_restarted
+        self._has_refused = False
         self._block[Block.AWAITS] = 0
         self._exports: list[Arrived] = []
         self._imports: dict[str, deque[Arrived]] = {}
         self._changes: list[tuple[str, int, bool]] = []
         # A rack is one step ahead of what another has received, at most.
         self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
-        self._now_ns, self._sent = NEVER, 0
+        self._now_ns = NEVER
+        self._sent = 0
         self._events: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self._kept: list[object] = []
 
@@ -139,13 +144,15 @@ class Barrier:
 
     def changes(self) -> Iterator[tuple[str, int, bool]]:
         """Yield rack, launch, and whether it has come or gone, since the last call."""
-        changes, self._changes = self._changes, []
+        changes = self._changes
+        self._changes = []
         yield from changes
 
     def prepare(self, tick: int) -> None:
         """Make a step of what was published since the last one."""
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
-        content, self._exports = pack_step(self.cycle_ns, awaited, self._exports), []
+        content = pack_step(self.cycle_ns, awaited, self._exports)
+        self._exports = []
         if len(content) > MOST_STEP:
             self._refuse(f"a cycle exports {len(content)} bytes; lockstep permits {MOST_STEP}")
         self._steps.append((tick * self._tick_ns, content))
@@ -171,7 +178,8 @@ class Barrier:
         self._block[Block.AWAITS] = 0
         for partner in self._partners.values():
             self._pass_on(partner)
-        self._is_first, self._has_begun = False, True
+        self._is_first = False
+        self._has_begun = True
         return True
 
     def close(self) -> None:
@@ -216,7 +224,8 @@ class Barrier:
             if (found := launch_and_cycle(key)) is not None:
                 self._note_sign(partner, *found, sample.kind == zenoh.SampleKind.PUT)
             return
-        content, envelope = sample.payload.to_bytes(), sample.attachment
+        content = sample.payload.to_bytes()
+        envelope = sample.attachment
         head = self._sealer.opened(key, None if envelope is None else envelope.to_bytes(), content)
         step = None if isinstance(head, Flaw) else unpack_step(head, content)
         if step is not None and self._is_of(partner, step.launch):

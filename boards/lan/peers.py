@@ -72,7 +72,8 @@ class PeerRack:
             self.tokens.append(launch)
         if self.is_there and self.launch in (NONE, launch):
             # Without a number it was resumed in lockstep, where launches are not on record.
-            self.launch, self.confirm_by = launch, -1
+            self.launch = launch
+            self.confirm_by = -1
         else:
             self._enters(launch, tick)
 
@@ -92,8 +93,11 @@ class PeerRack:
     def leaves(self, tick: int) -> None:
         """Note that it is lost."""
         if self.is_there:
-            self.presence, self.since, self.confirm_by = Presence.LOST, tick, -1
-            self.losses, self.offset_ns = self.losses + 1, None
+            self.presence = Presence.LOST
+            self.since = tick
+            self.confirm_by = -1
+            self.losses = self.losses + 1
+            self.offset_ns = None
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _enters(self, launch: int, tick: int) -> None:
@@ -101,7 +105,8 @@ class PeerRack:
         self.leaves(tick)
         if launch != self.launch:
             self.offset_ns = None
-        is_first, is_new = self.presence is Presence.AWAITED, launch not in self._seen
+        is_first = self.presence is Presence.AWAITED
+        is_new = launch not in self._seen
         if is_new:
             self.launches += 1
             self._seen.append(launch)
@@ -109,26 +114,38 @@ class PeerRack:
         if not is_first:
             alarm = Alarm.PEER_RESTARTED if is_new else Alarm.PEER_BACK
             self.findings.append(Finding(alarm, self.number, tick - self.since))
-        self.presence, self.launch, self.since, self.confirm_by = Presence.THERE, launch, tick, -1
+        self.presence = Presence.THERE
+        self.launch = launch
+        self.since = tick
+        self.confirm_by = -1
 
     def joins(self, launch: int, tick: int) -> None:
         """Note, in lockstep, that it is there: from the start, or still when this adapter has been restarted."""
         if self.presence is Presence.AWAITED:
-            self.presence, self.launches, self.since = Presence.THERE, 1, tick
-        self.launch, self.confirm_by = launch, -1
+            self.presence = Presence.THERE
+            self.launches = 1
+            self.since = tick
+        self.launch = launch
+        self.confirm_by = -1
 
     def resume(self, message: Any, confirm_by: int) -> None:
         """Continue from the message that an adapter before this one wrote: see `rack.levels.peer.PEER`."""
-        self.presence, self.launch = Presence(message.presence), message.launch
-        self.launches, self.losses, self.since = message.launches, message.losses, message.since
+        self.presence = Presence(message.presence)
+        self.launch = message.launch
+        self.launches = message.launches
+        self.losses = message.losses
+        self.since = message.since
         self.confirm_by = confirm_by if self.is_there else -1
         if self.launch:
             self._seen.append(self.launch)
 
     def fill(self, message: Any, is_lockstep: bool) -> None:
         """Write what is known into its message; launch numbers differ from run to run."""
-        message.presence, message.launch = self.presence, NONE if is_lockstep else self.launch
-        message.launches, message.losses, message.since = self.launches, self.losses, self.since
+        message.presence = self.presence
+        message.launch = NONE if is_lockstep else self.launch
+        message.launches = self.launches
+        message.losses = self.losses
+        message.since = self.since
 
 
 class Peers:
@@ -145,7 +162,8 @@ class Peers:
 
     def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Take what comes and goes from now on from this function: rack, launch, whether it has come."""
-        self._changes, self._is_lockstep = changes, is_lockstep
+        self._changes = changes
+        self._is_lockstep = is_lockstep
 
     def look(self, tick: int) -> list[Finding]:
         """Note who has come and who has gone; return what to report of it."""

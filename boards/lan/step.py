@@ -39,10 +39,12 @@ class Step(NamedTuple):
 
 def pack_step(cycle_ns: int, racks: Iterable[str], exports: Iterable[Arrived]) -> bytes:
     """Return the content of a step."""
-    names, found = "\n".join(racks).encode(), list(exports)
+    names = "\n".join(racks).encode()
+    found = list(exports)
     parts = [_HEAD.pack(cycle_ns, len(names), len(found)), names]
     for export in found:
-        key, envelope = export.key.encode(), export.envelope or b""
+        key = export.key.encode()
+        envelope = export.envelope or b""
         parts += [_PART.pack(len(key), len(envelope), len(export.payload)), key, envelope, export.payload]
     return b"".join(parts)
 
@@ -54,10 +56,14 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
     try:
         cycle_ns, length, count = _HEAD.unpack_from(content)
         at = _HEAD.size + length
-        racks, exports = content[_HEAD.size : at].decode().split("\n"), []
+        racks = content[_HEAD.size : at].decode().split("\n")
+        exports = []
         for _ in range(count):
-            lengths, start = _PART.unpack_from(content, at), at + _PART.size
-            key, envelope, at = start + lengths[0], start + sum(lengths[:2]), start + sum(lengths)
+            lengths = _PART.unpack_from(content, at)
+            start = at + _PART.size
+            key = start + lengths[0]
+            envelope = start + sum(lengths[:2])
+            at = start + sum(lengths)
             exports.append(Arrived(content[start:key].decode(), content[key:envelope], content[envelope:at]))
     except (struct.error, UnicodeDecodeError):
         return None

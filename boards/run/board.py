@@ -66,7 +66,8 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
 
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
-    spec, block = segment.layout.task(wiring.task), segment.block(wiring.task)
+    spec = segment.layout.task(wiring.task)
+    block = segment.block(wiring.task)
     kind: type[Executor] | type[Planner]
     kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
     level = kind(wiring.context)

@@ -22,7 +22,9 @@ from rack.boards.run.task import ClockGuard, Task, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
-_DEMAND, _CLOCK_SKIPPED, _DEMANDS = int(System.DEMAND), int(System.CLOCK_SKIPPED), tuple(Demand)
+_DEMAND = int(System.DEMAND)
+_CLOCK_SKIPPED = int(System.CLOCK_SKIPPED)
+_DEMANDS = tuple(Demand)
 
 
 class VirtualControlLoop(Task):
@@ -72,7 +74,8 @@ class VirtualControlLoop(Task):
 
     def cycle(self, tick: int) -> None:
         """Do the cycle released at `tick`."""
-        watch, deadline = self.stopwatch, tick + self._due
+        watch = self.stopwatch
+        deadline = tick + self._due
         watch.start(tick, self.next_cycle.skipped)
         if watch.is_late:
             self._handle_delay(tick)

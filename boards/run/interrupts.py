@@ -20,7 +20,9 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.words import Block
 
 # Plain integers for the hot path.
-_COUNT, _LOST, _WAITING = int(Block.INTERRUPTS), int(Block.INTERRUPTS_LOST), int(Block.INTERRUPTS_WAITING)
+_COUNT = int(Block.INTERRUPTS)
+_LOST = int(Block.INTERRUPTS_LOST)
+_WAITING = int(Block.INTERRUPTS_WAITING)
 
 
 class InterruptHandler:
@@ -34,7 +36,8 @@ class InterruptHandler:
         # What happened before this process was there is neither charged nor counted.
         inbox.advance(clock.tick)
         inbox.inbox.most_waiting = 0
-        self._served, self._service_ns = inbox.count, inbox.service_ns
+        self._served = inbox.count
+        self._service_ns = inbox.service_ns
         self._lost = [line.lost for line in inbox.lines.values()]
         self._cycles = 0
 
@@ -46,7 +49,8 @@ class InterruptHandler:
 
     def serve(self, tick: int) -> None:
         """Serve everything that has come up to the release at `tick`."""
-        inbox, begun_ns = self._inbox, process_time_ns()
+        inbox = self._inbox
+        begun_ns = process_time_ns()
         self._cycles += 1
         inbox.advance(tick)
         if inbox.count != self._served:

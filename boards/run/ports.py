@@ -115,7 +115,8 @@ class InputPorts:
 
     def take_traffic(self) -> tuple[int, int]:
         """Return the number of accesses and of bytes read since the last call."""
-        before, self._counted = self._counted, self._traffic
+        before = self._counted
+        self._counted = self._traffic
         return self._counted[0] - before[0], self._counted[1] - before[1]
 
     @property
@@ -253,7 +254,8 @@ class OutputPorts:
 
     def take_traffic(self) -> tuple[int, int]:
         """Return the number of messages and of bytes written since the last call."""
-        before, self._counted = self._counted, self._traffic
+        before = self._counted
+        self._counted = self._traffic
         return self._counted[0] - before[0], self._counted[1] - before[1]
 
     @property

@@ -21,7 +21,8 @@ class QueuePort:
 
     def __init__(self, writer: QueueWriter, episodes: Episodes, sends: bool) -> None:
         self.writer = writer
-        self._episodes, self._sends = episodes, sends
+        self._episodes = episodes
+        self._sends = sends
         self._refused = 0
 
     def noting(self, read: Callable[[int], Reading]) -> Callable[[int], Reading]:
@@ -41,7 +42,8 @@ class QueuePort:
             writer.message.send()
         in_time = onward(tick, now, basis)
         if writer.refused != self._refused:
-            refused, self._refused = writer.refused - self._refused, writer.refused
+            refused = writer.refused - self._refused
+            self._refused = writer.refused
             self._episodes.find(Alarm.QUEUE_FULL, writer.serial + writer.refused, tick, refused)
         return in_time
 
@@ -55,7 +57,8 @@ class DemandPort:
         self._basis: int | None = None
 
     def _send(self, basis: int | None = None) -> bool:
-        self._is_sent, self._basis = True, basis
+        self._is_sent = True
+        self._basis = basis
         return True
 
     def write(self, onward: Write, flush: Flush, tick: int, now: int | None, basis: int | None) -> bool:

@@ -34,13 +34,17 @@ class Stopwatch:
 
     def __init__(self, segment: Segment, task: str, inputs: InputPorts, outputs: OutputPorts) -> None:
         self._block = segment.block(task)
-        self._words, self._clock = segment.words, SystemClock(segment)
-        self._inputs, self._outputs, self._reading = inputs, outputs, inputs.task
+        self._words = segment.words
+        self._clock = SystemClock(segment)
+        self._inputs = inputs
+        self._outputs = outputs
+        self._reading = inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
         self._lockstep_done = done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = 0
-        self._cycles, self._state = self._block[_CYCLES], self._block[_LEVEL_STATE]
+        self._cycles = self._block[_CYCLES]
+        self._state = self._block[_LEVEL_STATE]
         self._processor_ns = 0  # processor time used before the current record
         self._closed_ns = 0  # end of the bookkeeping of the last cycle
         self._period_ns = self._clock.period_ns
@@ -60,7 +64,8 @@ class Stopwatch:
 
     def start(self, tick: int, skipped: int) -> None:
         """Begin the cycle released at `tick`, after `skipped` missed releases."""
-        self._tick, self._skipped = tick, skipped
+        self._tick = tick
+        self._skipped = skipped
         self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
         if self._lockstep_done is None:
             release_ns = self._words[_EPOCH] + tick * self._period_ns
@@ -79,7 +84,10 @@ class Stopwatch:
 
         `in_time`: no message was too late. `deadline` is a tick.
         """
-        block, tick, skipped, lockstep_done = self._block, self._tick, self._skipped, self._lockstep_done
+        block = self._block
+        tick = self._tick
+        skipped = self._skipped
+        lockstep_done = self._lockstep_done
         is_missed = not in_time or (lockstep_done is None and self.end_ns > self._time_of(deadline))
         if self._reading.troubles != self._troubles or not in_time:
             flags |= self._count_troubles()
@@ -93,7 +101,8 @@ class Stopwatch:
         if state != self._state:
             self._state = block[_LEVEL_STATE] = state
             block[_LEVEL_SINCE] = tick
-        used, before = thread_time_ns(), self._processor_ns
+        used = thread_time_ns()
+        before = self._processor_ns
         self._processor_ns = used
         self._trace.write(
             tick,
@@ -135,16 +144,21 @@ class Stopwatch:
     def _count_troubles(self) -> int:
         """Count failed accesses since the last cycle; return trace flags."""
         self._troubles = self._reading.troubles
-        bus_errors, corrupt = self._inputs.bus_errors + self._outputs.bus_errors, self._inputs.corrupt
-        new_errors, new_corrupt = bus_errors - self._bus_errors, corrupt - self._corrupt
-        self._bus_errors, self._corrupt = bus_errors, corrupt
+        bus_errors = self._inputs.bus_errors + self._outputs.bus_errors
+        corrupt = self._inputs.corrupt
+        new_errors = bus_errors - self._bus_errors
+        new_corrupt = corrupt - self._corrupt
+        self._bus_errors = bus_errors
+        self._corrupt = corrupt
         self._block[_BUS_ERRORS] += new_errors
         self._block[_CORRUPT] += new_corrupt
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
     def count_bus(self) -> None:
         """Update the bus counters of the control block; doing so in every cycle would cost too much."""
-        reads, writes, block = self._inputs.take_traffic(), self._outputs.take_traffic(), self._block
+        reads = self._inputs.take_traffic()
+        writes = self._outputs.take_traffic()
+        block = self._block
         block[Block.READS] += reads[0]
         block[Block.READ_BYTES] += reads[1]
         block[Block.WRITES] += writes[0]

@@ -35,7 +35,9 @@ class SystemController:
     """The clock's duties at every tick besides releasing tasks; see `rack.backplane.clock.driver.Controller`."""
 
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
-        self._words, self._wiring, self._driver = segment.words, wiring, driver
+        self._words = segment.words
+        self._wiring = wiring
+        self._driver = driver
         self._faults = FaultStage(segment, driver)
         self._desk = OperatorDesk(segment, driver.alarms)
         self._settled: tuple[int, int, int, int] | None = None
@@ -43,7 +45,9 @@ class SystemController:
 
     def begin(self, tick: int) -> None:
         """Do the work due before the tasks of `tick` are released."""
-        words, faults, desk = self._words, self._faults, self._desk
+        words = self._words
+        faults = self._faults
+        desk = self._desk
         if faults.open or faults.awaited or words[_INJECTED] != faults.injected:
             faults.advance(tick)
         if desk.waiting or words[_REQUESTED] != desk.requested:
@@ -65,7 +69,8 @@ class SystemController:
                 self._handle_loss(task, tick)
         lost = [task for task in processes if task.lost_tick >= 0]
         # Read before they are acted on: a change in between is handled at the next tick.
-        emergency, peer = words[_EMERGENCY], words[_PEER_STOP]
+        emergency = words[_EMERGENCY]
+        peer = words[_PEER_STOP]
         self._set_demand(lost, tick)
         # So is a switch that lies ahead.
         self._settled = (*seen, emergency, peer) if not lost and peer >> 1 <= tick else None
@@ -112,8 +117,10 @@ class OperatorDesk:
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
-        self._words, self._alarms = segment.words, alarms
-        self._table, self._clock = OperatorTable(segment), SystemClock(segment)
+        self._words = segment.words
+        self._alarms = alarms
+        self._table = OperatorTable(segment)
+        self._clock = SystemClock(segment)
         boxes = segment.layout.mailboxes
         self._writers = {at: open_writer(segment, box.name) for at, box in enumerate(boxes) if box.writer == CLOCK}
         self.requested = -1
@@ -134,7 +141,8 @@ class OperatorDesk:
                 entry.words[RequestWord.GIVEN_TICK] = -1
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
-        words, writer = entry.words, self._writers[entry[RequestWord.MAILBOX]]
+        words = entry.words
+        writer = self._writers[entry[RequestWord.MAILBOX]]
         if not words[RequestWord.SERIAL]:
             # If the clock dies after this line, its successor issues the command again, under the same serial.
             self._words[System.COMMANDED] += 1
@@ -158,9 +166,11 @@ class EndOfRun:
         self._silent = wiring.silent
         self._heard: int | None = None
         # By ticks, a message becomes visible at a boundary of its writer's period.
-        self._every, self._phase = 1, 0
+        self._every = 1
+        self._phase = 0
         if self._reader is not None and self._reader.spec.is_by_ticks:
-            self._every, self._phase = self._reader.spec.every, self._reader.spec.phase
+            self._every = self._reader.spec.every
+            self._phase = self._reader.spec.phase
         self._next = 0
 
     def __call__(self, tick: int) -> int | None:
@@ -186,7 +196,8 @@ def run_clock(segment: Segment, wiring: ClockWiring, attention: int | None = Non
     if words[System.STATE] != Run.RUNNING:
         words[System.EPOCH_NS] = time.monotonic_ns() + HEAD_START_NS
     else:
-        now, newest = SystemClock(segment).now(), words[System.TICK]
+        now = SystemClock(segment).now()
+        newest = words[System.TICK]
         alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
     driver = driver_of_run(segment, wiring, EndOfRun(segment, wiring), alarms)
     driver.controller = SystemController(segment, wiring, driver)

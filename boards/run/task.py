@@ -90,7 +90,8 @@ class ClockGuard:
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter, block: memoryview) -> None:
-        self._words, self._block = segment.words, block
+        self._words = segment.words
+        self._block = block
         self._clock = SystemClock(segment)
         self._alarms = alarms
         self._late_ns = self._clock.period_ns // 2

@@ -7,7 +7,9 @@ The rack runs it as its host board `command`. By hand, at any time:
 
 from math import cos, pi, sin
 
-PETALS, POINTS, RADIUS = 5, 60, 0.16
+PETALS = 5
+POINTS = 60
+RADIUS = 0.16
 CENTRE = (0.52, 0.0, 0.86)
 
 # Sixty short motions, sent as fast as the queue takes them, and blended: the tool does not stop in between.

@@ -56,6 +56,7 @@ class Assembly(HostProgram):
         motions.wait(motions.line((0.0, 0.0, 0.20), body=block))
 
     def _lower(self, motions: Motions) -> bool:
-        above, below = (*PLACE, 0.62), (*PLACE, 0.44)
+        above = (*PLACE, 0.62)
+        below = (*PLACE, 0.44)
         motions.wait(motions.line(above))
         return guarded_line(motions, below, (above[2] - below[2]) / SLOW)

@@ -8,7 +8,8 @@ By hand, at any time:
 
 from rack.levels.systems.trajectory.messages import RequestEnd
 
-X, DOWN = 0.50, (0.0, 0.0, 1.0, 0.0)
+X = 0.50
+DOWN = (0.0, 0.0, 1.0, 0.0)
 ABOVE, SURFACE = 0.62, 0.50  # m: a free height, and where the surface should be
 START, END, BEYOND = -0.25, 0.12, 0.30  # m, along y; the wall is somewhere before BEYOND
 PRESS, STEP = 15.0, 0.002  # N; m: the force is looked at once on so much of the way

@@ -16,7 +16,8 @@ class CommandsAbove:
     """
 
     def __init__(self, context: LevelContext, patience: MotorPatience, cycles: int, what: str, halted: str) -> None:
-        self._what, self._halted = what, halted
+        self._what = what
+        self._halted = halted
         self.oldest = {
             board: context.every + cycles * pace.every + patience.ticks(pace.every, context.tick_s)
             for board, pace in context.above.items()

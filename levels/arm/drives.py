@@ -21,7 +21,8 @@ RANGE_KEPT_RAD = 0.002
 """Distance that the gate keeps from the ends of a joint's range, for the same reason."""
 CLEAR_PART = 0.01
 """Part of a velocity limit that must be left where one rough prediction is enough."""
-HARD, SOFT = 0, 8
+HARD = 0
+SOFT = 8
 """Kinds of the solver's constraints."""
 
 
@@ -30,7 +31,8 @@ class Brake:
 
     def __init__(self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0) -> None:
         """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of the hold."""
-        self._braking, self._dynamics = braking, dynamics
+        self._braking = braking
+        self._dynamics = dynamics
         self._stiffness = stiffness
         self.rest: Array = rest.copy()  # (joints,), rad: where the joints came to rest
 
@@ -67,7 +69,8 @@ class LimitGate:
         self.clearance = limits, period_s  # for `is_clear`
         self._is_clear = is_clear.load()
         joints = len(braking)
-        self._inertia, self._resisting = np.eye(joints), np.zeros(joints)
+        self._inertia = np.eye(joints)
+        self._resisting = np.zeros(joints)
         self._unity = np.eye(joints)
         self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
 
@@ -123,7 +126,10 @@ def is_clear(
     It does not if the velocity stays within its bounds at no gain as at twice the gain predicted, with some room: more
     than inertia and bias change in a cycle.
     """
-    q, qd, bias, inertia = evaluation[0], evaluation[1], evaluation[BIAS_ROW], evaluation[INERTIA_ROW:]
+    q = evaluation[0]
+    qd = evaluation[1]
+    bias = evaluation[BIAS_ROW]
+    inertia = evaluation[INERTIA_ROW:]
     most_torque, fastest, low, high, braking, dry = limits
     left = torque - bias
     for joint in range(len(q)):
@@ -132,7 +138,9 @@ def is_clear(
         left[joint] -= dry[joint] * math.tanh(qd[joint] / FRICTION_SPEED)
     twice = cholesky_solve(inertia, left) * (2.0 * period_s)
     for joint in range(len(q)):
-        speed, hard, room = fastest[joint], braking[joint], CLEAR_PART * fastest[joint]
+        speed = fastest[joint]
+        hard = braking[joint]
+        room = CLEAR_PART * fastest[joint]
         least = -speed_towards(q[joint] - low[joint], -qd[joint], speed, hard, period_s) - qd[joint] + room
         most = speed_towards(high[joint] - q[joint], qd[joint], speed, hard, period_s) - qd[joint] - room
         if not (least <= 0.0 <= most and least <= twice[joint] <= most):
@@ -204,7 +212,8 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
     chance = uniform(seed, tick, 2 * joints)
     for joint in range(joints):
         # Box and Muller: two independent normal numbers from two uniform ones.
-        length, angle = math.sqrt(-2.0 * math.log(chance[joint])), 2.0 * math.pi * chance[joints + joint]
+        length = math.sqrt(-2.0 * math.log(chance[joint]))
+        angle = 2.0 * math.pi * chance[joints + joint]
         sample[0, joint] += noise[0, joint] * length * math.cos(angle)
         sample[1, joint] += noise[1, joint] * length * math.sin(angle)
         for row in range(2):
@@ -231,7 +240,9 @@ def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    none, table, places = np.zeros(0), np.zeros((6, 0)), np.zeros((4, 0), dtype=int)
+    none = np.zeros(0)
+    table = np.zeros((6, 0))
+    places = np.zeros((4, 0), dtype=int)
     is_clear.load()(none, table, table, 1.0)
     give.load()(table, table, table, 1.0, places, none)
     sense_coarsely.load()(table, 0, 0, table, table)

@@ -31,7 +31,9 @@ class FaultyLink:
 
     def __init__(self, arm: Arm, cell: Cell, every: int, acted: dict[int, bool]) -> None:
         """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell."""
-        self._arm, self._every, self._acted = arm, every, acted
+        self._arm = arm
+        self._every = every
+        self._acted = acted
         self._limits = limits = cell.bounds.torque
         # Friction that helped may now resist: it hides twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]

@@ -48,6 +48,11 @@ class Plant:
 
     def restore(self, state: Message) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted board."""
-        self.tick, self.waited, self.braked = state.tick, state.waited, bool(state.braked)
-        self.clipped, self.touches = state.clipped, state.touches
-        self.violations, self.pushed, self.struck = state.violations, state.pushed, state.struck
+        self.tick = state.tick
+        self.waited = state.waited
+        self.braked = bool(state.braked)
+        self.clipped = state.clipped
+        self.touches = state.touches
+        self.violations = state.violations
+        self.pushed = state.pushed
+        self.struck = state.struck

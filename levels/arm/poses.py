@@ -28,7 +28,8 @@ class PoseViews(NamedTuple):
 
 def poses(cell: Cell, data: mujoco.MjData) -> PoseViews:
     """Return the arguments of `show` for `data` of a cell."""
-    scene, number = SCENE.dtype(sizes(cell)), np.dtype(np.float64).itemsize
+    scene = SCENE.dtype(sizes(cell))
+    number = np.dtype(np.float64).itemsize
     begins = {name: field[1] // number for name, field in (scene.fields or {}).items()}
     memory, (position, quaternion, tool) = one_view(data.xpos, data.xquat, data.site_xpos)
     places = np.full(scene.itemsize // number, -1)
@@ -58,5 +59,6 @@ def show(
 def preload() -> None:
     """Load this module's compiled function."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data, turned = mujoco.MjData(model), np.eye(3).ravel()
+    data = mujoco.MjData(model)
+    turned = np.eye(3).ravel()
     show.load()(model._address, data._address, np.zeros(0, dtype=int), turned, turned, 0, np.zeros(4))

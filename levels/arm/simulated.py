@@ -30,7 +30,8 @@ class SimulatedArm(Simulation, Arm):
 
     def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
-        d, joints = self._data, len(cell.qpos)
+        d = self._data
+        joints = len(cell.qpos)
         self.begin(scene, clock_ns)
         # Memory views: single numbers in a third of the time that arrays take.
         self._qpos: memoryview[float] = memoryview(d.qpos)
@@ -82,14 +83,17 @@ class SimulatedArm(Simulation, Arm):
         if self._grip is not None and math.isfinite(grip_force):
             self._ctrl[self._grip] = self.grip_force = grip_force
         if self._most is None and self._give_clear(*self._clear):
-            self.waited, self.braked, self._given = 0, False, True
+            self.waited = 0
+            self.braked = False
+            self._given = True
             return None
         finding = self.refused(torque)
         if finding is not None:
             self.clipped += 1
             self.brake()
             return finding
-        self.waited, self.braked = 0, False
+        self.waited = 0
+        self.braked = False
         self._command[:] = torque
         self._give()
         return None
@@ -138,7 +142,8 @@ class SimulatedArm(Simulation, Arm):
     def restore(self, state: Message) -> None:
         """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
         super().restore(state)
-        d, cell = self._data, self.cell
+        d = self._data
+        cell = self.cell
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
@@ -147,7 +152,8 @@ class SimulatedArm(Simulation, Arm):
 
     def _give(self) -> None:
         """Apply the command to the motors, or the brakes' torque to the joints, through the limit gate."""
-        cell, braked = self.cell, self.braked
+        cell = self.cell
+        braked = self.braked
         q, qd = self._state
         passed, cut = self._gate.admit(self._brake.torque(q, qd) if braked else self._command, q, qd)
         self.clipped += cut

@@ -27,13 +27,16 @@ class Simulation(Plant):
 
     def begin(self, scene: SceneConfig, clock_ns: int) -> None:
         """Prepare the steps of a tick of `clock_ns`, and what judges them."""
-        cell, d = self.cell, self._data
-        self._model, self._clock_ns = cell.model, clock_ns
+        cell = self.cell
+        d = self._data
+        self._model = cell.model
+        self._clock_ns = clock_ns
         self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
         self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
         self._refresh()
         self._addresses = self._steps.model, self._steps.data
-        self._contacts, self._limits = ContactMonitor(cell), LimitMonitor(cell, self._steps)
+        self._contacts = ContactMonitor(cell)
+        self._limits = LimitMonitor(cell, self._steps)
         obstacles = zip(cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True)
         self._motions = [
             (mocap, ObstacleMotion(cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)))
@@ -113,9 +116,14 @@ class Simulation(Plant):
             mujoco.mj_setState(self._model, self._data, self._steps.states[0], STATE)
             self._refresh()
         self._data.time = self._after_s
-        contacts, limits = self._contacts, self._limits
-        self.contact, self.touches, self.first_touch = contacts.struck, contacts.count, contacts.first
-        self.violations, self.pushed, self.first_violation = limits.count, limits.pushed, limits.first
+        contacts = self._contacts
+        limits = self._limits
+        self.contact = contacts.struck
+        self.touches = contacts.count
+        self.first_touch = contacts.first
+        self.violations = limits.count
+        self.pushed = limits.pushed
+        self.first_violation = limits.first
 
     def _broken(self) -> str:
         """Return the fault of the simulation; empty: none."""
@@ -154,7 +162,8 @@ def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
     """Return the sum of the pushes on an object, (3,), N, at simulated `time_s`."""
     total = np.zeros(3)
     for push in pushes:
-        since, left = time_s - push.at, push.at + push.seconds - time_s
+        since = time_s - push.at
+        left = push.at + push.seconds - time_s
         if since >= 0.0 and left > 0.0:
             total += np.array(push.force) * (min(1.0, since / push.rise, left / push.rise) if push.rise > 0.0 else 1.0)
     return total

@@ -14,7 +14,8 @@ from rack.levels.compiled import compiled
 from rack.levels.robot.cell import STATE, Cell
 from rack.levels.robot.engine import contact_views, mj_get_state, mj_set_state, mj_step, one_view
 
-TIME, PHYSICS = int(mujoco.mjtState.mjSTATE_TIME), int(mujoco.mjtState.mjSTATE_PHYSICS)
+TIME = int(mujoco.mjtState.mjSTATE_TIME)
+PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
 
 
 class Substeps(NamedTuple):
@@ -78,7 +79,11 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     Returns the number of the step to continue with; negative if the last one made broke a limit, or has an unintended
     contact, a warning, or a state that is not finite.
     """
-    before, after, low, high, seen = states[0], states[1], judged[0], judged[1], judged[2:]
+    before = states[0]
+    after = states[1]
+    low = judged[0]
+    high = judged[1]
+    seen = judged[2:]
     if begin == 0:
         mj_get_state(model, data, before.ctypes.data, STATE)
     for step in range(begin, len(seen)):
@@ -114,7 +119,9 @@ def copy_state(model: int, data: int, state: Array) -> None:
 def preload() -> None:
     """Load this module's compiled functions."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data, table, touch = mujoco.MjData(model), np.zeros((3, 3, 0)), np.zeros((0, 0), dtype=bool)
+    data = mujoco.MjData(model)
+    table = np.zeros((3, 3, 0))
+    touch = np.zeros((0, 0), dtype=bool)
     states = np.zeros((2, mujoco.mj_stateSize(model, STATE)))
     own: list[Any] = [np.zeros((4, 0), dtype=int), np.zeros(0), table, states, data.warning.number]
     own += [*contact_views(model, data), touch]

@@ -36,7 +36,8 @@ class WristSensor:
     """
 
     def __init__(self, wrist: Wrist, data: mujoco.MjData, seed: int) -> None:
-        self._numbers, self._places = data.sensordata, wrist.addresses
+        self._numbers = data.sensordata
+        self._places = wrist.addresses
         self._noise, self._range = np.repeat(wrist.noise, 3), np.repeat(wrist.range, 3)
         self._seed, self._uniform = seed + STREAM, uniform.load()
 
@@ -47,7 +48,8 @@ class WristSensor:
             chance = self._uniform(self._seed, tick, 2 * AXES)
             for axis in range(AXES):
                 # Box and Muller, of which the second number is not used.
-                length, angle = math.sqrt(-2.0 * math.log(chance[axis])), 2.0 * math.pi * chance[AXES + axis]
+                length = math.sqrt(-2.0 * math.log(chance[axis]))
+                angle = 2.0 * math.pi * chance[AXES + axis]
                 sample[axis] += self._noise[axis] * length * math.cos(angle)
         return np.asarray(np.clip(sample, -self._range, self._range))
 
@@ -63,7 +65,8 @@ class ContactWrench:
         self.torque = np.zeros(joints)  # (joints,), N m: of the contact on the joints
         self.saturated = True  # the sample is at the end of the range, or NaN: the contact may be any stronger
         model, data = dynamics.evaluated
-        body, root = int(model.site_bodyid[wrist.site]), int(model.body_rootid[model.site_bodyid[wrist.site]])
+        body = int(model.site_bodyid[wrist.site])
+        root = int(model.body_rootid[model.site_bodyid[wrist.site]])
         memory, begins = one_view(data.qacc, data.cfrc_int, data.site_xpos, data.site_xmat, data.subtree_com)
         first = (0, AXES * body, 3 * wrist.site, 9 * wrist.site, 3 * root)
         tool = int(begins[2]) + 3 * cell.tool
@@ -106,13 +109,17 @@ def set_contact(
             sensed += memory[frame + 3 * axis + k] * raw[k]
             turning += memory[frame + 3 * axis + k] * raw[3 + k]
         wrench[axis] = memory[force + 3 + axis] - sensed
-        one, other = (axis + 1) % 3, (axis + 2) % 3
-        arm_one, arm_other = memory[site + one] - memory[centre + one], memory[site + other] - memory[centre + other]
+        one = (axis + 1) % 3
+        other = (axis + 2) % 3
+        arm_one = memory[site + one] - memory[centre + one]
+        arm_other = memory[site + other] - memory[centre + other]
         expected = memory[force + axis] - (arm_one * memory[force + 3 + other] - arm_other * memory[force + 3 + one])
         wrench[3 + axis] = expected - turning
     for axis in range(3):
-        one, other = (axis + 1) % 3, (axis + 2) % 3
-        arm_one, arm_other = memory[site + one] - memory[tool + one], memory[site + other] - memory[tool + other]
+        one = (axis + 1) % 3
+        other = (axis + 2) % 3
+        arm_one = memory[site + one] - memory[tool + one]
+        arm_other = memory[site + other] - memory[tool + other]
         wrench[3 + axis] += arm_one * wrench[other] - arm_other * wrench[one]
     mj_jac(model, data, jacobians[0].ctypes.data, jacobians[1].ctypes.data, memory[tool:].ctypes.data, body)
     for joint in range(len(dof)):
@@ -126,7 +133,10 @@ def preload() -> None:
     """Load the compiled functions of this module."""
     uniform.load()(STREAM, 0, 2 * AXES)
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data, none = mujoco.MjData(model), np.zeros(0)
-    places, memory, wrench = np.zeros(7, dtype=int), np.zeros(16), np.zeros(AXES)
+    data = mujoco.MjData(model)
+    none = np.zeros(0)
+    places = np.zeros(7, dtype=int)
+    memory = np.zeros(16)
+    wrench = np.zeros(AXES)
     at = model._address, data._address
     set_contact.load()(*at, places, memory, places[:0], np.zeros((2, 3, 0)), wrench, none, wrench, none)

@@ -64,7 +64,8 @@ class ElementalMoveExecutor(Executor):
         segments = SegmentWindow(write.command)
         if not self._started:
             self._recall(read, write, segments)
-        command, status = read.command, read.status.value
+        command = read.command
+        status = read.status.value
         self._orders.take(read.operator)
         self._plans.take(read.plan, self._done, self._handed_down, write.status.end)
         self._take_window(command.value, status, segments)
@@ -88,7 +89,8 @@ class ElementalMoveExecutor(Executor):
         if read.last_command.is_there and read.last_status.is_there:
             last = read.last_status.value
             write.command.copy_from(read.last_command.value)
-            self._done, self._replans = last.done, last.replans
+            self._done = last.done
+            self._replans = last.replans
             if last.state == State.ERROR:
                 self._fail(Error(last.error), last.reason)
             self._handed_down = max(last.done, segments.newest_move)
@@ -107,12 +109,14 @@ class ElementalMoveExecutor(Executor):
         self._close_request()
         if status.resting or not self._handed_down:
             self._done = self._handed_down = first - 1
-            self._error, self._reason = Error.NONE, ""
+            self._error = Error.NONE
+            self._reason = ""
 
     def _take_done(self, status: Message, segments: SegmentWindow) -> None:
         """Count segments that are done; fail on a grasp that holds nothing."""
         while (taken := segments.take_done(status.done)) is not None:
-            self._done, self._replans_of_move = int(taken["move"]), 0
+            self._done = int(taken["move"])
+            self._replans_of_move = 0
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
             if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
                 self._fail(
@@ -162,7 +166,9 @@ class ElementalMoveExecutor(Executor):
 
     def _close_request(self) -> None:
         if self._request:
-            self._request, self._waiting_since, self._reason = 0, None, ""
+            self._request = 0
+            self._waiting_since = None
+            self._reason = ""
 
     def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
         """Hand down the next moves, as far as they are planned and the window has room."""
@@ -217,26 +223,32 @@ class ElementalMoveExecutor(Executor):
 
     def _fail(self, error: Error, reason: str) -> None:
         if not self._error:
-            self._error, self._reason = error, reason
+            self._error = error
+            self._reason = reason
             self._request = 0
 
     def _report(self, read: Ports, segments: SegmentWindow, report: Message) -> None:
-        command, status = read.command.value, read.status.value
+        command = read.command.value
+        status = read.status.value
         report.echo = command.id
         report.state = self._state(command)
         waits = self._reason_to_wait(read.command, read.status) if report.state == State.EXECUTING else ""
         if waits:
             report.state = State.HOLDING
-        report.error, report.reason = self._error, self._reason if self._error else waits
+        report.error = self._error
+        report.reason = self._reason if self._error else waits
         report.operated = status.operated or self._orders.standing is not Operation.NONE
         self._report_move(command, status, segments, report)
         self._report_plans(command, status, segments, report)
-        report.replan, report.start = self._request, status.position
+        report.replan = self._request
+        report.start = status.position
 
     def _report_move(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
         """Report what is done, and the progress of the move under way."""
         under_way = segments.first if segments.count else None
-        report.done, report.held, report.replans = self._done, status.held, self._replans
+        report.done = self._done
+        report.held = status.held
+        report.replans = self._replans
         report.current = int(under_way["move"]) if under_way is not None else 0
         is_begun = under_way is not None and under_way["id"] == status.current
         report.progress = status.progress if is_begun else 0.0
@@ -257,7 +269,8 @@ class ElementalMoveExecutor(Executor):
 
     def _answer(self, read: Ports, write: Ports) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""
-        above, below = read.command.value.operator, read.status.value
+        above = read.command.value.operator
+        below = read.status.value
         write.command.operator = self._orders.rests_on(above)
         # Rest counts only once the level below has received the command.
         write.status.resting = below.resting and below.operator >= write.command.operator

@@ -123,17 +123,20 @@ class ElementalMovePlanner(Planner):
         job = self._job
         assert job is not None, "plan is called only when one is wanted"
         write.clear()
-        write.move, write.replan = job.move.id, job.request
+        write.move = job.move.id
+        write.replan = job.request
         visible_at = tick + self.context.every * self.context.within_cycles
         try:
             situation = self._situation(job.move, read)
             path = self._motion.plan(job.move, job.start, situation, attempt=self._tries, goal=job.goal)
         except Refused as refused:
-            write.error, write.reason = refused.code, str(refused)
+            write.error = refused.code
+            write.reason = str(refused)
             self._note_refusal(job, refused, read.world.value.revision, visible_at)
             return
         count = len(path.waypoints)
-        write.kind, write.count = SegmentKind.PATH, count
+        write.kind = SegmentKind.PATH
+        write.count = count
         write.waypoints[:count], write.blend[:count] = path
         self._note_path(job, path, visible_at)
 
@@ -150,7 +153,8 @@ class ElementalMovePlanner(Planner):
 
     def _blocked(self, read: Ports) -> PlanningJob | None:
         """Return the first path ahead that a change of the world has blocked; its end stays."""
-        status, revision = read.status.value, read.world.value.revision
+        status = read.status.value
+        revision = read.world.value.revision
         if revision == self._revision:
             return None
         handed_down = max(status.current, status.done) + MAX_HANDED_DOWN
@@ -162,7 +166,8 @@ class ElementalMovePlanner(Planner):
 
     def _ahead(self, read: Ports) -> PlanningJob | None:
         """Return the first move without a path."""
-        status, primitive = read.status.value, read.primitive.value
+        status = read.status.value
+        primitive = read.primitive.value
         newest = max(status.planned, self._published[-1].move.id if self._published else 0)
         move = next_motion(self._window, newest)
         if move is None:
@@ -176,7 +181,9 @@ class ElementalMovePlanner(Planner):
 
     def _situation(self, move: Move, read: Ports) -> Situation:
         """Return the situation when `move` begins: the world as sensed, changed by the moves before it."""
-        world, held, done = read.world.value, read.primitive.value.held, read.status.value.done
+        world = read.world.value
+        held = read.primitive.value.held
+        done = read.status.value.done
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         if held >= 0:
             situation = situation.holding(held, self._grip[1] if self._grip is not None else None)
@@ -196,7 +203,9 @@ class ElementalMovePlanner(Planner):
 
     def _note_grip(self, read: Ports) -> None:
         """Store how the next object, still at rest, will be grasped; after a restart, how it is held."""
-        world, held, done = read.world.value, read.primitive.value.held, read.status.value.done
+        world = read.world.value
+        held = read.primitive.value.held
+        done = read.status.value.done
         if held < 0:
             ahead = [(m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done]
             self._grip = next(((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None)

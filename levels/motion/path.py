@@ -101,7 +101,8 @@ class BlendedPath:
         t = (s - self._starts[corner] + b) / (2.0 * b)
         h = 2.0 * b * t**3 * (1.0 - 0.5 * t)
         # q = P + u1 sigma + (u2 - u1) h, and its derivatives.
-        before, change = self._directions[corner - 1], self._changes[corner]
+        before = self._directions[corner - 1]
+        change = self._changes[corner]
         np.multiply(before, s - self._starts[corner], out=q)
         q += self.waypoints[corner]
         q += np.multiply(change, h, out=self._scratch)
@@ -130,7 +131,8 @@ class BlendedPath:
         self._pieces: list[tuple[int, int]] = []
         self._breaks: list[float] = [0.0]
         for line in range(last):
-            corner, b = line + 1, self._radii[line + 1]
+            corner = line + 1
+            b = self._radii[line + 1]
             self._add_piece((line, -1), self._starts[corner] - b)
             if b > 0.0:
                 self._add_piece((line, corner), self._starts[corner] + b)
@@ -150,7 +152,8 @@ class BlendedPath:
         first, second, third = (np.zeros((len(self._pieces), self.joints)) for _ in range(3))
         for k, (line, corner) in enumerate(self._pieces):
             if corner >= 0:
-                b, change = self._radii[corner], np.abs(self._changes[corner])
+                b = self._radii[corner]
+                change = np.abs(self._changes[corner])
                 first[k] = np.abs(self._directions[corner - 1 : corner + 1]).max(axis=0)
                 second[k] = 0.75 * change / b
                 third[k] = 1.5 * change / b**2
@@ -160,7 +163,8 @@ class BlendedPath:
 
 
 def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
-    points, radii = np.array(waypoints, dtype=float), np.array(blend, dtype=float)
+    points = np.array(waypoints, dtype=float)
+    radii = np.array(blend, dtype=float)
     if points.ndim != 2 or len(points) == 0:
         raise ValueError(f"path: waypoints of shape {points.shape}; valid: (k, joints) with k >= 1")
     if radii.shape != (len(points),):

@@ -41,7 +41,9 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
     part used of the highest speed that the bend of a curve permits: a smaller share leaves more to accelerate with.
     """
     first, second, third = piece
-    velocity, acceleration, jerk = limits.velocity, limits.acceleration, limits.jerk
+    velocity = limits.velocity
+    acceleration = limits.acceleration
+    jerk = limits.jerk
     curved = bool(second.any())
     speed = _least(velocity, first)
     if curved:
@@ -67,13 +69,15 @@ def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
 
     By symmetry it is also the highest speed from which `start` can still be reached.
     """
-    a, j = limits.acceleration, limits.jerk
+    a = limits.acceleration
+    j = limits.jerk
     if a <= 0.0:
         return min(start, limits.speed)
     change = _root_of_cubic(2.0 * start, length * math.sqrt(j)) ** 2
     if change > a * a / j:
         # (2 start + change) / 2 * (change / a + a / j) = length
-        linear, constant = 2.0 * start + a * a / j, 2.0 * a * (start * a / j - length)
+        linear = 2.0 * start + a * a / j
+        constant = 2.0 * a * (start * a / j - length)
         change = 0.5 * (-linear + math.sqrt(linear * linear - 4.0 * constant))
     return min(start + change * REACHABLE_PART, limits.speed)
 

@@ -67,7 +67,10 @@ class Trajectory:
         """Return s, ds and dds at `times_s` (n,), within the duration; (n,) each."""
         row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
         t = times_s - row[:, 0]
-        s, ds, dds, jerk = row[:, 1], row[:, 2], row[:, 3], row[:, 4]
+        s = row[:, 1]
+        ds = row[:, 2]
+        dds = row[:, 3]
+        jerk = row[:, 4]
         return s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)), ds + t * (dds + t * jerk / 2.0), dds + t * jerk
 
     def stretched(self, factor: float) -> Trajectory:
@@ -113,7 +116,8 @@ class _Run:
     """A stretch of a path between two points of rest, and the bounds of its pieces."""
 
     def __init__(self, path: BlendedPath, start: float, end: float) -> None:
-        first, last = path.piece_at(start), path.piece_at(end - COINCIDENT_RAD)
+        first = path.piece_at(start)
+        last = path.piece_at(end - COINCIDENT_RAD)
         inner = path.breaks[first + 1 : last + 1]
         self.marks = [start, *inner.tolist(), end]
         self.bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
@@ -138,7 +142,8 @@ def _fastest(run: _Run, limits: Limits) -> list[Section]:
             rows = list(_sections(marks, stretches))
             time_s = math.fsum(row[0] for row in rows)  # exact: `sum` rounds otherwise from Python 3.12 on
             if time_s < least and len(rows) <= run.most_sections:
-                best, least = rows, time_s
+                best = rows
+                least = time_s
     return best
 
 
@@ -149,10 +154,13 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
     for start, length, limit, (before, after) in zip(marks, lengths, limits, pairwise(speeds), strict=False):
         if limit.acceleration > 0.0:
             wanted = ruckig.InputParameter(1)
-            wanted.current_position, wanted.current_velocity = [start], [before]
-            wanted.target_position, wanted.target_velocity = [start + length], [after]
+            wanted.current_position = [start]
+            wanted.current_velocity = [before]
+            wanted.target_position = [start + length]
+            wanted.target_velocity = [after]
             wanted.max_velocity = [limit.speed]
-            wanted.max_acceleration, wanted.max_jerk = [limit.acceleration], [limit.jerk]
+            wanted.max_acceleration = [limit.acceleration]
+            wanted.max_jerk = [limit.jerk]
             yield from _calculated(wanted)
         else:
             yield (length / before if before > 0.0 else np.inf, start, before, 0.0, 0.0)
@@ -161,9 +169,11 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
 def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
     wanted = ruckig.InputParameter(1)
     wanted.control_interface = ruckig.ControlInterface.Velocity
-    wanted.current_position, wanted.current_velocity = [state.s], [state.ds]
+    wanted.current_position = [state.s]
+    wanted.current_velocity = [state.ds]
     wanted.current_acceleration = [state.dds]
-    wanted.max_acceleration, wanted.max_jerk = [acceleration], [jerk]
+    wanted.max_acceleration = [acceleration]
+    wanted.max_jerk = [jerk]
     return _joined(_calculated(wanted), state.s)
 
 
@@ -198,7 +208,9 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     most = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))
     speed = np.maximum(ds[:-1], ds[1:])
     first, second, third = _bounds_over(path, s)
-    speed, most, jerk = speed[:, None], most[:, None], jerk[:, None]
+    speed = speed[:, None]
+    most = most[:, None]
+    jerk = jerk[:, None]
     cubed = speed * speed * speed  # of an array, ** 3 is not the same on every processor
     room = 1.0 + LIMIT_ROUNDING
     return bool(
@@ -211,7 +223,9 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
 
 def _checked_times(stop: Trajectory) -> Array:
     """Return the ends of the intervals: evenly spread, and wherever jerk or the sign of dds changes."""
-    start, dds, jerk = stop.sections[:, 0], stop.sections[:, 3], stop.sections[:, 4]
+    start = stop.sections[:, 0]
+    dds = stop.sections[:, 3]
+    jerk = stop.sections[:, 4]
     until_zero = np.divide(-dds, jerk, out=np.zeros(len(jerk)), where=jerk != 0.0)
     zeros = np.clip(start + until_zero, start, np.append(start[1:], stop.duration))
     return np.unique(np.concatenate((start, zeros, np.linspace(0.0, stop.duration, STOP_INTERVALS + 1))))
@@ -221,7 +235,8 @@ def _bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
     """Return the bounds of the path's derivatives between consecutive `s`; (n - 1, joints) each."""
     last = len(path.breaks) - 2
     piece = np.clip(np.searchsorted(path.breaks, s, side="right") - 1, 0, last)
-    low, high = piece[:-1], piece[1:]
+    low = piece[:-1]
+    high = piece[1:]
     bounds = [bound[low] for bound in path.bounds]
     for k in range(1, int((high - low).max()) + 1):
         for total, bound in zip(bounds, path.bounds, strict=True):

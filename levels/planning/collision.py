@@ -62,8 +62,10 @@ class CollisionChecker:
         self._base = self._required_distances()
         self._required = self._base.copy()
         self._q, self._least = np.zeros(len(cell.qpos)), np.inf  # the last configuration checked, and its clearance
-        m, d = self._model, self._data
-        tool, quaternion = (d.site_xpos[cell.tool], d.site_xmat[cell.tool]), np.zeros(4)
+        m = self._model
+        d = self._data
+        tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
+        quaternion = np.zeros(4)
         arrays = self._q, cell.qpos.copy(), d.qpos, *tool, self._offset, quaternion, self._required
         self._is_free = partial(is_free.load(), m._address, d._address, *arrays, *contact_views(m, d))
 
@@ -104,7 +106,8 @@ class CollisionChecker:
     def room(self, q: Array) -> float:
         """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative: with none."""
         self.free(q)
-        short, pairs = self._shortfalls(), self._data.contact.geom
+        short = self._shortfalls()
+        pairs = self._data.contact.geom
         required = self._required[pairs[:, 0], pairs[:, 1]]
         if np.any((short > 0) & (required <= 0)):
             return -1.0
@@ -149,8 +152,10 @@ class CollisionChecker:
 
     def _required_distances(self) -> Array:
         """Return (geoms, geoms), in m: the clearance between arm and cell, 0 between links that may collide."""
-        m, arm = self.cell.model, self.cell.arm_geoms
-        typ, affinity = m.geom_contype, m.geom_conaffinity
+        m = self.cell.model
+        arm = self.cell.arm_geoms
+        typ = m.geom_contype
+        affinity = m.geom_conaffinity
         collide = (typ[:, None] & affinity[None, :]) | (typ[None, :] & affinity[:, None]) != 0
         required = np.full((m.ngeom, m.ngeom), ANY_DISTANCE)
         required[arm, :] = self.clearance
@@ -175,7 +180,9 @@ class CollisionChecker:
     def _apply(self) -> None:
         """Set the required distances for the held object and the one that may be touched."""
         self._required[:] = self._base
-        arm, gripper, supports = self.cell.arm_geoms, self.cell.gripper_geoms, self.cell.supports
+        arm = self.cell.arm_geoms
+        gripper = self.cell.gripper_geoms
+        supports = self.cell.supports
         if self.held is not None:
             held = self._row_geoms[self.held]
             self._require(held, np.arange(self._model.ngeom), self.clearance)
@@ -183,7 +190,8 @@ class CollisionChecker:
             self._require(held, gripper, ANY_DISTANCE)
             self._require(held, held, ANY_DISTANCE)
         if self._touched is not None:
-            touched, is_held = self._row_geoms[self._touched], self._touched == self.held
+            touched = self._row_geoms[self._touched]
+            is_held = self._touched == self.held
             self._require(touched, gripper, ANY_DISTANCE if is_held else -MAX_TOUCH_DEPTH_M)
             self._require(touched, supports, -MAX_HELD_DEPTH_M if is_held else -MAX_TOUCH_DEPTH_M)
             self._require(gripper, supports, 0.0)
@@ -232,6 +240,8 @@ def is_free(
 def preload() -> None:
     """Load this module's compiled function."""
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    none, square, room = np.zeros(0), np.zeros((0, 0)), contact_views(data.model, data)
+    none = np.zeros(0)
+    square = np.zeros((0, 0))
+    room = contact_views(data.model, data)
     arrays = none, np.zeros(0, dtype=int), none, np.zeros(3), np.zeros(9), np.zeros(7), np.zeros(4), square
     is_free.load()(data.model._address, data._address, *arrays, *room, -1, 0.0)

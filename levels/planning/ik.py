@@ -47,7 +47,8 @@ class InverseKinematics:
         self._seed = seed
         self._pace = 1.0 / cell.limits.velocity
         limits = cell.limits.position
-        self._inner_low, self._inner_high = limits[:, 0] + LIMIT_MARGIN_RAD, limits[:, 1] - LIMIT_MARGIN_RAD
+        self._inner_low = limits[:, 0] + LIMIT_MARGIN_RAD
+        self._inner_high = limits[:, 1] - LIMIT_MARGIN_RAD
         self._data = mujoco.MjData(cell.model)
         joints = len(cell.qpos)
         self._jacobian = np.zeros((6, cell.model.nv))
@@ -116,7 +117,8 @@ class InverseKinematics:
     def _error(self, target: Pose, q: Array) -> Array:
         """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world frame."""
         tool = self.tool_at(q)
-        turn, error = np.zeros(3), np.zeros(6)
+        turn = np.zeros(3)
+        error = np.zeros(6)
         error[:3] = target.position - tool.position
         mujoco.mju_subQuat(turn, target.quaternion, tool.quaternion)
         mujoco.mju_rotVecQuat(error[3:], turn, tool.quaternion)
@@ -124,19 +126,23 @@ class InverseKinematics:
 
     def _step(self, error: Array, q: Array) -> Array | None:
         """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there is none."""
-        m, d = self._cell.model, self._data
+        m = self._cell.model
+        d = self._data
         mujoco.mj_comPos(m, d)
         mujoco.mj_jacSite(m, d, self._jacobian[:3], self._jacobian[3:], self._cell.tool)
         jacobian = np.take(self._jacobian, self._cell.dof, axis=1)
-        hessian, step = gram(jacobian), np.zeros(len(q))
+        hessian = gram(jacobian)
+        step = np.zeros(len(q))
         hessian.flat[:: len(q) + 1] += DAMPING * (1.0 + norm(error) ** 2)
         gradient = transposed_mat_vec(jacobian, -error)
-        low, high = LIMIT_PART * (self._inner_low - q), LIMIT_PART * (self._inner_high - q)
+        low = LIMIT_PART * (self._inner_low - q)
+        high = LIMIT_PART * (self._inner_high - q)
         rank = mujoco.mju_boxQP(step, self._factor, None, hessian, gradient, low, high)
         return step if rank >= 0 else None
 
 
 def sampling_range(cell: Cell) -> tuple[Array, Array]:
     """Return low and high (joints,), in rad: the limits, or one turn for a joint without limits."""
-    low, high = cell.limits.position[:, 0], cell.limits.position[:, 1]
+    low = cell.limits.position[:, 0]
+    high = cell.limits.position[:, 1]
     return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

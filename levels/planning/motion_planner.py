@@ -92,7 +92,8 @@ class MotionPlanner:
                 return near
         reference = move.joints if move.posture else start
         reachable = self.ik.reachable(move.tool, reference)
-        name, place = VERB_NAMES[move.verb], in_metres(move.tool)
+        name = VERB_NAMES[move.verb]
+        place = in_metres(move.tool)
         if not reachable:
             raise Refused(Error.UNREACHABLE, f"{name}: the arm cannot bring the tool to {place}")
         for q in reachable:
@@ -127,7 +128,8 @@ class MotionPlanner:
         return f"no path found around {found}" if found else "no path found"
 
     def _line(self, move: Move, start: Array, goal: Array | None) -> Path:
-        name, place = VERB_NAMES[move.verb], in_metres(move.tool)
+        name = VERB_NAMES[move.verb]
+        place = in_metres(move.tool)
         path = straight_line(self.ik, start, move.tool)
         if path is None:
             raise Refused(Error.UNREACHABLE, f"{name}: no straight tool line to {place}")

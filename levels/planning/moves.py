@@ -100,7 +100,8 @@ class Situation:
 
     def with_body(self, row: int, at: Pose) -> Situation:
         """Return this situation with body `row` at another pose."""
-        positions, quaternions = self.positions.copy(), self.quaternions.copy()
+        positions = self.positions.copy()
+        quaternions = self.quaternions.copy()
         positions[row], quaternions[row] = at
         return replace(self, positions=positions, quaternions=quaternions)
 

@@ -134,7 +134,8 @@ class SampledSearch:
     """Searches joint space scaled by `weights` (joints,) for polylines checked every `resolution` of scaled length."""
 
     def __init__(self, low: Array, high: Array, weights: Array, resolution: float) -> None:
-        self._low, self._high = low, high
+        self._low = low
+        self._high = high
         self._weights = weights
         self._resolution = resolution
 
@@ -145,7 +146,8 @@ class SampledSearch:
         """
         util.RNG.setSeed(seed)
         start, goal, free = query
-        count, scaled = 0, np.zeros(len(start))
+        count = 0
+        scaled = np.zeros(len(start))
 
         def valid(state: base.State) -> bool:
             nonlocal count
@@ -175,7 +177,8 @@ class SampledSearch:
         joints = len(start)
         low = np.where(np.isfinite(self._low), self._low, np.minimum(start, goal) - ENDLESS_RAD)
         high = np.where(np.isfinite(self._high), self._high, np.maximum(start, goal) + ENDLESS_RAD)
-        space, bounds = base.RealVectorStateSpace(joints), base.RealVectorBounds(joints)
+        space = base.RealVectorStateSpace(joints)
+        bounds = base.RealVectorBounds(joints)
         for j in range(joints):
             # The arm may rest slightly beyond a limit: the start counts as inside.
             bounds.setLow(j, float(min(low[j], start[j], goal[j]) * self._weights[j]) - BOUND_ROUNDING)
@@ -218,7 +221,8 @@ def lever_arms(cell: Cell, seed: int) -> Array:
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
     """
-    data, rng = mujoco.MjData(cell.model), np.random.default_rng(seed)
+    data = mujoco.MjData(cell.model)
+    rng = np.random.default_rng(seed)
     levers = np.zeros(len(cell.qpos))
     low, high = sampling_range(cell)
     for _ in range(LEVER_SAMPLES):
@@ -229,7 +233,8 @@ def lever_arms(cell: Cell, seed: int) -> Array:
 
 
 def _lever(cell: Cell, data: mujoco.MjData, joint: int) -> float:
-    m, dof = cell.model, cell.dof[joint]
+    m = cell.model
+    dof = cell.dof[joint]
     index = int(m.dof_jntid[dof])
     if m.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE:
         return 1.0

@@ -42,7 +42,8 @@ class Payloads:
     """Checks the payloads of one arm. `names` are the objects by their rows."""
 
     def __init__(self, cell: Cell, names: tuple[str, ...]) -> None:
-        self._cell, self._names = cell, names
+        self._cell = cell
+        self._names = names
         self._dynamics = Dynamics(cell)
         self._data = cell.start()
         self._rest = np.zeros(len(cell.home))
@@ -62,7 +63,8 @@ class Payloads:
         """Raise `Refused` with both torques if a motor cannot carry object `row` at one of (k, joints), rad."""
         model = self._cell.model
         centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
-        payload, limit = Payload(self._mass(row), centre.position), MAX_MOTOR_PART * self._cell.bounds.torque
+        payload = Payload(self._mass(row), centre.position)
+        limit = MAX_MOTOR_PART * self._cell.bounds.torque
         for q in configurations:
             load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
             worst = int(np.argmax(load - limit))
@@ -87,7 +89,8 @@ class Payloads:
         wide, narrow = self._around(surfaces[0] + surfaces[1]) if surfaces is not None else (None, None)
         if surfaces is None or wide is None or narrow is None or wide.gap <= narrow.gap:
             return None
-        model, cell = self._cell.model, self._cell
+        model = self._cell.model
+        cell = self._cell
         assert cell.gripper_closed is not None, "there are jaws"
         assert cell.gripper_stiffness is not None, "there are jaws"
         most = float(model.actuator_forcerange[cell.gripper_actuator, 1])
@@ -105,7 +108,8 @@ class Payloads:
 
     def _surfaces(self, row: int, grip: Pose) -> tuple[float, float] | None:
         """Return how far the object reaches from the tool to either side, m; None: the line misses it."""
-        cell, data = self._cell, self._data
+        cell = self._cell
+        data = self._data
         address = cell.object_qpos[row]
         tool = pose(*site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
@@ -118,7 +122,8 @@ class Payloads:
 
     def _closing(self) -> list[Jaws]:
         """Return the jaws from open to closed, while there is a gap and a finger on either side."""
-        cell, data = self._cell, self._data
+        cell = self._cell
+        data = self._data
         if cell.linkage is None:
             return []
         openings = cell.linkage.openings
@@ -141,16 +146,20 @@ class Payloads:
 
     def _nearest(self, geoms: NDArray[np.int_], start: float, way: float) -> tuple[float, int]:
         """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf: none."""
-        model, data, tool = self._cell.model, self._data, self._cell.tool
+        model = self._cell.model
+        data = self._data
+        tool = self._cell.tool
         axis = data.site_xmat[tool].reshape(3, 3)[:, 1].copy()
-        begin, along = data.site_xpos[tool] + start * axis, way * axis
+        begin = data.site_xpos[tool] + start * axis
+        along = way * axis
         found = (np.inf, -1)
         for geom in geoms:
             kind = int(model.geom_type[geom])
             if kind == mujoco.mjtGeom.mjGEOM_MESH:
                 distance = mujoco.mj_rayMesh(model, data, int(geom), begin, along)
             else:
-                at, turned = data.geom_xpos[geom], data.geom_xmat[geom]
+                at = data.geom_xpos[geom]
+                turned = data.geom_xmat[geom]
                 distance = mujoco.mju_rayGeom(at, turned, model.geom_size[geom], begin, along, kind)
             if 0.0 <= distance < found[0]:
                 found = (float(distance), int(geom))

@@ -25,13 +25,15 @@ class Pose(NamedTuple):
 
     def __matmul__(self, inner: Pose) -> Pose:
         """Return the composition: `inner` is given in the frame that this pose places."""
-        position, quaternion = np.zeros(3), np.zeros(4)
+        position = np.zeros(3)
+        quaternion = np.zeros(4)
         mujoco.mju_mulPose(position, quaternion, *self, *inner)
         return Pose(position, quaternion)
 
     def inverse(self) -> Pose:
         """Return the inverse."""
-        position, quaternion = np.zeros(3), np.zeros(4)
+        position = np.zeros(3)
+        quaternion = np.zeros(4)
         mujoco.mju_negPose(position, quaternion, *self)
         return Pose(position, quaternion)
 
@@ -93,10 +95,12 @@ def pointing(direction: ArrayLike, yaw: float = 0.0) -> Array:
     target = np.array(direction, dtype=float)
     target /= norm(target)
     axis = np.cross([0.0, 0.0, 1.0], target)
-    sine, cosine = norm(axis), float(target[2])
+    sine = norm(axis)
+    cosine = float(target[2])
     # Straight down, any horizontal axis is possible: x keeps the tool's y across the yaw.
     axis = np.array([1.0, 0.0, 0.0]) if sine < MAX_PARALLEL_SINE else axis / sine
-    turn, result = np.zeros(4), np.zeros(4)
+    turn = np.zeros(4)
+    result = np.zeros(4)
     mujoco.mju_axisAngle2Quat(turn, axis, math.atan2(sine, cosine))
     mujoco.mju_mulQuat(result, turn, turned_about_z(yaw))
     return result

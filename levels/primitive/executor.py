@@ -147,13 +147,15 @@ class PrimitiveExecutor(Executor):
             self._position[:] = work.motion.set_point.position
 
     def _finish(self, servo: Message, tick: int) -> None:
-        work, memory = self._work, self._memory
+        work = self._work
+        memory = self._memory
         if work is None or memory is None or self._fault is not None or not work.done(servo):
             return
         if isinstance(work, GripperWork):
             memory.held = work.held_after
             self._carry(memory.held, tick)
-        memory.done, self._work = work.segment.id, None
+        memory.done = work.segment.id
+        self._work = None
 
     def _withdraw(self, serials: list[int]) -> bool:
         """Drop work and fault that have left the window; return whether the work must first ramp to rest."""
@@ -165,7 +167,8 @@ class PrimitiveExecutor(Executor):
         if isinstance(self._work, PathWork) and self._memory is not None:
             # Messages may arrive out of order: a withdrawn segment may return, and then continues.
             self._memory.interrupted, self._memory.progress = serial, self._work.progress
-        self._work, self._fault = None, None
+        self._work = None
+        self._fault = None
         return False
 
     def _begin(self, read: Ports, serials: list[int], hold: bool) -> None:
@@ -190,7 +193,8 @@ class PrimitiveExecutor(Executor):
     def _begin_gripper(self, segment: MotionSegment, memory: Memory) -> GripperWork:
         if self._gripper is None:
             raise ValueError(f"segment {segment.id}: the arm has no gripper; valid: paths")
-        memory.opening, memory.force = segment.opening, segment.force
+        memory.opening = segment.opening
+        memory.force = segment.force
         return GripperWork(segment, self._gripper, self._rules)
 
     def _begin_path(self, segment: MotionSegment, memory: Memory, read: Ports) -> PathWork:
@@ -208,7 +212,8 @@ class PrimitiveExecutor(Executor):
 
     def _wanted(self, read: Ports, serials: list[int]) -> tuple[int, float]:
         """Return the segment for which a trajectory is wanted, and the path parameter of its start; 0: none."""
-        work, done = self._work, self._memory.done if self._memory is not None else 0
+        work = self._work
+        done = self._memory.done if self._memory is not None else 0
         kinds = read.command.value.segments["kind"].tolist()
         for serial, kind in zip(serials, kinds, strict=False):
             begin = 0.0 if kind == SegmentKind.PATH else None
@@ -223,7 +228,9 @@ class PrimitiveExecutor(Executor):
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_set_point(self, command: Message, tick: int) -> None:
-        work, memory, in_step = self._work, self._memory, self._tracking.in_step
+        work = self._work
+        memory = self._memory
+        in_step = self._tracking.in_step
         command.id = tick // self.context.every + 1 if memory is not None else 0
         # Out of step the arm's position is not certain: no set point is better than a wrong one.
         command.due = self._due(tick) if in_step else 0
@@ -231,17 +238,21 @@ class PrimitiveExecutor(Executor):
         command.position[:] = self._position
         command.velocity[:], command.acceleration[:] = set_point.velocity, set_point.acceleration
         if memory is not None:
-            command.opening, command.force, command.held = memory.opening, memory.force, memory.held_row
+            command.opening = memory.opening
+            command.force = memory.force
+            command.held = memory.held_row
 
     def _write_status(self, read: Ports, status: Message, serials: list[int], tick: int) -> None:
-        memory, path_work = self._memory or Memory(), self._work if isinstance(self._work, PathWork) else None
+        memory = self._memory or Memory()
+        path_work = self._work if isinstance(self._work, PathWork) else None
         status.echo = read.command.value.id
         status.state = self._state(serials, memory)
         reason = self._reason_to_wait(read) if status.state == State.EXECUTING else ""
         if reason:
             status.state = State.HOLDING
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
-        status.done, status.held = memory.done, memory.held_row
+        status.done = memory.done
+        status.held = memory.held_row
         interrupted = memory.interrupted if memory.interrupted in serials else 0
         status.current = self._work.segment.id if self._work is not None else interrupted
         if read.status.is_there:
@@ -257,7 +268,8 @@ class PrimitiveExecutor(Executor):
 
     def _reason_to_wait(self, read: Ports) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
-        work, command = self._work, read.command
+        work = self._work
+        command = read.command
         if not self._tracking.in_step:
             return self._tracking.awaited(read.status.value)
         if isinstance(work, GripperWork):

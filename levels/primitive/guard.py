@@ -41,7 +41,8 @@ class Guard:
         """Look `lookahead_s` ahead; `delay_s` is the time from sensing the world to the set point commanded last."""
         self._checker = CollisionChecker(cell, scene)
         self._clearance = CLEARANCE_PART * scene.clearance
-        self._rows, self._objects = len(scene.bodies), len(scene.objects)
+        self._rows = len(scene.bodies)
+        self._objects = len(scene.objects)
         self._by_themselves = (np.arange(self._rows) >= self._objects)[:, None].astype(float)
         self._delay_s = delay_s
         self._spacing_s = lookahead_s / NEAR_CHECKS

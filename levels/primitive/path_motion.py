@@ -69,7 +69,8 @@ class PathMotion:
         """
         points = self.path.sample(NEAREST_STEP_RAD)
         away = np.linalg.norm(points - position, axis=1)
-        before, after = np.append(np.inf, away[:-1]), np.append(away[1:], np.inf)
+        before = np.append(np.inf, away[:-1])
+        after = np.append(away[1:], np.inf)
         near = np.flatnonzero((away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD))
         # `linspace` ends exactly: rounding must not lead beyond the end, where no trajectory begins.
         places = np.linspace(0.0, self.path.length, len(points))[near]
@@ -88,7 +89,9 @@ class PathMotion:
             return
         stop = make_stop(self.path, self._braking, self.trajectory.at(self.time_s))
         if stop is not None:
-            self.trajectory, self.time_s, self.stopping = stop, 0.0, True
+            self.trajectory = stop
+            self.time_s = 0.0
+            self.stopping = True
 
     def advance(self, duration_s: float) -> JointSetPoint:
         """Advance by `duration_s`; return the new set point. The next call overwrites its arrays."""
@@ -111,7 +114,9 @@ class PathMotion:
         return self.set_point
 
     def _rest(self, s: float, position: Array) -> float:
-        self.s, self.trajectory, self.stopping = s, None, False
+        self.s = s
+        self.trajectory = None
+        self.stopping = False
         np.subtract(position, self.path.evaluate(s).q, out=self._offset)
         distance = float(np.abs(self._offset).max())
         self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
@@ -127,14 +132,16 @@ class PathMotion:
         if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
             self.s = self.path.length
             self.set_point.position[:] = self.path.evaluate(self.s).q
-        self.trajectory, self.stopping = None, False
+        self.trajectory = None
+        self.stopping = False
         self.set_point.velocity.fill(0.0)
         self.set_point.acceleration.fill(0.0)
 
     def _bridge(self, duration_s: float) -> None:
         """Add the remaining distance to the path: a quintic from one to zero, at rest at both ends."""
         self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
-        u, per_s = self._bridged_s / self._bridging_s, 1.0 / self._bridging_s
+        u = self._bridged_s / self._bridging_s
+        per_s = 1.0 / self._bridging_s
         left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
         rate = -30.0 * u**2 * (1.0 - u) ** 2 * per_s
         change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2

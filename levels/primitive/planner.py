@@ -43,12 +43,18 @@ class PrimitivePlanner(Planner):
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
         """Time the wanted segment from its point of departure, or give the reason why not."""
-        status, context = read.status.value, self.context
-        serial, begin = status.wants, status.begin
+        status = read.status.value
+        context = self.context
+        serial = status.wants
+        begin = status.begin
         published = tick + context.within_cycles * context.every
-        self._made, self._answered_at = (serial, begin), published + context.every
-        write.segment, write.begin = serial, begin
-        write.duration, write.earliest, write.count = 0.0, 0.0, 0
+        self._made = (serial, begin)
+        self._answered_at = published + context.every
+        write.segment = serial
+        write.begin = begin
+        write.duration = 0.0
+        write.earliest = 0.0
+        write.count = 0
         fault: SegmentFault | None = None
         try:
             segment = read_segment(read.command.value, serial)
@@ -74,7 +80,8 @@ class PrimitivePlanner(Planner):
         self, write: Message, segment: MotionSegment, trajectory: Trajectory, start_s: float
     ) -> SegmentFault | None:
         sections = trajectory.sections
-        write.duration, write.count = trajectory.duration, len(sections)
+        write.duration = trajectory.duration
+        write.count = len(sections)
         write.sections[: len(sections)] = sections
         write.earliest = start_s + trajectory.duration + self._rules.latency_s
         fresh = trajectory.begin == 0.0

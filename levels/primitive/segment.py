@@ -60,7 +60,9 @@ def read_segment(command: Message, serial: int) -> MotionSegment:
     Raises `ValueError` for an unknown kind and for numbers that are not finite.
     """
     record = command.segments[window(command).index(serial)]
-    count, kind, held = int(record["count"]), int(record["kind"]), int(record["object"])
+    count = int(record["count"])
+    kind = int(record["kind"])
+    held = int(record["object"])
     if kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
         raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
     if not np.isfinite([record["by"], record["opening"], record["force"]]).all():
@@ -97,7 +99,8 @@ class Memory:
 
 def recall(read: Ports) -> Memory | None:
     """Return the state in the level's own last messages; None before the first ones."""
-    status, command = read.last_status, read.last_command
+    status = read.last_status
+    command = read.last_command
     if not (status.is_there and command.is_there and command.value.id):
         return None
     return Memory(

@@ -55,7 +55,8 @@ class Tracking:
         # Written so that NaN does not count as rest.
         if not np.abs(servo.target_velocity).max() <= MAX_REST_RAD_S or not np.isfinite(servo.target).all():
             return False
-        self.in_step, self._cycles_in_step = True, 0
+        self.in_step = True
+        self._cycles_in_step = 0
         return True
 
     def awaited(self, servo: Message) -> str:
@@ -91,7 +92,9 @@ class Straying:
 
     def forget(self) -> None:
         """Start counting anew."""
-        self._cycles, self.place, self.fault = 0, "", None
+        self._cycles = 0
+        self.place = ""
+        self.fault = None
 
     def update(self, servo: Message) -> None:
         """Process one status; set `fault` when a joint has been too far away for too long."""

@@ -149,7 +149,8 @@ class PathWork:
 
     def step(self, cycle: WorkCycle) -> None:
         """Advance by one cycle."""
-        motion, waits = self.motion, self.begin_wanted is not None
+        motion = self.motion
+        waits = self.begin_wanted is not None
         if motion.trajectory is not None and not motion.stopping:
             self._block(not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world))
             if cycle.hold or self.blocked:
@@ -166,7 +167,8 @@ class PathWork:
         away = np.abs(status.position - self.motion.set_point.position)
         settled = self._quiet.settled(bool((away < self._rules.params.settled).all()))
         if self._quiet.overdue and not settled:
-            joint, permitted = int(away.argmax()), self._rules.params.settled
+            joint = int(away.argmax())
+            permitted = self._rules.params.settled
             name = self._rules.joints[joint]
             reason = f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most {permitted} rad"
             self.fault = SegmentFault(Error.FOLLOWING, reason)
@@ -245,7 +247,8 @@ class GripperWork:
         # Before the command reaches it, the gripper rests too.
         if self._cycles <= HANDOVER_CYCLES:
             return False
-        speed, permitted = abs(status.opening_velocity), self._rules.params.settled_opening
+        speed = abs(status.opening_velocity)
+        permitted = self._rules.params.settled_opening
         settled = self._quiet.settled(speed < permitted)
         if self._quiet.overdue and not settled:
             reason = f"gripper still moves at {speed:.4f} m/s; it must come below {permitted} m/s"

@@ -109,13 +109,16 @@ def index(
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
     tool = lookup.tool_site(model, robot.tool, moved if hand is None else None)
-    gripper, joint = robot.gripper, lookup.gripper_joint(model, robot, moved)
+    gripper = robot.gripper
+    joint = lookup.gripper_joint(model, robot, moved)
     bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
-    objects, obstacles = bodies[: len(scene.objects)], bodies[len(scene.objects) :]
+    objects = bodies[: len(scene.objects)]
+    obstacles = bodies[len(scene.objects) :]
     linked = lookup.hand(model, joint, joints)
     if hand is not None:  # the palm, which its joints do not move, is a part of a hand
         linked = moved = lookup.below(model, model.site_bodyid[[tool]]) | moved
-    arm_geoms, gripper_geoms = lookup.geoms_of(model, moved), lookup.geoms_of(model, linked)
+    arm_geoms = lookup.geoms_of(model, moved)
+    gripper_geoms = lookup.geoms_of(model, linked)
     object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)

@@ -50,7 +50,9 @@ class Terms(NamedTuple):
     bias: Array  # (joints,), N m: gravity, Coriolis and centrifugal torques, springs, viscous friction
 
 
-STATE_ROWS, BIAS_ROW, INERTIA_ROW = 2, 2, 3
+STATE_ROWS = 2
+BIAS_ROW = 2
+INERTIA_ROW = 3
 """An evaluation is one array, (3 + joints, joints): position, velocity, bias, inertia."""
 
 
@@ -73,8 +75,10 @@ class Dynamics:
         self._offset = np.zeros(3)
         at = self._model._address, d._address
         self._evaluating = *at, *addresses(self._model, d, cell), self._evaluations
-        hand, tool = int(cell.model.site_bodyid[cell.tool]), (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
-        gravity, jacobians = np.array(self._model.opt.gravity), np.zeros((2, 3, cell.model.nv))
+        hand = int(cell.model.site_bodyid[cell.tool])
+        tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
+        gravity = np.array(self._model.opt.gravity)
+        jacobians = np.zeros((2, 3, cell.model.nv))
         self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, given
         self._evaluate, self._carry = evaluate.load(), carry.load()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
@@ -99,7 +103,8 @@ class Dynamics:
 
     def pose(self, q: Array) -> tuple[Array, Array]:
         """Return position (3,), m, and rotation (3, 3) of the tool at `q`. The arrays are valid until the next call."""
-        m, d = self._model, self._data
+        m = self._model
+        d = self._data
         self.newest[:STATE_ROWS] = np.nan
         d.qpos[self._cell.qpos] = q
         mujoco.mj_kinematics(m, d)
@@ -128,7 +133,10 @@ def evaluate(model: int, data: int, places: NDArray[np.int64], memory: Array, ev
 
     Both are (3 + joints, joints), and equal afterwards; `places` are addresses in `memory`, see `addresses`.
     """
-    newest, given, joints, same = evaluations[0], evaluations[1], places.shape[1], True
+    newest = evaluations[0]
+    given = evaluations[1]
+    joints = places.shape[1]
+    same = True
     for row in range(STATE_ROWS):
         for joint in range(joints):
             same &= newest[row, joint] == given[row, joint]
@@ -164,7 +172,9 @@ def carry(
     evaluation: Array,
 ) -> None:
     """Add a point mass at the tool: m J^T J to the inertia, m J^T (Jdot qd - g) to the bias."""
-    velocity, bias, inertia = evaluation[1], evaluation[BIAS_ROW], evaluation[INERTIA_ROW:]
+    velocity = evaluation[1]
+    bias = evaluation[BIAS_ROW]
+    inertia = evaluation[INERTIA_ROW:]
     centre = np.empty(3)
     for axis in range(3):
         of = turned[3 * axis : 3 * axis + 3]
@@ -173,7 +183,8 @@ def carry(
     mj_jac_dot(model, data, jacobians[1].ctypes.data, 0, centre.ctypes.data, hand)
     count = len(dof)
     for axis in range(3):
-        jacobian, change = jacobians[0, axis], jacobians[1, axis]
+        jacobian = jacobians[0, axis]
+        change = jacobians[1, axis]
         acceleration = -gravity[axis]
         for joint in range(count):
             acceleration += change[dof[joint]] * velocity[joint]
@@ -187,8 +198,12 @@ def carry(
 def preload() -> None:
     """Load this module's compiled functions."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data, places, none = mujoco.MjData(model), np.zeros((4, 0), dtype=int), np.zeros(0)
-    at, evaluations, place = (model._address, data._address), np.zeros((2, 3, 0)), np.zeros(3)
+    data = mujoco.MjData(model)
+    places = np.zeros((4, 0), dtype=int)
+    none = np.zeros(0)
+    at = (model._address, data._address)
+    evaluations = np.zeros((2, 3, 0))
+    place = np.zeros(3)
     evaluate.load()(*at, places, none, evaluations)
     jacobians = np.zeros((2, 3, 0))
     carry.load()(0.0, place, *at, places[0], 0, place, np.zeros(9), place, jacobians, evaluations[0])

@@ -29,9 +29,11 @@ class native(compiled[..., None]):  # noqa: N801  # stands for a function
 
     def __init__(self, name: str, arguments: int) -> None:
         function = getattr(ctypes.CDLL(str(LIBRARY)), name)
-        function.restype, function.argtypes = None, [ctypes.c_ssize_t] * arguments
+        function.restype = None
+        function.argtypes = [ctypes.c_ssize_t] * arguments
         super().__init__(function)
-        self._name, self._arguments = name, arguments
+        self._name = name
+        self._arguments = arguments
 
     def load(self) -> Any:
         """Return the function for compiled callers."""
@@ -69,7 +71,8 @@ def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     """
     begins = np.array([array.ctypes.data for array in arrays])
     ends = [int(begin) + array.nbytes for begin, array in zip(begins, arrays, strict=True)]
-    first, item = int(begins.min()), np.dtype(np.float64).itemsize
+    first = int(begins.min())
+    item = np.dtype(np.float64).itemsize
     return _view(first, np.float64, ((max(ends) - first) // item,), (item,)), (begins - first) // item
 
 
@@ -89,15 +92,18 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     """
     state = np.zeros(mujoco.mj_stateSize(model, STATE))
     mujoco.mj_getState(model, data, state, STATE)
-    warnings, timers = data.warning.number, data.timer.number
+    warnings = data.warning.number
+    timers = data.timer.number
     end = warnings.ctypes.data - warnings.itemsize + len(warnings) * warnings.strides[0]
     number = _view(end + len(timers) * timers.strides[0], np.int32, (1,), (4,))
     before = int(number[0])
     mujoco.mj_addContact(model, data, mujoco.MjContact())  # where there are no contacts, they have no address
     if not before + 1 == number[0] == data.ncon:
         raise RuntimeError(f"MuJoCo {mujoco.mj_versionString()} does not keep the number of contacts where 4.0 does")
-    geoms, distance = data.contact.geom, data.contact.dist
-    room, strides = data.narena // geoms.strides[0], geoms.strides
+    geoms = data.contact.geom
+    distance = data.contact.dist
+    room = data.narena // geoms.strides[0]
+    strides = geoms.strides
     views = ContactViews(
         number,
         _view(geoms.ctypes.data, np.int32, (room, 2), strides),

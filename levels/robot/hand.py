@@ -91,7 +91,8 @@ def fit_tendons(
     remove(spec, [a for a in spec.actuators if a.name not in tendons and drives_arm(spec, a, robot)])
     for name in robot.joints:
         joint = spec.joint(name)
-        joint.actfrclimited, joint.actgravcomp = mujoco.mjtLimited.mjLIMITED_FALSE, False
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        joint.actgravcomp = False
     for actuator in spec.actuators:
         if actuator.delay > 0.0:
             actuator.nsample = max(actuator.nsample, math.ceil(actuator.delay / step_s) + 1)
@@ -99,7 +100,8 @@ def fit_tendons(
         site = spec.site(finger.tip)
         if site is not None:
             site.parent.name = site.parent.name or f"tip of {finger.name}"
-            kind, body = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtObj.mjOBJ_BODY
+            kind = mujoco.mjtSensor.mjSENS_CONTACT
+            body = mujoco.mjtObj.mjOBJ_BODY
             sensor = spec.add_sensor(name=_force_of(finger), type=kind, reftype=body, refname=site.parent.name)
             sensor.intprm[:3] = NET_FORCE
     return list(hand.flexors), np.full(len(robot.joints), np.inf)
@@ -175,7 +177,8 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: NDArray[np.int_]
     arms = np.zeros(len(joints))
     for number, joint in enumerate(robot.joints):
         for row, sign in enumerate((1.0, -1.0)):
-            name, own = model.actuator(int(actuators[row, number])).name, [moments[row, number] for moments in at]
+            name = model.actuator(int(actuators[row, number])).name
+            own = [moments[row, number] for moments in at]
             arm = float(own[0][number])
             why = _no_arm(robot, joint, own, sign)
             if why:
@@ -207,7 +210,8 @@ def _no_arm(robot: RobotConfig, joint: str, own: list[NDArray[np.float64]], sign
 
 def _moments(model: mujoco.MjModel, joints: NDArray[np.int_], position: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the moments of all actuators on `joints` at a position of these, (actuators, joints), m."""
-    data, moments = mujoco.MjData(model), np.zeros((model.nu, model.nv))
+    data = mujoco.MjData(model)
+    moments = np.zeros((model.nu, model.nv))
     data.qpos[model.jnt_qposadr[joints]] = position
     mujoco.mj_fwdPosition(model, data)
     mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)

@@ -69,7 +69,8 @@ class Encoders:
     @classmethod
     def of(cls, robot: RobotConfig) -> Encoders:
         """Return the encoders of a `[robot]` table."""
-        joints, sensors = len(robot.joints), robot.sensors
+        joints = len(robot.joints)
+        sensors = robot.sensors
         return cls(np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints))
 
     @property

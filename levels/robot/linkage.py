@@ -92,7 +92,8 @@ class _Solver:
         self._follow, self._loose = follow, np.ones(len(follow), dtype=bool)
         self.driven = int(model.jnt_qposadr[joint])
         self.joints = model.jnt_qposadr[follow].astype(int)
-        self._dof, self._driven_dof = model.jnt_dofadr[follow], int(model.jnt_dofadr[joint])
+        self._dof = model.jnt_dofadr[follow]
+        self._driven_dof = int(model.jnt_dofadr[joint])
         stiffness = model.jnt_stiffness[follow]
         self._springs = SPRING_PART * stiffness / max(float(np.max(stiffness, initial=0.0)), 1e-12)
         self._relaxed = model.qpos_spring[self.joints]
@@ -100,10 +101,13 @@ class _Solver:
 
     def settle(self, start: Array, opening: float) -> Array:
         """Return qpos with the linkage settled at `opening`, searched from `start`."""
-        data, count = self._data, len(self.joints)
+        data = self._data
+        count = len(self.joints)
         data.qpos[:] = start
         data.qpos[self.driven] = opening
-        matrix, slope, step = np.zeros((count, count)), np.zeros(count), np.zeros(count)
+        matrix = np.zeros((count, count))
+        slope = np.zeros(count)
+        step = np.zeros(count)
         for _ in range(ITERATIONS if count else 0):
             residual, jacobian = self._rows()
             mujoco.mju_mulMatTMat(matrix, jacobian, jacobian)
@@ -123,7 +127,8 @@ class _Solver:
 
     def check(self, opening: float) -> None:
         """Raise `RobotError` where the last pose leaves an equality open."""
-        data, jacobian = self._data, self._jacobian()
+        data = self._data
+        jacobian = self._jacobian()
         ours = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
         ours &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         if not ours.any():
@@ -149,7 +154,8 @@ class _Solver:
 
     def _rows(self) -> tuple[Array, Array]:
         """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops that are exceeded."""
-        data, jacobian = self._data, self._jacobian()[:, self._dof]
+        data = self._data
+        jacobian = self._jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)
         rows = np.flatnonzero(counts & np.any(jacobian != 0.0, axis=1))
         return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows])

@@ -128,7 +128,8 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
     if old is None:
         have = listed([a.name for a in spec.actuators])
         raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; actuators: {have}")
-    kind, target = old.trntype, old.target
+    kind = old.trntype
+    target = old.target
     if kind not in (*JOINT_DRIVES, mujoco.mjtTrn.mjTRN_TENDON):
         raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; valid: on a joint or tendon")
     remove(spec, [old])

@@ -40,7 +40,8 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: NDArray
         raise RobotError(f"robot.wrist: site '{model.site(force).name}' is on a body that the arm does not move")
     most = {"force": config.most_force, "torque": config.most_torque}
     for key, sensor in sensors.items():
-        reach, unit = float(model.sensor_cutoff[sensor]), UNITS[key]
+        reach = float(model.sensor_cutoff[sensor])
+        unit = UNITS[key]
         if not reach > 0.0:
             raise RobotError(f"robot.wrist.{key}: sensor '{names[key]}' has no range; give it a cutoff, {unit}")
         if most[key] > reach:

@@ -31,7 +31,9 @@ TURNING = 2.0
 """Speed, in `FRICTION_SPEED`, up to which dry friction may be anything up to its full value."""
 
 
-EXPLAINED, LEFT_OVER, ASTRAY = 0, 1, 2
+EXPLAINED = 0
+LEFT_OVER = 1
+ASTRAY = 2
 """Verdicts on a cycle: nothing, or some torque, is left unexplained; a joint has strayed from its set points."""
 
 
@@ -45,8 +47,11 @@ class ActuatorMonitor:
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
-        model, dof, joints = cell.model, cell.dof, len(cell.dof)
-        self._limits, self._fastest = cell.bounds.torque, URGENT_SPEED_PART * cell.bounds.velocity
+        model = cell.model
+        dof = cell.dof
+        joints = len(cell.dof)
+        self._limits = cell.bounds.torque
+        self._fastest = URGENT_SPEED_PART * cell.bounds.velocity
         self._table = np.zeros((13 + joints, joints))  # in the rows of `left_over`
         # `torque`, (joints,), N m: given in the cycle that begins; the level fills it in.
         self.torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
@@ -85,7 +90,8 @@ class ActuatorMonitor:
         if not self._begun:
             return None
         if verdict == EXPLAINED:
-            self._cycles, self._pushed = 0, False
+            self._cycles = 0
+            self._pushed = False
             return None
         if verdict == ASTRAY:
             astray = wanted[0] - state[0]
@@ -99,7 +105,8 @@ class ActuatorMonitor:
         lacks = left * np.sign(self.torque)
         explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
         if not self._pushed and not explained.all():
-            self._pushed, self._cycles = True, 0
+            self._pushed = True
+            self._cycles = 0
         share = np.where(explained, lacks / self._limits, 0.0)
         # While a joint turns, its dry friction is known, and any push shows.
         rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < MIN_TURNING_JOINTS
@@ -110,9 +117,12 @@ class ActuatorMonitor:
             self._cycles = 0
             return None
         if self._cycles == 0 or joint != self._joint:
-            self._joint, self._cycles = joint, 0
-            self._commanded, self._given = commanded[joint], commanded[joint] - lacks[joint]
-            self._most, self._alone = 0.0, True
+            self._joint = joint
+            self._cycles = 0
+            self._commanded = commanded[joint]
+            self._given = commanded[joint] - lacks[joint]
+            self._most = 0.0
+            self._alone = True
         self._cycles += 1
         self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
         self._alone &= not rests and np.count_nonzero(np.abs(left) > self._noise) == 1
@@ -132,7 +142,8 @@ class ActuatorMonitor:
             return False
         if self._pushed:
             return True
-        more, rise = commanded - self._commanded, commanded - lacks - self._given
+        more = commanded - self._commanded
+        rise = commanded - lacks - self._given
         certain = 2.0 * self._noise[joint]
         hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD_PART * commanded else 0.0
         return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))
@@ -154,14 +165,18 @@ def left_over(
     dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s
     noise, uncertain = table[5], table[6]  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
     off = table[7]  # rad: error of the positions
-    position, velocity, verdict = state[0], state[1], EXPLAINED
+    position = state[0]
+    velocity = state[1]
+    verdict = EXPLAINED
     for j in range(len(velocity)):
-        left, unsure = torque[j] - 0.5 * (bias_before[j] + bias[j]), noise[j]
+        left = torque[j] - 0.5 * (bias_before[j] + bias[j])
+        unsure = noise[j]
         for k in range(len(velocity)):
             left -= (inertia_before[j, k] + inertia[j, k]) * (half_rate * (velocity[k] - velocity_before[k]))
             unsure += abs(inertia[j, k]) * uncertain[k]
         ahead = velocity[j] + early[j] * (half_rate * (velocity[j] - velocity_before[j]))
-        slowest, fastest = min(ahead, velocity_before[j]), max(ahead, velocity_before[j])
+        slowest = min(ahead, velocity_before[j])
+        fastest = max(ahead, velocity_before[j])
         least = dry[j] * math.tanh(slowest / FRICTION_SPEED - TURNING)
         most = dry[j] * math.tanh(fastest / FRICTION_SPEED + TURNING)
         left -= min(max(left, least), most)

@@ -52,12 +52,14 @@ class JointPd(Modification):
     def __init__(self, context: LawContext) -> None:
         super().__init__(context)
         params = read_params(JointPdParams, context.params)
-        self._stiffness, self._damping = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
+        self._stiffness = params.bandwidth**2
+        self._damping = 2.0 * params.damping * params.bandwidth
         self._load = float(params.load)
 
     def modify(self, sample: LawSample) -> None:
         """Set the torque."""
-        error, slip = sample.wanted_position - sample.position, sample.wanted_velocity - sample.velocity
+        error = sample.wanted_position - sample.position
+        slip = sample.wanted_velocity - sample.velocity
         pull = sample.inertia * (self._stiffness * error + self._damping * slip)
         sample.torque = pull + self._load * sample.load
 
@@ -78,13 +80,15 @@ class Notch(Modification):
     def __init__(self, context: LawContext) -> None:
         """Raise `LevelError` for a frequency that is not below half the law's rate."""
         super().__init__(context)
-        params, half_hz = read_params(NotchParams, context.params), 0.5 / context.period_s
+        params = read_params(NotchParams, context.params)
+        half_hz = 0.5 / context.period_s
         if params.frequency >= half_hz:
             raise LevelError(
                 f"params.frequency = {params.frequency:g} Hz: permitted: below half the law's rate, {half_hz:g} Hz"
             )
         angle = 2.0 * math.pi * params.frequency * context.period_s
-        cosine, alpha = math.cos(angle), math.sin(angle) / (2.0 * params.quality)
+        cosine = math.cos(angle)
+        alpha = math.sin(angle) / (2.0 * params.quality)
         self._feed = np.array([1.0, -2.0 * cosine, 1.0]) / (1.0 + alpha)
         self._back = np.array([-2.0 * cosine, 1.0 - alpha]) / (1.0 + alpha)
         self._given: Array = np.zeros((2, len(context.joints)))  # N m: the last two torques of the law, newest first

@@ -134,9 +134,12 @@ class Grip:
     """
 
     def __init__(self, config: GripperConfig) -> None:
-        self._stiffness, self._damping, self._most_force = config.stiffness, config.damping, config.force
+        self._stiffness = config.stiffness
+        self._damping = config.damping
+        self._most_force = config.force
         self._least, self._most = sorted((config.open, config.closed))
-        self._opening, self._limit = config.open, config.force
+        self._opening = config.open
+        self._limit = config.force
         self._kept: float | None = None
 
     def keep(self, force: float) -> None:

@@ -47,13 +47,21 @@ class Curve:
 @compiled
 def set_motion(table: Array, duration_s: float, ends_s: float, time_s: float, ahead_s: float, motion: Array) -> None:
     """Set position, velocity and, `ahead_s` later, acceleration, (3, joints), to those on a curve."""
-    h, u, later = duration_s, time_s / duration_s, (time_s + ahead_s) / duration_s
-    moves, accelerates = time_s < ends_s, time_s + ahead_s < ends_s
+    h = duration_s
+    u = time_s / duration_s
+    later = (time_s + ahead_s) / duration_s
+    moves = time_s < ends_s
+    accelerates = time_s + ahead_s < ends_s
     for j in range(table.shape[1]):
         if not moves:
             motion[0, j], motion[1, j], motion[2, j] = table[REST, j], 0.0, 0.0
             continue
-        c0, c1, c2, c3, c4, c5 = table[0, j], table[1, j], table[2, j], table[3, j], table[4, j], table[5, j]
+        c0 = table[0, j]
+        c1 = table[1, j]
+        c2 = table[2, j]
+        c3 = table[3, j]
+        c4 = table[4, j]
+        c5 = table[5, j]
         motion[0, j] = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
         motion[1, j] = (c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
         acceleration = (2.0 * c2 + later * (6.0 * c3 + later * (12.0 * c4 + later * 20.0 * c5))) / (h * h)
@@ -90,7 +98,9 @@ def set_bridge(
     """Set the coefficients of the cubic Hermite curve in `table`, (7, joints)."""
     motion = np.zeros((3, table.shape[1]))
     set_motion(before, before_duration_s, before_ends_s, begin_s, 0.0, motion)
-    first, second, way = motion[1] * duration_s, velocity * duration_s, position - motion[0]
+    first = motion[1] * duration_s
+    second = velocity * duration_s
+    way = position - motion[0]
     table[0] = motion[0]
     table[1] = first
     table[2] = 3.0 * way - 2.0 * first - second
@@ -100,7 +110,8 @@ def set_bridge(
 @compiled
 def is_within(table: Array, duration_s: float, acceleration: Array) -> bool:
     """Return whether the acceleration of a cubic is within bounds, rad/s2: it is largest at one of the ends."""
-    begin, end = 2.0 * table[2] / duration_s**2, (2.0 * table[2] + 6.0 * table[3]) / duration_s**2
+    begin = 2.0 * table[2] / duration_s**2
+    end = (2.0 * table[2] + 6.0 * table[3]) / duration_s**2
     return bool(np.all((np.abs(begin) <= acceleration) & (np.abs(end) <= acceleration)))
 
 
@@ -123,8 +134,11 @@ class Decay(Curve):
         linear = 3.94 * np.abs(velocity)
         by_acceleration = (linear + np.sqrt(linear**2 + 4.0 * 5.774 * hardest * np.abs(position))) / (2.0 * hardest)
         duration_s = float(max(np.max(1.875 * np.abs(position) / fastest), np.max(by_acceleration)))
-        p, w = position, velocity * duration_s
-        c3, c4, c5 = -10.0 * p - 6.0 * w, 15.0 * p + 8.0 * w, -6.0 * p - 3.0 * w
+        p = position
+        w = velocity * duration_s
+        c3 = -10.0 * p - 6.0 * w
+        c4 = 15.0 * p + 8.0 * w
+        c5 = -6.0 * p - 3.0 * w
         super().__init__(p, w, np.zeros_like(p), c3, c4, c5, duration_s=duration_s, rest=np.zeros_like(p))
 
 
@@ -140,7 +154,8 @@ class Passage(Decay):
 
 def preload() -> None:
     """Load this module's compiled functions."""
-    table, joints = np.zeros((REST + 1, 1)), np.zeros(1)
+    table = np.zeros((REST + 1, 1))
+    joints = np.zeros(1)
     set_motion.load()(table, 1.0, 1.0, 0.0, 0.0, table[:3])
     set_bridge.load()(table, 1.0, 1.0, 0.0, joints, joints, 1.0, table)
     is_within.load()(table, 1.0, joints)

@@ -154,7 +154,8 @@ class ArmDriver(Executor):
         """Advance the arm to `tick`, sense, drive or brake, report."""
         missed = self._catch_up(read.before, tick)
         self.take_messages(read)
-        sensed, sensors = self._link.sense(), self.sensors
+        sensed = self._link.sense()
+        sensors = self.sensors
         contact = self.arm.contact
         sensors.look(sensed, tick, None if missed or self.abandoned else self._wanted, contact is not None)
         if contact is not None:
@@ -239,9 +240,11 @@ class ArmDriver(Executor):
 
     def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
         """Fill the status, and the estimate in the state; the steady fields only when they change."""
-        arm, status = self.arm, write.status
+        arm = self.arm
+        status = write.status
         if self._numbers is None:
-            moving, kept = numbers(status, "position", "grip_force"), numbers(write.state, "position", "doubt")
+            moving = numbers(status, "position", "grip_force")
+            kept = numbers(write.state, "position", "doubt")
             self._numbers = moving, kept, self.motors.torque
         _, _, opening, opening_velocity, _ = sensed
         self._show_numbers(
@@ -276,9 +279,13 @@ class ArmDriver(Executor):
         status.violations = shown.violations
         status.pushed = shown.pushed
         if shown.fault:
-            status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, shown.fault
+            status.state = State.ERROR
+            status.error = Error.SIMULATION
+            status.reason = shown.fault
         elif shown.error:
-            status.state, status.error, status.reason = State.ERROR, shown.error, kept
+            status.state = State.ERROR
+            status.error = shown.error
+            status.reason = kept
         else:
             resting = State.IDLE if shown.holding else State.EXECUTING
             status.state = State.HOLDING if kept and self.has_work else resting
@@ -291,7 +298,8 @@ def numbers(message: Message, first: str, last: str) -> Array:
     """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one array."""
     fields = message.record.dtype.fields
     assert fields is not None
-    begin, end = fields[first][1], fields[last][1] + fields[last][0].itemsize
+    begin = fields[first][1]
+    end = fields[last][1] + fields[last][0].itemsize
     return np.frombuffer(message.raw[begin:end])
 
 

@@ -54,7 +54,8 @@ class ServoExecutor(ArmDriver):
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated
         self._loop = ComputedTorque(cell, params, self.arm.dynamics)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
-        joints, modify = context.robot.joints, self._modified.obey
+        joints = context.robot.joints
+        modify = self._modified.obey
         self.operator = OperatorControl(self.commands, joints, cell.limits.position, modify=modify)
         self.orders = self.operator.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
@@ -87,7 +88,8 @@ class ServoExecutor(ArmDriver):
             self._loop.take(read.plan.value)
         if read.command.verdict is Verdict.NEW:
             command: Message = read.command.value
-            self.command, self.rests_on = command.id, command.operator
+            self.command = command.id
+            self.rests_on = command.operator
             self.reference.take(command)
             if self._grip is not None:
                 self._grip.take(command)
@@ -99,7 +101,8 @@ class ServoExecutor(ArmDriver):
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the wanted motion; after braking it begins where the arm is."""
-        sensors, reference = self.sensors, self.reference
+        sensors = self.sensors
+        reference = self.reference
         if self.abandoned:
             reference.start(sensors.position, sensors.velocity, tick)
         elif missed:
@@ -119,7 +122,9 @@ class ServoExecutor(ArmDriver):
         return self._torque(wanted, terms), grip_force
 
     def _torque(self, wanted: Motion, terms: Terms) -> Array:
-        loop, state, modified = self._loop, self.sensors.state, self._modified
+        loop = self._loop
+        state = self.sensors.state
+        modified = self._modified
         if not modified.exists:
             return loop.torque(wanted, state, terms)
         given = LawInputs(wanted, state, np.diagonal(terms.inertia), terms.bias, self.arm.tick)
@@ -142,7 +147,9 @@ class ServoExecutor(ArmDriver):
 
     def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
         """Return what the status says of set points."""
-        operator, cut = self.operator, self.reference.refused + self._loop.cut
+        operator = self.operator
+        cut = self.reference.refused + self._loop.cut
         kept = self.stopping.reason or (operator.reason if operator.stands else "")
-        holding, stopped = self.abandoned or self.reference.holding, self.abandoned or reaction > 0 or operator.stands
+        holding = self.abandoned or self.reference.holding
+        stopped = self.abandoned or reaction > 0 or operator.stands
         return self.command, holding, stopped, cut, kept

@@ -43,7 +43,9 @@ class Modified:
     """One modification of a law, put in or not."""
 
     def __init__(self, number: int, name: str, modification: Modification, is_on: bool) -> None:
-        self.number, self.name, self.modification = number, name, modification
+        self.number = number
+        self.name = name
+        self.modification = modification
         self.is_on = is_on
         self.begins = True  # the next sample is its first
 
@@ -71,14 +73,16 @@ class ModifiedLaw:
 
     def __init__(self, context: LevelContext, params: ModifiableParams, torque: Array, findings: list[Finding]) -> None:
         """Limit torques to `torque`, (joints,), N m; report failures as `findings`."""
-        joints, period_s = context.robot.joints, context.period_s
+        joints = context.robot.joints
+        period_s = context.period_s
         self.exists = bool(params.modifications)  # without one, `torque` is the law's
         self._all = {
             name: Modified(number, name, entry.kind(LawContext(joints, period_s, torque, entry.params)), entry.on)
             for number, (name, entry) in enumerate(params.modifications.items())
         }
         self._ticks = max(round(params.transfer / context.tick_s), context.every)
-        self._torque, self._findings = torque, findings
+        self._torque = torque
+        self._findings = findings
         self._sample = LawSample(len(joints))
         self._kept = np.zeros_like(self._sample.seen), np.zeros(len(joints))  # room for `Modified.act`
         self._last = np.zeros(len(joints))  # N m: torque of the last sample
@@ -91,7 +95,8 @@ class ModifiedLaw:
 
     def obey(self, command: Message) -> str:
         """Put a modification in, or take it out, with the next sample; return why that is refused, empty: it is not."""
-        one, is_on = self._all.get(command.name), command.goal == Goal.ON
+        one = self._all.get(command.name)
+        is_on = command.goal == Goal.ON
         if one is None:
             return f"no modification '{command.name}'; permitted: {', '.join(self._all) or 'none'}"
         if is_on != one.is_on or one.name in self._failed:
@@ -109,7 +114,8 @@ class ModifiedLaw:
 
     def torque(self, law: Law, given: LawInputs) -> Array:
         """Return the torques, (joints,), N m, of `law` as modified. Valid until the next call."""
-        torque, tick = self._modified(law, given) if self._in else law(given.motion, given.state), given.tick
+        torque = self._modified(law, given) if self._in else law(given.motion, given.state)
+        tick = given.tick
         if self._switched:
             self._switched = False
             self._since = tick if self._is_driving else None
@@ -122,7 +128,9 @@ class ModifiedLaw:
 
     def _modified(self, law: Law, given: LawInputs) -> Array:
         sample = self._sample
-        sample.tick, sample.inertia, sample.load = given.tick, given.inertia, given.load
+        sample.tick = given.tick
+        sample.inertia = given.inertia
+        sample.load = given.load
         sample.seen[:3], sample.seen[3:], sample.torque[:] = given.motion.table, given.state, np.nan
         seen, torque = self._kept
         for one in self._before:

@@ -41,7 +41,8 @@ class OperatorControl:
         self.stands = False  # the level follows the operator, not the level above
         self._driven = np.full(len(joints), True) if driven is None else driven
         self._joints = [joint for joint, own in zip(joints, self._driven, strict=True) if own]
-        self._ranges, self._modify = ranges[self._driven], modify
+        self._ranges = ranges[self._driven]
+        self._modify = modify
         self._position = np.zeros(len(joints))  # (joints,), rad: of the arm, at the newest command
         self._goal: Array | None = None  # (joints,), rad
         self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
@@ -85,7 +86,8 @@ class OperatorControl:
         if goal is None:
             motion = reference.rest(tick)
         else:
-            before, motion = reference.goal, reference.to(goal, tick)
+            before = reference.goal
+            motion = reference.to(goal, tick)
             if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):

@@ -27,7 +27,8 @@ class ServoPlanner(Planner):
         super().__init__(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._dynamics = Dynamics(cell)
-        self._home, self._objects = cell.home, len(cell.object_qpos)
+        self._home = cell.home
+        self._objects = len(cell.object_qpos)
         bodies = cell.bodies[: self._objects]
         self._masses = cell.model.body_subtreemass[bodies].copy()
         self._centres = cell.model.body_ipos[bodies].copy()
@@ -44,7 +45,9 @@ class ServoPlanner(Planner):
         held = command.held if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects else -1
         payload = Payload(0.0, np.zeros(3)) if held < 0 else self._payload(read.scene.value, held)
         write.inertia = self._dynamics.terms(self._position(read), self._rest, payload).inertia
-        write.held, write.payload_mass, write.payload_offset = held, payload.mass, payload.offset
+        write.held = held
+        write.payload_mass = payload.mass
+        write.payload_offset = payload.offset
 
     def _position(self, read: Ports) -> Array:
         """Return the joint positions to plan for: the set point due, else where the arm is, else home."""

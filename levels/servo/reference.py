@@ -27,7 +27,9 @@ ASTRAY_RAD = 0.005
 """Distance from the reference beyond which an arm is led back gradually after missed cycles."""
 MAX_AHEAD_S = 2.0
 """Time ahead at which a set point may be due: beyond that it is a broken command, not a slow level."""
-WRONG, CUT, WITHIN = 0, 1, 2
+WRONG = 0
+CUT = 1
+WITHIN = 2
 """Verdicts on a set point: not finite, cut at the bounds, within them."""
 
 
@@ -43,9 +45,12 @@ class Reference:
     """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion wanted at that tick."""
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
-        self._limits, self._tick_s, self._half_s = limits, tick_s, 0.5 * tick_s
+        self._limits = limits
+        self._tick_s = tick_s
+        self._half_s = 0.5 * tick_s
         self._low, self._high = bounds.position.T.copy()
-        self._fastest, self._hardest = bounds.velocity, MAX_ACCELERATION * limits.acceleration
+        self._fastest = bounds.velocity
+        self._hardest = MAX_ACCELERATION * limits.acceleration
         joints = len(limits.velocity)
         self._motions = np.zeros((2, 3, joints))  # the one wanted, and its difference from the curve
         self._wanted = Motion(self._motions[0])
@@ -79,13 +84,15 @@ class Reference:
 
     def take(self, command: Message) -> None:
         """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is taken."""
-        self._command, self._offered = command, command.due
+        self._command = command
+        self._offered = command.due
 
     def at(self, tick: int) -> Motion:
         """Return the motion wanted at `tick`, by the set points taken; its acceleration is mid-cycle."""
         if self._next is not None and (self.holding or tick >= self._due):
             self._advance(self._next, tick)
-        offered, waiting = self._offered, self._next
+        offered = self._offered
+        waiting = self._next
         if tick < offered != self._due and (waiting is None or offered != waiting.due):
             self._receive(offered, tick)
         if not self.holding and tick >= self._due:
@@ -112,8 +119,10 @@ class Reference:
         if now.velocity.any():
             return now
         limits = self._limits
-        self._curve, self._from = Passage(now.position, goal, limits.velocity, limits.acceleration), tick
-        self._difference, self.goal = None, goal
+        self._curve = Passage(now.position, goal, limits.velocity, limits.acceleration)
+        self._from = tick
+        self._difference = None
+        self.goal = goal
         return self._motion(tick)
 
     def _receive(self, due: int, tick: int) -> None:
@@ -121,7 +130,8 @@ class Reference:
         command = self._command
         if command is None:
             return
-        position, velocity = np.array(command.position), np.array(command.velocity)
+        position = np.array(command.position)
+        velocity = np.array(command.velocity)
         verdict = WRONG
         if (due - tick) * self._tick_s <= MAX_AHEAD_S:
             verdict = self._admit(position, velocity, self._low, self._high, self._fastest)
@@ -140,14 +150,18 @@ class Reference:
         begin_s = (begin - self._from) * self._tick_s
         curve = Bridge(self._curve, begin_s, (position, velocity), (due - begin) * self._tick_s)
         if not self.holding and curve.is_within(self._hardest):
-            self._curve, self._from, self._due = curve, begin, due
+            self._curve = curve
+            self._from = begin
+            self._due = due
             if self._difference is not None and (begin - self._differs_from) * self._tick_s >= self._difference.ends_s:
                 self._difference = None
             return
         now = self._motion(tick)
         left_s = (due - tick) * self._tick_s
         self._curve = Curve(position - velocity * left_s, velocity * left_s, duration_s=left_s)
-        self._from, self._due, self.holding = tick, due, False
+        self._from = tick
+        self._due = due
+        self.holding = False
         self._join(now.position, now.velocity, tick)
 
     def _join(self, position: Array, velocity: Array, tick: int) -> None:
@@ -161,12 +175,16 @@ class Reference:
 
     def _motion(self, tick: int) -> Motion:
         """Return the motion at `tick`, valid until the next call; its acceleration is mid-cycle."""
-        curve, difference, wanted = self._curve, self._difference, self._wanted
-        time_s, half_s = (tick - self._from) * self._tick_s, self._half_s
+        curve = self._curve
+        difference = self._difference
+        wanted = self._wanted
+        time_s = (tick - self._from) * self._tick_s
+        half_s = self._half_s
         self._interpolate(curve.table, curve.duration_s, curve.ends_s, time_s, half_s, wanted.table)
         if difference is not None:
             time_s = (tick - self._differs_from) * self._tick_s
-            lasts_s, ends_s = difference.duration_s, difference.ends_s
+            lasts_s = difference.duration_s
+            ends_s = difference.ends_s
             self._interpolate(difference.table, lasts_s, ends_s, time_s, half_s, self._motions[1])
             wanted.table += self._motions[1]
         return wanted

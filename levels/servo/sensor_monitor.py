@@ -20,7 +20,8 @@ Mask = NDArray[np.bool_]
 
 FIT_RAD = 5e-5
 """Permitted difference between a position and the integrated velocities: 20 times that of faultless runs."""
-BEYOND_RAD, BEYOND_SPEED = 0.05, 1.2
+BEYOND_RAD = 0.05
+BEYOND_SPEED = 1.2
 """Distance beyond its range, rad, and multiple of its velocity limit, that no joint can reach."""
 STILL_CYCLES = 10
 """Cycles without any change, while the set point moves, after which a sensor is stuck."""
@@ -40,7 +41,9 @@ STRUCK_SPEED = 5.0
 """Multiple of the fastest velocity that a blow may give a joint within a cycle."""
 SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent."""
-DOUBTFUL, GOOD, TAKEN = 0, 1, 2
+DOUBTFUL = 0
+GOOD = 1
+TAKEN = 2
 """Verdicts on a sample; a good one is taken at once where no joint was in doubt."""
 
 
@@ -55,10 +58,14 @@ class SensorMonitor:
         """Check the joints of a cell in cycles of `every` ticks; they start at home."""
         self._good_cycles = params.good_cycles
         self._retry_cycles = max(round(params.retry / (every * tick_s)), params.good_cycles)
-        encoders, bounds, home = cell.encoders, cell.bounds, cell.home
+        encoders = cell.encoders
+        bounds = cell.bounds
+        home = cell.home
         self._coarse = not encoders.exact
-        self._low, self._high = bounds.position[:, 0] - BEYOND_RAD, bounds.position[:, 1] + BEYOND_RAD
-        self._tick_s, self._every = tick_s, every
+        self._low = bounds.position[:, 0] - BEYOND_RAD
+        self._high = bounds.position[:, 1] + BEYOND_RAD
+        self._tick_s = tick_s
+        self._every = every
         joints = len(home)
         self._table = np.zeros((19, joints))  # in the rows of `check`
         self._q, self._qd, *self._raw = self._table[:4]  # the sample, and the one before it
@@ -100,7 +107,8 @@ class SensorMonitor:
         """
         q, qd, _, _, sampled = sensed
         passed = self._every if self._tick is None else tick - self._tick
-        self._tick, passed_s = tick, passed * self._tick_s
+        self._tick = tick
+        passed_s = passed * self._tick_s
         self.fresh = sampled == tick
         if not self.fresh:
             self._estimate_blind(passed_s, tick - sampled)
@@ -108,7 +116,8 @@ class SensorMonitor:
         # Driven for a while, then braked: in between it was faster than at both ends.
         braked_s = 4.0 * self._every * self._tick_s if passed > self._every else 0.0
         blow = STRUCK_SPEED if struck else 0.0
-        driven, motion = wanted is not None, self.state if wanted is None else wanted
+        driven = wanted is not None
+        motion = self.state if wanted is None else wanted
         verdict = self._check(q, qd, motion, passed_s, braked_s, blow, driven, self.faulty)
         if verdict == TAKEN:
             return
@@ -124,7 +133,8 @@ class SensorMonitor:
 
     def _take(self, room: Array) -> None:
         """Trust the sample; report a joint that this moves by more than `room`, rad."""
-        q, way = self._q, self._way
+        q = self._q
+        way = self._way
         self._unchanged[:] = q == self._raw[0]
         if self.doubt.any():
             off = q - self.position - way
@@ -145,12 +155,14 @@ class SensorMonitor:
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
         q, qd, (last_q, last_qd), way, room = self._q, self._qd, self._raw, self._way, self._allowed
-        finite, inside = np.isfinite(q) & np.isfinite(qd), (q >= self._low) & (q <= self._high)
+        finite = np.isfinite(q) & np.isfinite(qd)
+        inside = (q >= self._low) & (q <= self._high)
         unchanged = (q == last_q) & (qd == last_qd)
         if not self._coarse:
             self._claim(unchanged, passed_s)
         frozen = self._claimed > self._room
-        still, begins = self._is_still(), not self.faulty
+        still = self._is_still()
+        begins = not self.faulty
         room += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
         self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
@@ -226,7 +238,8 @@ class SensorMonitor:
             self._ring(Finding(alarm, joint, float(values[joint])))
 
     def _ring(self, finding: Finding) -> None:
-        self.faulty, self._streak = True, 0
+        self.faulty = True
+        self._streak = 0
         if finding.alarm not in self._rung:
             self._rung.add(finding.alarm)
             self.findings.append(finding)
@@ -236,7 +249,8 @@ class SensorMonitor:
         self._streak = self._streak + 1 if good else 0
         if self._streak < (self._retry_cycles if self._unproven.any() else self._good_cycles):
             return False
-        self.faulty, self._streak = False, 0
+        self.faulty = False
+        self._streak = 0
         self._unproven[:] = False
         self._suspect[:] = False
         self._rung.clear()
@@ -262,11 +276,15 @@ def check(
     room, speed_room, unshown = table[7], table[8], table[9]  # for errors, rad, rad/s; motion that must show, rad
     # Cycles without a change while the set point moves, and its motion in that time, rad; integrated velocity while the
     # sample does not change, rad.
-    still, still_way, claimed = table[10], table[11], table[12]
+    still = table[10]
+    still_way = table[11]
+    claimed = table[12]
     way, allowed = table[13], table[14]  # set: motion since the last sample, and room for its errors, rad
     braking, fastest = table[15], table[16]  # rad/s2, rad/s
     fits, unchanged = table[17], table[18]  # set to 0 or 1: agrees with velocities; if taken, is as before
-    good, in_doubt, at_rest = not faulty, False, False
+    good = not faulty
+    in_doubt = False
+    at_rest = False
     for j in range(len(q)):
         q[j], qd[j] = sensed[j], sensed_velocity[j]
         at_rest = at_rest or (driven and qd[j] == velocity[j])

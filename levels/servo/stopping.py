@@ -50,10 +50,13 @@ class Stopping:
     """
 
     def __init__(self, params: ArmParams, joints: Sequence[str], tick_s: float, every: int) -> None:
-        self._joints, self._params, self._every = joints, params, every
+        self._joints = joints
+        self._params = params
+        self._every = every
         self._on_sensors = Reaction[params.on_sensor_fault.upper()]
         self._on_motors = Reaction[params.on_actuator_fault.upper()]
-        self._retry_ticks, self._good_ticks = round(params.retry / tick_s), params.good_cycles * every
+        self._retry_ticks = round(params.retry / tick_s)
+        self._good_ticks = params.good_cycles * every
         self._most = max(round(params.patience / tick_s), every)
         self.refused: Finding | None = None  # the last cycle's torque, if the arm refused it
         self.error = Error.NONE  # latched fault
@@ -71,14 +74,18 @@ class Stopping:
 
     def recall(self, state: Message) -> None:
         """Continue from the state in an `ARM_STATE`."""
-        self._tick, self._kept = state.tick, state.kept
-        self.error, self.reason = Error(state.error), state.reason
+        self._tick = state.tick
+        self._kept = state.kept
+        self.error = Error(state.error)
+        self.reason = state.reason
 
     def remember(self, state: Message) -> None:
         """Fill in the state for `recall`."""
         if (self._kept, self.error) != self._remembered:
             self._remembered = self._kept, self.error
-            state.kept, state.error, state.reason = self._kept, self.error, self.reason if self.error else ""
+            state.kept = self._kept
+            state.error = self.error
+            state.reason = self.reason if self.error else ""
 
     @property
     def trying(self) -> bool:
@@ -112,7 +119,8 @@ class Stopping:
         if self._struck_until is None or blow.error is not self._blow.error:
             self.findings.append(finding)
         self._on_blow = reaction if self._struck_until is None else max(self._on_blow, reaction)
-        self._struck_until, self._blow = tick + self._retry_ticks, blow
+        self._struck_until = tick + self._retry_ticks
+        self._blow = blow
 
     def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
         """Return the reaction of this cycle."""
@@ -123,7 +131,8 @@ class Stopping:
         sound = self.refused is None and self._retry_at is None and self._struck_until is None
         if sound and not (sensors.faulty or demand):
             self._kept = max(self._kept - passed, 0) if self._kept else 0
-            self.cause, self.reason = Error.NONE, ""
+            self.cause = Error.NONE
+            self.reason = ""
             return Reaction.NONE
         reaction, cause = self._weigh(sensors, tick)
         if cause is None:
@@ -137,7 +146,8 @@ class Stopping:
         elif cause is not None:
             self._wait_for(cause, tick)
         else:
-            self.cause, self.reason = Error.NONE, ""
+            self.cause = Error.NONE
+            self.reason = ""
         return max(reaction, DEMANDED[demand]) if demand else reaction
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
@@ -147,7 +157,8 @@ class Stopping:
 
     def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
         """Return the reaction to faults, and the fault to report."""
-        reaction, cause = Reaction.NONE, None if self.refused is None else self._about_torque(self.refused)
+        reaction = Reaction.NONE
+        cause = None if self.refused is None else self._about_torque(self.refused)
         if sensors.faulty:
             reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
             cause = self._about_sensors(sensors)
@@ -190,7 +201,8 @@ class BrakeLog:
     """Reports when the brakes of an arm engage and release, each time, however short; and why."""
 
     def __init__(self, arm: Arm, every: int) -> None:
-        self._arm, self._every = arm, every
+        self._arm = arm
+        self._every = every
         self._engaged: tuple[int, int] | None = None  # why, see `Alarm.BRAKES_CLOSED`, and at which tick
 
     def start(self, tick: int, why: int) -> None:

@@ -92,7 +92,8 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
     pick = f"action {k}, pick {action.object}"
     place = f"action {k}, place {action.object} at {list(action.to)}"
     with _naming(place):
-        situation, row = rehearsal.situation, handling.row
+        situation = rehearsal.situation
+        row = handling.row
         standing_goals = [
             standing(rehearsal.motion.cell, situation, row, goal) for goal in goals(action, situation.object_pose(row))
         ]
@@ -133,7 +134,8 @@ class Handling(NamedTuple):
 
     def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
         """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there is none."""
-        situation, here = self.start.situation, self.start.q
+        situation = self.start.situation
+        here = self.start.q
         ways: list[Way] = []
         puts: list[tuple[Pose, list[Spot]]] = []
         for take in takes:
@@ -152,7 +154,8 @@ class Handling(NamedTuple):
 
     def moved(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
         """Return the rehearsal after the four moves of a grasp or a release for action `k`. Raises `Refused`."""
-        above, row = spot.tool.raised(self.lift), self.row
+        above = spot.tool.raised(self.lift)
+        row = self.row
         over = None if verb is Verb.GRASP else row
         rehearsal = rehearsal.then(k, Verb.MOVE, tool=above, row=over, joints=spot.above)
         rehearsal = rehearsal.then(k, Verb.APPROACH, tool=spot.tool, row=row)
@@ -170,7 +173,8 @@ class Handling(NamedTuple):
 
     def _held(self, takes: list[Spot]) -> list[Spot]:
         """Return the spots where gripper and motors can hold the object. Raises the first `Refused` when none can."""
-        payloads, seen = self.start.motion.payloads, self.start.situation.object_pose(self.row)
+        payloads = self.start.motion.payloads
+        seen = self.start.situation.object_pose(self.row)
         held: list[Spot] = []
         refusals: list[Refused] = []
         for take in takes:
@@ -210,8 +214,10 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
         if why := next(filter(None, map(motion.checker.why, reachable)), ""):
             return Refused(Error.NO_PATH, why)
         beyond = beyond or (tool if not reachable else None)
-    begin, end = motion.ik.tool_at(here), beyond or tools[0]
-    low, high = 0.0, 1.0
+    begin = motion.ik.tool_at(here)
+    end = beyond or tools[0]
+    low = 0.0
+    high = 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         reached = bool(motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here))

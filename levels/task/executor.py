@@ -55,7 +55,8 @@ class TaskExecutor(Executor):
         if not self._started:
             self._recall(read, write)
         self._orders.take(read.operator, lambda command: self._judge(command, read.last_status.value.order))
-        plan, below = self._plan_to_follow(read, write, tick), read.status.value
+        plan = self._plan_to_follow(read, write, tick)
+        below = read.status.value
         if not self._error:
             self._follow(plan, below)
             self._check_times(plan, tick)
@@ -81,7 +82,8 @@ class TaskExecutor(Executor):
         self._started = True
         last = read.last_status.value
         self._done = last.moves_done
-        self._error, self._reason = Error(last.error), last.reason
+        self._error = Error(last.error)
+        self._reason = last.reason
         if read.last_status.is_there and read.last_command.is_there:
             before = (last.detour or last.first + self._done) - 1
             self._window = ShownWindow(last.first, read.last_command.value.id, before)
@@ -94,13 +96,15 @@ class TaskExecutor(Executor):
 
     def _follow(self, plan: Message, below: Message) -> None:
         if plan.error:
-            self._error, self._reason = Error(plan.error), plan.reason
+            self._error = Error(plan.error)
+            self._reason = plan.reason
         elif plan.count and not self._detour.move:
             self._done = min(max(self._done, self._window.done(below)), plan.count)
         failed = below.state == State.ERROR and below.done >= self._window.before
         if failed and not self._detour.move and self._done < plan.count:
             action = int(plan.moves["action"][self._done])
-            self._error, self._reason = Error(below.error), f"action {action}: {below.reason}"
+            self._error = Error(below.error)
+            self._reason = f"action {action}: {below.reason}"
 
     def _step_aside(self, plan: Message, below: Message) -> int:
         """Interrupt the program for an operator; return how many moves of the plan are done."""
@@ -108,12 +112,14 @@ class TaskExecutor(Executor):
 
     def _check_times(self, plan: Message, tick: int) -> None:
         """Fail when an action is not done by its time."""
-        now_s, done = tick * self.context.tick_s + self._ahead_s, self._actions_done(plan)
+        now_s = tick * self.context.tick_s + self._ahead_s
+        done = self._actions_done(plan)
         for k in range(done, len(self._actions)):
             by_s = self._actions[k].by
             if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
                 reason = f"action {k}, {self._actions[k]}, was not done by {by_s:g} s"
-                self._error, self._reason = Error.TOO_LATE, reason
+                self._error = Error.TOO_LATE
+                self._reason = reason
 
     def _reason_to_wait(self, below: Reading) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
@@ -134,7 +140,8 @@ class TaskExecutor(Executor):
         progress = (*progress, *self._stage())
         operated = below.operated or self._orders.standing is not Operation.NONE
         if operated or progress != self._progress:
-            self._progress, self._moved_at = progress, tick
+            self._progress = progress
+            self._moved_at = tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
             self._error = Error.STALLED
             self._reason = f"nothing has moved for {self._stalled_s:g} s: {waits or _awaited(plan, below)}"
@@ -150,7 +157,8 @@ class TaskExecutor(Executor):
 
     def _hand_down(self, plan: Message, command: Message) -> None:
         """Show the program's next moves, or the operator's goto."""
-        detour, window = self._detour, self._window
+        detour = self._detour
+        window = self._window
         if self._error or not (detour.is_known if detour.move else plan.count):
             window.show_none(command)
         elif detour.move:
@@ -170,9 +178,12 @@ class TaskExecutor(Executor):
             status.state = State.HOLDING
         status.error = self._error
         status.reason = self._reason if self._error else waits if status.state == State.HOLDING else ""
-        status.action, status.actions = self._actions_done(plan), len(self._actions)
-        status.moves_done, status.moves = self._done, plan.count
-        status.first, status.detour = self._window.first, self._detour.move
+        status.action = self._actions_done(plan)
+        status.actions = len(self._actions)
+        status.moves_done = self._done
+        status.moves = plan.count
+        status.first = self._window.first
+        status.detour = self._detour.move
 
     def _answer(self, below: Message, write: Ports) -> None:
         """Obey and answer the operator, and pass down the newest command on which this cycle is based."""

@@ -59,7 +59,8 @@ def standing(cell: Cell, situation: Situation, row: int, goal: Pose) -> Pose:
 
     Raises `Refused` for a goal over no support, or far above or below one.
     """
-    model, data = cell.model, _laid_out(cell, situation.with_body(row, goal))
+    model = cell.model
+    data = _laid_out(cell, situation.with_body(row, goal))
     name = model.body(cell.bodies[row]).name
     x, y, z = goal.position
     support = _geom_below(cell, data, row, goal.position)
@@ -78,7 +79,8 @@ def standing(cell: Cell, situation: Situation, row: int, goal: Pose) -> Pose:
 
 def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
     """Return the first geom below `point` that is neither object `row` nor the arm; -1: there is none."""
-    found, body = np.full(1, -1, dtype=np.int32), int(cell.bodies[row])
+    found = np.full(1, -1, dtype=np.int32)
+    body = int(cell.bodies[row])
     begin = point.copy()
     while True:
         distance = mujoco.mj_ray(cell.model, data, begin, np.array(DOWN), None, 1, body, found)
@@ -97,10 +99,12 @@ def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
 
 def _top(cell: Cell, situation: Situation, row: int) -> float:
     """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
-    model, data = cell.model, _laid_out(cell, situation)
+    model = cell.model
+    data = _laid_out(cell, situation)
     parts = geoms_of(model, below(model, cell.bodies[[row]]))
     # A box's extent along z: its half sizes times the third row of its rotation.
     vertical = data.geom_xmat[parts].reshape(-1, 3, 3)[:, 2, :]
-    centre, half = model.geom_aabb[parts, :3], model.geom_aabb[parts, 3:]
+    centre = model.geom_aabb[parts, :3]
+    half = model.geom_aabb[parts, 3:]
     heights = data.geom_xpos[parts, 2] + np.sum(vertical * centre, axis=1) + np.sum(np.abs(vertical) * half, axis=1)
     return float(np.max(heights))

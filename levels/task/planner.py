@@ -51,7 +51,8 @@ class TaskPlanner(Planner):
         # OMPL takes time and memory to import: only racks that plan motions pay for it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        self._program, self._id = self._first_program(), FIRST_PLAN
+        self._program = self._first_program()
+        self._id = FIRST_PLAN
         self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
         self._needs = read_params(self.params, context.params)
         self._periods = pipeline_periods(context)
@@ -90,7 +91,9 @@ class TaskPlanner(Planner):
         try:
             self._decompose(read, write, tick)
         except Refused as refused:
-            write.error, write.reason, write.count = refused.code, str(refused), 0
+            write.error = refused.code
+            write.reason = str(refused)
+            write.count = 0
         self._plan = Message(write.record.dtype)
         self._plan.copy_from(write)
 
@@ -138,7 +141,8 @@ class TaskPlanner(Planner):
         """Raise `Refused` with the earliest possible time if an action cannot be done by its time."""
         finish_s = finish_times(moves, visible_s, self._periods, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
-            action, earliest_s = self._program.action[move.action], finished_s + self._ahead_s
+            action = self._program.action[move.action]
+            earliest_s = finished_s + self._ahead_s
             if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
                 write.earliest = earliest_s
                 text = f"action {move.action}, {action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"

@@ -102,7 +102,9 @@ class Detour:
     """An operator's goto: one move instead of the program's, then the rest of the program."""
 
     def __init__(self, robot: RobotConfig, orders: Orders, window: ShownWindow, move: int = 0) -> None:
-        self._robot, self._orders, self._window = robot, orders, window
+        self._robot = robot
+        self._orders = orders
+        self._window = window
         self._goal: Message | None = None
         self._is_new = False
         self.move = move  # id of the goto on the bus; 0: the program is not interrupted
@@ -132,11 +134,13 @@ class Detour:
         except ValueError as error:
             self._orders.refuse(str(error))
             return
-        self._goal, self._is_new = goal, is_new
+        self._goal = goal
+        self._is_new = is_new
 
     def step(self, plan: Message, done: int, below: Message) -> int:
         """Advance by one cycle; return how many of the plan's moves are done: `done`, or one less."""
-        self.holds, self.until = False, None
+        self.holds = False
+        self.until = None
         standing = self._orders.standing
         if standing is Operation.NONE and self.move:
             self._window.renumber(done)
@@ -157,7 +161,8 @@ class Detour:
             return done
         # At rest, the program can be interrupted once the level below has received the window without further moves.
         if below.resting and below.operator >= self._orders.basis:
-            self.move, self.holds = self._window.jump(), False
+            self.move = self._window.jump()
+            self.holds = False
             return done if is_free(plan, done) else done - 1
         return done
 
@@ -165,12 +170,15 @@ class Detour:
         """Return the goto as a move; `action` is the program's next, though the move serves none."""
         goal = self._goal
         assert goal is not None, "there is a move only for a goal"
-        joints, verb, tool = np.array(self._robot.home), Verb.MOVE_JOINTS, pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
+        joints = np.array(self._robot.home)
+        verb = Verb.MOVE_JOINTS
+        tool = pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
         if goal.goal == Goal.JOINTS:
             joints = self._joints(goal)
         elif goal.goal != Goal.HOME:
             turned = goal.quaternion if goal.goal == Goal.POSE else pointing(goal.direction)
-            verb, tool = Verb.MOVE, pose(goal.position, turned)
+            verb = Verb.MOVE
+            tool = pose(goal.position, turned)
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
     def _follow(self, below: Message) -> None:

@@ -281,7 +281,8 @@ class RackTiming:
     def level(self, board: str) -> LevelTiming:
         """Return the timing of a level that has a budget. Raises `KeyError`."""
         table = self.boards[board]
-        budget, plans = table.budget, table.is_plan_budgeted
+        budget = table.budget
+        plans = table.is_plan_budgeted
         if budget is None:
             raise KeyError(board)
         return LevelTiming(

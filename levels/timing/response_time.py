@@ -74,13 +74,16 @@ def response_time(
         turns = sum(min(_released(until, load), jobs * cost + turn) for load in sharing)
         return blocking + jobs * cost + turns + sum(_released(until, load) for load in above)
 
-    worst, job, end = 0, 0, 0
+    worst = 0
+    job = 0
+    end = 0
     while True:
         start = max(end, blocking + (job + 1) * cost)
         found = _fixed_point(partial(work, jobs=job + 1), start, horizon + job * (period or 0))
         if found is None:
             return None
-        end, worst = found, max(worst, found + jitter - job * (period or 0))
+        end = found
+        worst = max(worst, found + jitter - job * (period or 0))
         job += 1
         if period is None or end + jitter <= job * period:
             return worst
@@ -140,7 +143,8 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     may plan at any release, so its jobs have no fixed place. Tasks of equal priority must never wait at the same time,
     since their order is not fixed either.
     """
-    period, first = lcm(*(task.period_ns for task in tasks)), max(task.phase_ns for task in tasks)
+    period = lcm(*(task.period_ns for task in tasks))
+    first = max(task.phase_ns for task in tasks)
     until = first + 2 * period
     is_open = any(task.role == "planner" or task.jitter_ns for task in tasks)
     if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
@@ -148,7 +152,8 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     whole = [replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),)) for task in tasks]
     chart = simulate(whole, until + max(task.period_ns for task in tasks))
     priorities = {task.name: task.priority for task in tasks}
-    spent, found = defaultdict[int, list[tuple[int, int]]](list), dict.fromkeys(priorities, 0)
+    spent = defaultdict[int, list[tuple[int, int]]](list)
+    found = dict.fromkeys(priorities, 0)
     for job in chart.jobs:
         if job.release_ns >= until:
             continue

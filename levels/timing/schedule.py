@@ -155,7 +155,8 @@ class _Runner:
 
     def _take(self, now_ns: int) -> None:
         """Take up the oldest release that has not expired."""
-        every, expected = self.task.every_ns, self.ready_at - self.task.jitter_ns
+        every = self.task.every_ns
+        expected = self.ready_at - self.task.jitter_ns
         first = self.task.phase_ns
         newest = first + (now_ns - self.task.jitter_ns - first) // every * every
         self._release = max(expected, newest - self._slack_ns)

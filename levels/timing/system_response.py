@@ -29,7 +29,8 @@ class Prediction:
 
 def predict(rack: RackTiming) -> Prediction:
     """Return the system's response as it follows from the cycles alone."""
-    hierarchy, tick_ms = rack.hierarchy, rack.clock_ns * 1e-6
+    hierarchy = rack.hierarchy
+    tick_ms = rack.clock_ns * 1e-6
     cycles = hierarchy.cycles
     planned = [board for board in rack.boards.values() if board.has_planner]
     return Prediction(
@@ -123,7 +124,8 @@ def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
     for chain in rack.chains:
         passed = mailboxes_along(layout, chain)
         for at, level in enumerate(chain):
-            operator, rest = boxes.get(f"{level}.operator"), chain[at:]
+            operator = boxes.get(f"{level}.operator")
+            rest = chain[at:]
             if operator is None or len(passed) < len(rest) - 1:
                 continue
             taken = (operator, *passed[len(passed) - len(rest) + 1 :])

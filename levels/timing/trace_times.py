@@ -183,7 +183,8 @@ def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
     parts that are longer than usual, then off all in proportion.
     """
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
-    starts, ends = stamps[:, :-1], stamps[:, 1:]
+    starts = stamps[:, :-1]
+    ends = stamps[:, 1:]
     parts = ends - starts - above.within(starts, ends)
     beyond = parts.sum(axis=1) - rows["processor_ns"]
     beyond = np.where(beyond > 0, beyond + overhead_ns(rows), 0)

@@ -22,7 +22,11 @@ SYSTEM = "system"
 """The subject of the system's response."""
 LOOSE_PLAN = "fig. 4"
 """A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation number."""
-PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX = "plan within", "response time", "load", "frames", "inbox"
+PLAN_WITHIN = "plan within"
+RESPONSE_TIME = "response time"
+LOAD = "load"
+FRAMES = "frames"
+INBOX = "inbox"
 """Criteria beyond the paper."""
 EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
 BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX
@@ -104,10 +108,13 @@ def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
 
 
 def _of_chains(rack: RackTiming, chains: ParallelChains, goal_ns: float | None) -> Iterator[EquationVerdict]:
-    subject, cycles_ns = response_subject(rack, chains), [cycle * rack.tick_ns for cycle in chains.cycles]
-    bound, limit = goal_ns, "timing.response_ms"
+    subject = response_subject(rack, chains)
+    cycles_ns = [cycle * rack.tick_ns for cycle in chains.cycles]
+    bound = goal_ns
+    limit = "timing.response_ms"
     if bound is None:
-        bound, limit = equations.system_response_bound_ns(cycles_ns), "n R_max"
+        bound = equations.system_response_bound_ns(cycles_ns)
+        limit = "n R_max"
     total = equations.system_response_ns((), cycles_ns)
     yield EquationVerdict.of("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}")
     for way, ticks in (("command", rack.command_ticks(chains)), ("status", rack.status_ticks(chains))):
@@ -116,7 +123,9 @@ def _of_chains(rack: RackTiming, chains: ParallelChains, goal_ns: float | None) 
 
 
 def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
-    executes, communicates, cycle = level.execution_ns, level.communication_ns, level.cycle_ns
+    executes = level.execution_ns
+    communicates = level.communication_ns
+    cycle = level.cycle_ns
     relations = {
         "3.1": (equations.fits_cycle(executes, communicates, cycle), "t_proc + t_c <= R_i"),
         "3.4": (equations.executes_in_time(executes, level.longest_cycle_ns), "t_exec < R_max"),
@@ -131,7 +140,8 @@ def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
 def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
     if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
         return
-    board, cycle = level.board, level.cycle_ns
+    board = level.board
+    cycle = level.cycle_ns
     if level.plan_within_ns is not None:
         relation = Relation(level.slice_ns, "<=", level.plan_within_ns)
         yield EquationVerdict.of(PLAN_WITHIN, board, relation, "d R_i <= budget.plan_within_ms")

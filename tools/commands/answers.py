@@ -41,7 +41,8 @@ def describe(name: str) -> dict[str, str | int | float]:
     state = Run(words[System.STATE]).name.lower() if alive else "dead"
     gone = "its launcher is gone: 'rack clean' removes it"
     by = f"launched {age_s:.0f} s ago by process {launcher}" if alive else gone
-    boards, hosts = len({task.board for task in segment.layout.tasks}), len(segment.layout.hosts)
+    boards = len({task.board for task in segment.layout.tasks})
+    hosts = len(segment.layout.hosts)
     side = f" and {hosts} on the host side" if hosts else ""
     detail = f"{boards} boards{side}, tick {words[System.TICK]}, {by}"
     segment.close()

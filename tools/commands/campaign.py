@@ -113,7 +113,8 @@ def campaign(
         loads=(True,) if load else (False, True),
         seconds=seconds,
     )
-    goes_on, started = out is not None and (out / ORDER).is_file(), time.monotonic()
+    goes_on = out is not None and (out / ORDER).is_file()
+    started = time.monotonic()
     folder = out if out is not None and goes_on else folder_of(out, "campaign")
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder)):
         with progress_for(silent=as_json) as progress:

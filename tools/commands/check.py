@@ -91,7 +91,8 @@ def check(
         _print_fixed(fitting, as_json)
         sys.exit(1 if fitting.left else 0)
     lacking = shared_out(found)
-    stock, forecast = inventory(found, judged.layout, lacking), Forecast.of(judged.timing, not lacking)
+    stock = inventory(found, judged.layout, lacking)
+    forecast = Forecast.of(judged.timing, not lacking)
     if as_json:
         print_json(stock | {"timing": forecast.document() | {"repair": fitting.document()}})
     else:
@@ -109,7 +110,8 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     from rack.tools.recording.recording import Recording
 
     recording = Recording(run)
-    ran, asked = sorted({task.board for task in recording.layout.tasks}), sorted(config.board)
+    ran = sorted({task.board for task in recording.layout.tasks})
+    asked = sorted(config.board)
     if ran != asked:
         raise Failure(f"{run}: a run of other boards: {', '.join(ran)}; '{config.name}' has {', '.join(asked)}", 2)
     ran_as = rack_timing(recording.rack_config, recording.layout)
@@ -134,7 +136,8 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
     `depth` is the number of a mailbox's slots, `size` the bytes of one message, `capacity` the most unread ones in a
     queue (0: no queue).
     """
-    places, tick_ms = AddressMap(layout), layout.clock_ns * 1e-6
+    places = AddressMap(layout)
+    tick_ms = layout.clock_ns * 1e-6
     tasks = [
         {
             "slot": task.slot,
@@ -186,7 +189,8 @@ def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
         assert config.robot is not None, "it drives one"
         cell = built_cell(config.robot, config.scene, config.clock_ns)
-        every, tick_ms = config.every(board), layout.clock_ns * 1e-6
+        every = config.every(board)
+        tick_ms = layout.clock_ns * 1e-6
         ticks = cell.patience.ticks(every, tick_ms * 1e-3)
         angle_mrad = ticks * tick_ms * cell.bounds.velocity
         yield {

@@ -41,9 +41,11 @@ def estop(
       rack estop 192.168.1.5/cell --certificates ~/cell
     """
     if "/" in rack:
-        tick, own = _stop_from_afar(RackAddress.of(rack), reset, Asker.of(name, certificates)), rack.partition("/")[2]
+        tick = _stop_from_afar(RackAddress.of(rack), reset, Asker.of(name, certificates))
+        own = rack.partition("/")[2]
     else:
-        tick, own = _latch(rack, reset), rack
+        tick = _latch(rack, reset)
+        own = rack
     where = ", on its own machine" if own != rack else ""
     state = f"reset at tick {tick}" if reset else f"latched at tick {tick}; to release{where}: rack estop {own} --reset"
     document = {"rack": own, "emergency_stop": not reset, "tick": tick}
@@ -62,7 +64,8 @@ def _stop_from_afar(address: RackAddress, reset: bool, asker: Asker) -> int:
 def _latch(rack: str, reset: bool) -> int:
     """Set or clear the latch of a rack on this machine, and wait until the clock has seen it; return its tick."""
     segment = Segment.attach(rack)
-    words, lines = segment.words, UtilityLines(segment)
+    words = segment.words
+    lines = UtilityLines(segment)
     if segment.run_is_over:
         raise Failure(f"rack '{rack}': its run is over")
     if reset:

@@ -45,7 +45,8 @@ def list_racks(
             raise Failure(f"HOST = {hosts[0]}: needs --lan, as in: rack list --lan {hosts[0]}", 2)
         answers.list_racks(as_json)
         return
-    asker, given = Asker.of(name, certificates), [HostAddress.of(host) for host in hosts or ()]
+    asker = Asker.of(name, certificates)
+    given = [HostAddress.of(host) for host in hosts or ()]
     with needing_zenoh():
         from rack.tools.network.listing import known_hosts, racks_at
     from rack.tools.console.tables import table, terminal_width

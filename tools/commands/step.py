@@ -124,7 +124,8 @@ class Stepper:
         """Return the rack as it is held."""
         from rack.tools.live.snapshot import RackMonitor
 
-        found, executors = RackMonitor(self._segment).look(), {task.name for task in self._executors()}
+        found = RackMonitor(self._segment).look()
+        executors = {task.name for task in self._executors()}
         rows = [row for row in found.tasks if row.task in executors]
         levels = [{"level": row.task, "state": row.state, "row": row.row, "reason": row.reason} for row in rows]
         tick = self._words[System.HELD] - 1

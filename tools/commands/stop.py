@@ -39,7 +39,8 @@ def stop_rack(rack: str, timeout_s: float) -> bool:
     Raises `SegmentError` when there is no such rack.
     """
     segment = Segment.attach(rack)
-    pid, started = segment.words[Head.LAUNCHER_PID], segment.words[Head.LAUNCHER_START]
+    pid = segment.words[Head.LAUNCHER_PID]
+    started = segment.words[Head.LAUNCHER_START]
     segment.words[System.STOP_REQUEST] = 1
     segment.close()
     if not is_alive(pid, started):

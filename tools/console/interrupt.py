@@ -139,7 +139,8 @@ def _leave_terminal() -> None:
 
 def _kill(family: list[int]) -> None:
     """Kill every descendant in this session and wait for it; a viewer window has its own session and stays."""
-    ends, left = select.poll(), 0
+    ends = select.poll()
+    left = 0
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)

@@ -23,7 +23,8 @@ class Progress:
     """
 
     def __init__(self, bar: RichProgress | None = None, prints_lines: bool = False) -> None:
-        self._bar, self._prints_lines = bar or RichProgress(disable=True), prints_lines
+        self._bar = bar or RichProgress(disable=True)
+        self._prints_lines = prints_lines
         self._task = self._bar.add_task("", total=None)
 
     def total(self, seconds: float) -> None:

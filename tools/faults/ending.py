@@ -97,7 +97,8 @@ def levels_of(segment: Segment) -> str:
     """Return the last state of each level, with its reason, as one readable text."""
     states = []
     for writer, status in statuses(segment, "reason"):
-        state, reason = State(status.state).name.lower(), status.reason
+        state = State(status.state).name.lower()
+        reason = status.reason
         states.append(f"{writer} {state}{f' ({reason})' if reason else ''}")
     return ", ".join(states)
 
@@ -108,9 +109,11 @@ def is_late(segment: Segment) -> bool:
 
 
 def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTable) -> Strike:
-    entry, layout = table.entries[index], segment.layout
+    entry = table.entries[index]
+    layout = segment.layout
     kind = KINDS[entry[Entry.KIND]]
-    values, board = kind.values(entry), board_of(entry, layout)
+    values = kind.values(entry)
+    board = board_of(entry, layout)
     joint = int(values.get("joint", -1))
     begun = entry.stage != Stage.WAITING
     return Strike(

@@ -179,6 +179,7 @@ def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
     if reaction.code == BRAKES and reaction.value > 0:
         # They were engaged for the cycles without torque; the event comes when there is torque again.
         return reaction.tick
-    code, board = UNDONE_BY.get(reaction.code), reaction.board if reaction.code == "restart" else None
+    code = UNDONE_BY.get(reaction.code)
+    board = reaction.board if reaction.code == "restart" else None
     later = (e for e in after if e.kind == "recovery" and e.code == code and e.tick >= reaction.tick)
     return min((event.tick for event in later if board in (None, event.board)), default=None)

@@ -106,7 +106,9 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
 
 class _Judge:
     def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
-        self._events, self._run, self._layout = events, run, run.layout
+        self._events = events
+        self._run = run
+        self._layout = run.layout
         self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
@@ -194,7 +196,8 @@ class _Judge:
         return not strike.count or until < (self._bound(strike, None) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
-        delay, delay_ms = max(0, event.tick - strike.tick), self._delay_ms(event, strike)
+        delay = max(0, event.tick - strike.tick)
+        delay_ms = self._delay_ms(event, strike)
         if event.code != "clock_skipped":
             delay -= self._skipped.between(strike.tick, event.tick)
         if event.kind == DIED:
@@ -218,7 +221,8 @@ class _Judge:
         return min([*later, last + 1])
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
-        record, owed = strike.record, self._owed(strike)
+        record = strike.record
+        owed = self._owed(strike)
         after = aftermath(strike, self._events, horizon, owed)
         found = best.event.tick if best else strike.tick
         # Ticks from the strike within which every reaction must be undone.
@@ -298,7 +302,8 @@ def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
 
 
 def _row(found: Judgement, layout: Layout) -> Report:
-    tick_ms, cycle = layout.clock_ns * 1e-6, found.cycle
+    tick_ms = layout.clock_ns * 1e-6
+    cycle = found.cycle
     return {
         **asdict(found),
         "reactions": list(found.reactions),

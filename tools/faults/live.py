@@ -109,7 +109,8 @@ class LiveRack:
 
     def _check(self, fault: FaultConfig) -> None:
         """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`, `Failure`."""
-        tick, where = self._segment.words[System.TICK], KINDS[fault.kind].where
+        tick = self._segment.words[System.TICK]
+        where = KINDS[fault.kind].where
         if where == "start":
             why = "a running rack has passed its self-tests; give it in the config or with 'rack run --faults'"
             raise ConfigError([Mistake("kind", fault.kind, why)])
@@ -150,7 +151,8 @@ class LiveRack:
             raise Failure(f"{self._described(entry)}: the run ended before it began")
 
     def _state(self, entry: FaultEntry) -> str:
-        begun, until = entry[Entry.FROM], entry[Entry.UNTIL]
+        begun = entry[Entry.FROM]
+        until = entry[Entry.UNTIL]
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
             return f"{self._described(entry)}: armed, waits for {self._awaited(entry)}; {how}"

@@ -88,7 +88,8 @@ class LiveDesk:
     """The desk of one rack."""
 
     def __init__(self, rack: WatchedRack) -> None:
-        self._rack, self._segment = rack, rack.segment
+        self._rack = rack
+        self._segment = rack.segment
         self._config = loads(self._segment.config)
 
     def levels(self) -> list[dict[str, str]]:
@@ -110,7 +111,8 @@ class LiveDesk:
 
         Raises `ConfigError` with every mistake, and `Failure` when it is not given or not answered in time.
         """
-        segment, tick = self._segment, self._segment.words[System.TICK]
+        segment = self._segment
+        tick = self._segment.words[System.TICK]
         command = asked({key: value for key, value in given.items() if value is not None})
         wanted = request(command, self._config, segment.layout)
         if 0 <= wanted.tick <= tick:
@@ -126,7 +128,8 @@ class LiveDesk:
             self._rack.follow(answering.name)
         # However the wait ends, leaving the claim withdraws a request that has not been given.
         with self._rack.claim(wanted) as entry:
-            ticket, text = entry[RequestWord.TICKET], describe(message_of(entry, segment.layout))
+            ticket = entry[RequestWord.TICKET]
+            text = describe(message_of(entry, segment.layout))
             reply = self._await_giving(entry, ticket, command.level, text)
         return self._await_reply(reply, wait, timeout_s)
 
@@ -153,7 +156,8 @@ class LiveDesk:
         patience = _Patience(self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks")
         while True:
             # Before the look: a reply written just before the run ended still counts.
-            in_vain, tick = patience.is_in_vain, self._segment.words[System.TICK]
+            in_vain = patience.is_in_vain
+            tick = self._segment.words[System.TICK]
             reply = replies.look()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
                 return reply
@@ -192,7 +196,8 @@ class Replies:
     def look(self) -> Reply:
         """Read the statuses written since the last call."""
         rows = self._ring.drain().rows
-        orders, answers = rows["message"]["order"], rows["message"]["answer"]
+        orders = rows["message"]["order"]
+        answers = rows["message"]["answer"]
         mine = orders == self.reply.serial
         if self.reply.taken_up < 0 and mine.any():
             self._take_up(rows[int(np.argmax(mine))])
@@ -219,16 +224,20 @@ class _Patience:
     """Waits as long as the rack's clock ticks; explains a long wait on stderr, once."""
 
     def __init__(self, rack: WatchedRack, what: str) -> None:
-        self._rack, self._words, self._what = rack, rack.segment.words, what
+        self._rack = rack
+        self._words = rack.segment.words
+        self._what = what
         self._tick, self._changed = self._words[System.TICK], time.monotonic()
         self._note_at: float | None = self._changed + NOTE_S
 
     def look_again(self) -> bool:
         """Wait a moment; return False when the clock has not ticked for too long."""
         self._rack.refresh()
-        now, tick = time.monotonic(), self._words[System.TICK]
+        now = time.monotonic()
+        tick = self._words[System.TICK]
         if tick != self._tick:
-            self._tick, self._changed = tick, now
+            self._tick = tick
+            self._changed = now
         if self._note_at is not None and now > self._note_at:
             self._note_at = None
             print(f"{self._what}; the rack is at tick {tick}", file=sys.stderr, flush=True)

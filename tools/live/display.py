@@ -140,7 +140,8 @@ class RackView:
 
     def __rich_console__(self, terminal: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         """Yield what rich draws, as wide as the terminal permits."""
-        snapshot, width = self.snapshot, options.max_width
+        snapshot = self.snapshot
+        width = options.max_width
         yield _head(snapshot)
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)

@@ -51,7 +51,8 @@ class EventLog:
         """Write to a file from now on, earlier events first."""
         # Line-buffered: the log of a killed run is complete up to its end.
         self._file = path.open("w", buffering=1)
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         self._put("".join(waiting))
 
     def end(self, outcome: dict[str, Any]) -> None:

@@ -159,7 +159,8 @@ class Standstill:
             if still_s >= STILL_S and (hold.level, hold.since_tick) not in self._reported:
                 self._reported.add((hold.level, hold.since_tick))
                 text = f"nothing has moved for {still_s:.0f} s: {hold.line}"
-                code, since = "standstill", hold.since_tick
+                code = "standstill"
+                since = hold.since_tick
                 yield Event(time.time_ns(), tick, "held", "", text, code, subject=hold.level, since=since)
 
 

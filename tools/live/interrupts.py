@@ -54,7 +54,9 @@ class Inboxes:
 
     def look(self) -> tuple[InboxFill, ...]:
         """Return the inbox of every board that messages interrupt, as it is now."""
-        served, lost, waiting = Block.INTERRUPTS, Block.INTERRUPTS_LOST, Block.INTERRUPTS_WAITING
+        served = Block.INTERRUPTS
+        lost = Block.INTERRUPTS_LOST
+        waiting = Block.INTERRUPTS_WAITING
         return tuple(
             InboxFill(name, block[served], block[lost], block[waiting], depth) for name, block, depth in self._blocks
         )
@@ -107,7 +109,8 @@ def interrupts(recording: Recording) -> list[dict[str, Any]]:
 
     A latency, us, is the time from sending a message to the end of its service; then a level can see it.
     """
-    layout, found = recording.layout, []
+    layout = recording.layout
+    found = []
     for slot, depth in inbox_depths(layout).items():
         board = replayed(recording, slot)
         served = {name: int(np.count_nonzero(one.is_served)) for name, one in board.mailboxes.items()}

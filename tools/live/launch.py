@@ -129,13 +129,15 @@ def run_rack(
         with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             started = time.monotonic()
             outcome = _watch(rack, seconds, display, log, news)
-            wall_s, segment = time.monotonic() - started, rack.segment
+            wall_s = time.monotonic() - started
+            segment = rack.segment
         _log_news(news, segment, log)
         if recorder is not None and not INTERRUPT.number:
             # Later it would find no rack to attach to.
             recorder.await_begun()
         rack.close()
-        recording, rows_lost = "none", dict[str, int]()
+        recording = "none"
+        rows_lost = dict[str, int]()
         if folder is not None and recorder is not None:
             recording, rows_lost = _compared(
                 folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0), outcome.ticks
@@ -170,7 +172,8 @@ def _viewer(port: int) -> News:
 def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, news: list[News]) -> Outcome:
     """Run the rack to its end; show it, and log what only the host side can see."""
     rack.start(seconds)
-    monitor, standstill = RackMonitor(rack.segment), Standstill(rack.segment)
+    monitor = RackMonitor(rack.segment)
+    standstill = Standstill(rack.segment)
     while rack.watch(display.period_s):
         display.show(monitor.look())
         _log_news(news, rack.segment, log)

@@ -45,7 +45,8 @@ class Queues:
         for queue, position in self._ends:
             # The position first: what is taken meanwhile was in the queue.
             taken = int(position.peek().value.taken)
-            words, spec = queue.slots.box, queue.spec
+            words = queue.slots.box
+            spec = queue.spec
             found.append(QueueFill(spec.name, words[Box.SENT] - taken, spec.capacity, words[Box.REFUSED]))
         return tuple(found)
 
@@ -59,7 +60,8 @@ def queues(recording: Recording) -> list[dict[str, Any]]:
     found = []
     for box in queues_of(recording.layout):
         taken, unread = (recording.signal(taken_name(box.name), field) for field in ("taken", "unread"))
-        before, sent = np.concatenate(([0], taken[:-1])), recording.signal(box.name, "serial")
+        before = np.concatenate(([0], taken[:-1]))
+        sent = recording.signal(box.name, "serial")
         found.append(
             {
                 "mailbox": box.name,

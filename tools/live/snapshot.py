@@ -131,7 +131,8 @@ class RackMonitor:
 
     def look(self) -> Snapshot:
         """Return the rack as it is now."""
-        words, layout = self._segment.words, self._segment.layout
+        words = self._segment.words
+        layout = self._segment.layout
         lost = GONE if self._segment.is_mirror else DEAD
         tick = words[System.TICK]
         return Snapshot(
@@ -185,11 +186,14 @@ class RackMonitor:
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
-        state, reason, row = TaskState(block[Block.STATE]).name.lower(), "", ""
+        state = TaskState(block[Block.STATE]).name.lower()
+        reason = ""
+        row = ""
         if block[Block.LOST]:
             state = LOST
         elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
-            state, reason = State(status.value.state).name.lower(), status.value.reason
+            state = State(status.value.state).name.lower()
+            reason = status.value.reason
             row = fired(status.value)
         return TaskRow(
             task=task.name,

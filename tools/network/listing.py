@@ -75,7 +75,8 @@ def _at(host: HostAddress, asker: Asker) -> Iterator[FoundRack]:
 
 def _described(host: str, rack: RemoteRack) -> FoundRack:
     segment = rack.segment
-    words, layout = segment.words, segment.layout
+    words = segment.words
+    layout = segment.layout
     state = Run(words[System.STATE]).name.lower()
     peers = tuple(_peers(segment))
     boards = len({task.board for task in layout.tasks})

@@ -193,7 +193,8 @@ def _heads(segment: Segment) -> Iterator[Stretch]:
 def _rings(segment: Segment) -> Iterator[MirroredRing]:
     layout: Layout = segment.layout
     for task in layout.processes:
-        head, first = segment.map.blocks[task.name] + 8 * Block.TRACE_HEAD, segment.map.traces[task.name]
+        head = segment.map.blocks[task.name] + 8 * Block.TRACE_HEAD
+        first = segment.map.traces[task.name]
         yield MirroredRing(head, first, TRACE_RECORD_SIZE, task.depth, task.depth, is_mailbox=False)
     for address in segment.map.alarms.values():
         yield MirroredRing(address, address + LINE, ALARM_RECORD_SIZE, ALARM_DEPTH, ALARM_DEPTH, is_mailbox=False)

@@ -66,7 +66,8 @@ class Questioner:
     """A session at one host, in a context. Raises `Failure` when nobody is there, or it refuses this user."""
 
     def __init__(self, at: HostAddress, asker: Asker) -> None:
-        self._at, self._asker = at, asker
+        self._at = at
+        self._asker = asker
         check_reach(at, asker)
         protocol = "tls" if asker.certificates else "tcp"
         endpoint = f"{protocol}/{at.host}:{at.port}"
@@ -75,7 +76,8 @@ class Questioner:
             self._link = LanLink(asker.name, table, asks=True)
         except LevelError as error:
             raise Failure(str(error).replace("adapter.lan: ", "")) from None
-        self._session, self._number = secrets.randbits(63), 0
+        self._session = secrets.randbits(63)
+        self._number = 0
         self._changed = threading.Condition()
         self._launches: dict[str, int] = {}
         self._token = self._link.session.liveliness().declare_subscriber(
@@ -151,7 +153,9 @@ class Questioner:
 
     def _answer(self, asked: FarLaunch, what: What, payload: bytes, question: _Question) -> DeskAnswer:
         """Return the answer to a question. Raises `Failure` when there is none within the patience."""
-        deadline, returned, timed_out = time.monotonic() + PATIENCE_S, 0, False
+        deadline = time.monotonic() + PATIENCE_S
+        returned = 0
+        timed_out = False
         while True:
             began = time.monotonic()
             for reply in question.replies:

@@ -121,7 +121,8 @@ def _questions(stretches: Sequence[Stretch]) -> Iterator[list[Stretch]]:
     for stretch in stretches:
         if group and (size + stretch.size > MOST_CONTENT or len(group) == MOST_STRETCHES):
             yield group
-            group, size = [], 0
+            group = []
+            size = 0
         group.append(stretch)
         size += stretch.size
     if group:

@@ -15,7 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple, Self
 
-STAT, CPUINFO = Path("/proc/stat"), Path("/proc/cpuinfo")
+STAT = Path("/proc/stat")
+CPUINFO = Path("/proc/cpuinfo")
 CPUFREQ = Path("/sys/devices/system/cpu")
 STEAL = 8
 """Column of a core's line."""
@@ -78,11 +79,13 @@ class CoreMeter:
 
     def look(self) -> None:
         """Compare the counters with those of the last look."""
-        counts, now = _counts(), time.monotonic_ns()
+        counts = _counts()
+        now = time.monotonic_ns()
         if counts != self._counts:
             rises = {core: count - self._counts.get(core, count) for core, count in counts.items()}
             self._stolen += [Stolen(self._looked_ns, now, core, rise * _MS) for core, rise in rises.items() if rise > 0]
-        self._counts, self._looked_ns = counts, now
+        self._counts = counts
+        self._looked_ns = now
         if time.monotonic() >= self._frequency_at:
             self._frequency_at = time.monotonic() + FREQUENCY_S
             for core, mhz in _frequencies():

@@ -23,7 +23,8 @@ def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
 
     Raises `ConfigError` for mistakes in the config, and `Failure` if the run has other entries, or lost some.
     """
-    layout, recording = resolve(config).layout, Recording(run)
+    layout = resolve(config).layout
+    recording = Recording(run)
     ran = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
     hosts = {host.name for host in layout.hosts}
     found: dict[str, Entries] = {}
@@ -62,6 +63,7 @@ def _rows(recording: Recording, box: MailboxSpec, is_queued: bool) -> list[tuple
     """Return ticks and messages of a mailbox; of one that repeats itself only the changes."""
     if box.name not in recording.mailboxes:
         return []
-    ticks, messages = recording.signal(box.name, "tick"), recording.messages(box)
+    ticks = recording.signal(box.name, "tick")
+    messages = recording.messages(box)
     rows = [(int(tick), message.tobytes()) for tick, message in zip(ticks, messages, strict=True)]
     return [row for at, row in enumerate(rows) if is_queued or not at or row[1] != rows[at - 1][1]]

@@ -82,7 +82,8 @@ def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
     for mailbox in recording.mailboxes:
         if not {"table", "row", "fired"} <= recording.fields(mailbox):
             continue
-        ticks, row = recording.signal(mailbox, "tick"), recording.signal(mailbox, "row")
+        ticks = recording.signal(mailbox, "tick")
+        row = recording.signal(mailbox, "row")
         texts = recording.signal(mailbox, "table"), recording.signal(mailbox, "fired")
         cycles: dict[tuple[str, int, str], list[int]] = {}
         for tick, key in zip(ticks.tolist(), zip(texts[0], row.tolist(), texts[1], strict=True), strict=True):
@@ -96,18 +97,21 @@ def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
 
 
 def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
-    mailbox, tick_s = f"{level}.status", recording.layout.clock_ns * 1e-9
+    mailbox = f"{level}.status"
+    tick_s = recording.layout.clock_ns * 1e-9
     fields = recording.fields(mailbox)
     if "state" not in fields:
         return
-    ticks, own = recording.signal(mailbox, "tick"), recording.signal(mailbox, "state") == State.HOLDING
+    ticks = recording.signal(mailbox, "tick")
+    own = recording.signal(mailbox, "state") == State.HOLDING
     standing = recording.signal(mailbox, "standing").astype(int) if "standing" in fields else np.zeros(len(ticks), int)
     # An operator's command takes precedence over the level's own state.
     what = np.where(standing > 0, standing, -own.astype(int))
     for first, end in _stretches(what):
         is_operators = what[first] > 0
         why = Operation(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
-        since, until = int(ticks[first]), int(ticks[end]) if end < len(ticks) else None
+        since = int(ticks[first])
+        until = int(ticks[end]) if end < len(ticks) else None
         yield {
             "level": level,
             "by": "operator" if is_operators else OWN,

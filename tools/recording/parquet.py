@@ -29,7 +29,8 @@ CONFIG = "config.toml"
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 """Columns that the messages of all mailboxes have."""
 TRACE_ROWS = 1 << 16
-MESSAGE_ROWS, MESSAGE_BYTES = 8192, 16 << 20
+MESSAGE_ROWS = 8192
+MESSAGE_BYTES = 16 << 20
 """Rows are written in large blocks: a file's footer has an entry for every column of every block."""
 
 
@@ -64,7 +65,8 @@ class CyclesFile:
         names = np.repeat([task for task, _ in waiting], [len(block) for _, block in waiting])
         arrays = [pa.array(names), *(pa.array(np.ascontiguousarray(rows[name])) for name in FIELDS)]
         self._writer.write_batch(pa.record_batch(arrays, schema=TRACE_SCHEMA), row_group_size=len(rows))
-        self._waiting, self._rows = [], 0
+        self._waiting = []
+        self._rows = 0
 
     def close(
         self, lost: Mapping[str, int], cores: CoreRecord = UNMEASURED, gaps: Sequence[tuple[str, int, int]] = ()
@@ -168,7 +170,8 @@ def _columns(
     mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
 ) -> Iterator[Column]:
     for field in fields:
-        inner, shape = (*path, field.name), outer + field.shape
+        inner = (*path, field.name)
+        shape = outer + field.shape
         if field.fields:
             yield from _columns(mailbox, inner, shape, field.fields)
         else:

@@ -21,7 +21,8 @@ BEGUN = "recording"
 """Printed by the recorder when it has attached."""
 ATTACH_S = 30.0
 """Longest wait for the recorder to begin."""
-IDLE_LOOKS, STOPPED_LOOKS = 100, 5
+IDLE_LOOKS = 100
+STOPPED_LOOKS = 5
 """Looks, 0.2 s to 1 s apart, at a recorder that uses no processor time, after which it is killed: on a loaded machine
 it is slow, but never idle. Fewer for one that a signal has stopped. Looks, not seconds: Ctrl-Z stops both processes.
 """
@@ -73,7 +74,8 @@ class RecorderProcess:
 
         With the `words` of a rack in lockstep, that waits for it, in any case.
         """
-        self._request, self._words = json.dumps([rack, str(folder), port]).encode() + b"\n", words
+        self._request = json.dumps([rack, str(folder), port]).encode() + b"\n"
+        self._words = words
         self._ask()
         return self.await_begun(ATTACH_S)
 
@@ -100,7 +102,8 @@ class RecorderProcess:
             self._kill_hung()
         while not self._is_gone and self._read(0.0):
             continue
-        lines, self._lines = self._lines, []
+        lines = self._lines
+        self._lines = []
         if self._has_begun and not had_begun:
             lines.append("the recorder has begun")
         if not self._is_gone and self._process.poll() is not None:
@@ -132,7 +135,8 @@ class RecorderProcess:
 
     def _ended(self) -> str:
         """Return how it ended, with the last line that it printed on stderr."""
-        size, status = os.fstat(self._complaints).st_size, self._process.returncode
+        size = os.fstat(self._complaints).st_size
+        status = self._process.returncode
         last = os.pread(self._complaints, 4096, max(0, size - 4096)).decode(errors="replace").strip().splitlines()[-1:]
         if status == UNWRITABLE:
             raise Failure("".join(last))

@@ -31,7 +31,9 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import CyclesFile, SignalsFile
 
-CYCLES, SIGNALS, SPOOL = "cycles.parquet", "signals.parquet", "recorder.spool"
+CYCLES = "cycles.parquet"
+SIGNALS = "signals.parquet"
+SPOOL = "recorder.spool"
 MENDED = "-mended"
 MAGIC = b"RACKSPL2"
 FLUSH_S = 0.25
@@ -164,7 +166,8 @@ class Spool:
 
     def _packed(self) -> Iterator[bytes]:
         for ring, place in self._rings.items():
-            blocks, lost = self._waiting[ring], self._lost[ring]
+            blocks = self._waiting[ring]
+            lost = self._lost[ring]
             if blocks or lost:
                 rows = sum(map(len, blocks))
                 packed = pa.compress(b"".join(block.tobytes() for block in blocks), codec="zstd", asbytes=True)

@@ -23,7 +23,9 @@ from rack.tools.recording.recording import Recording
 
 QUOTA_NS = 100_000_000
 """Period of quotas: the default of Linux (cpu.max), and so of libvirt, Docker and Kubernetes."""
-LEAST_STALLS, CLUSTERED, WINDOW = 5, 0.75, 0.02
+LEAST_STALLS = 5
+CLUSTERED = 0.75
+WINDOW = 0.02
 """So many stalls, of which this part ends within one window, a part of the period, are no chance.
 
 With phases that have nothing to do with the period, four of five end within 2 % of it once in 6,300 runs; more stalls
@@ -69,10 +71,13 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
 
     While the clock's core is away without steal, the whole machine may be: that counts for every core.
     """
-    config, tasks = recording.rack_config, recording.layout.tasks
-    grid_ns, home = tick_ns(config), obtained_core(config.clock.core)
+    config = recording.rack_config
+    tasks = recording.layout.tasks
+    grid_ns = tick_ns(config)
+    home = obtained_core(config.clock.core)
     traces = [recording.trace(task.name) for task in tasks]
-    rows, places = np.concatenate(traces), [(*recording.place(task), task.every) for task in tasks]
+    rows = np.concatenate(traces)
+    places = [(*recording.place(task), task.every) for task in tasks]
     on, priority, every = np.repeat(places, [len(trace) for trace in traces], axis=0).T
     # Releases skipped before a cycle were due before it.
     due = rows["release_ns"] - skipped(rows) * every * grid_ns
@@ -85,13 +90,16 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     resumed = np.where(is_missed(rows), rows["end_ns"], rows["start_ns"])
     lost = skipped(rows) + is_missed(rows)
     spans = np.array(recording.cores.stolen or (), np.int64).reshape(-1, 4)
-    away, absences, during_steal = {}, [], 0
+    away = {}
+    absences = []
+    during_steal = 0
 
     def lost_during(occupied: Occupation, among: np.ndarray) -> int:
         return int(lost[among & (occupied.within(due, resumed) > 0)].sum())
 
     for core in dict.fromkeys([home, *on.tolist()]):
-        here, is_home = on == core, core == home
+        here = on == core
+        is_home = core == home
         stolen = Occupation(*spans[spans[:, 2] == core, :2].T)
         since, until = clock if is_home else _unstamped(rows[here], urgent[here])
         # Without the clock no task is released: the other cores need not have been away.

@@ -32,7 +32,8 @@ class RackGrid:
 
     def __init__(self, recording: Recording) -> None:
         config = recording.rack_config
-        self.recording, self.rack = recording, recording.layout.rack
+        self.recording = recording
+        self.rack = recording.layout.rack
         self.is_lockstep = config.clock.mode == "lockstep"
         self.clock_ns, self.period_ns = recording.layout.clock_ns, tick_ns(config)
         self.launch = recording.launch
@@ -199,9 +200,11 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
             f"'{of.rack}' met began {abs(began_s):.3f} s {'later' if began_s > 0 else 'earlier'}",
             2,
         )
-    at_ns, by_ns = at_ns[is_this], by_ns[is_this]
+    at_ns = at_ns[is_this]
+    by_ns = by_ns[is_this]
     order = np.argsort(at_ns, kind="stable")
-    at_ns, by_ns = at_ns[order], by_ns[order]
+    at_ns = at_ns[order]
+    by_ns = by_ns[order]
     # Between two comparisons, and before the first and after the last, the clocks may drift.
     ends = peer.stamp_ns(np.array(peer.ticks))
     alone_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
@@ -225,8 +228,10 @@ def _check_import(of: RackGrid, taken: str, peer: RackGrid, written: str) -> Non
     """Check that what a rack took from another is what that one wrote."""
     if taken not in of.recording.mailboxes or written not in peer.recording.mailboxes:
         return
-    took, wrote = of.recording.rows(taken), peer.recording.rows(written)
-    at_ns, content = wrote["tick"] * peer.clock_ns, [row.tobytes() for row in wrote["message"]]
+    took = of.recording.rows(taken)
+    wrote = peer.recording.rows(written)
+    at_ns = wrote["tick"] * peer.clock_ns
+    content = [row.tobytes() for row in wrote["message"]]
     for row in took:
         # Its tick there is only known in ticks here, which may be longer.
         since_ns = int(row["basis"]) * of.clock_ns

@@ -115,7 +115,8 @@ class Change:
         """
         cores = set(self.after.timing.cores.values()) - set(self.before.timing.cores.values())
         lacking = any(obtained_core(core) != core for core in cores)
-        old, new = self.before.timing.level(self.board), self.after.timing.level(self.board)
+        old = self.before.timing.level(self.board)
+        new = self.after.timing.level(self.board)
         factor = new.cycle_ns / old.cycle_ns
         if old.slice_ns is not None and new.slice_ns is not None:
             factor *= max(new.slice_ns / old.slice_ns, 1.0)
@@ -169,7 +170,8 @@ class Change:
         """Return which other tasks are on a core, and whether this machine has it."""
         own = (self.board, f"{self.board}.planner")
         others = [name for name, place in self.after.timing.cores.items() if place == core and name not in own]
-        sharing, obtained = f"shared with {', '.join(others)}" if others else "not shared", obtained_core(core)
+        sharing = f"shared with {', '.join(others)}" if others else "not shared"
+        obtained = obtained_core(core)
         return sharing if obtained == core else f"{sharing}; this machine has no core {core}, uses core {obtained}"
 
     def _protocols(self) -> dict[str, str]:

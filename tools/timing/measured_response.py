@@ -43,7 +43,8 @@ def system_response(recording: Recording) -> dict[str, Any] | None:
 
 
 def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> dict[str, Any]:
-    cycles, tick_ms = chains.cycles, rack.clock_ns * 1e-6
+    cycles = chains.cycles
+    tick_ms = rack.clock_ns * 1e-6
     return {
         "subject": response_subject(rack, chains),
         "levels": list(chains.levels),
@@ -91,16 +92,19 @@ def _along(
     The worst case is information that just misses a release whose message went all the way: it waits for the next one
     that does.
     """
-    layout, mailbox = recording.layout, boxes[-1].name
+    layout = recording.layout
+    mailbox = boxes[-1].name
     first, last = (layout.task(boards[at]).every for at in (0, -1))
     tick_ms = layout.clock_ns * 1e-6
-    basis, visible_at = recording.signal(mailbox, "basis"), recording.signal(mailbox, "visible_at")
+    basis = recording.signal(mailbox, "basis")
+    visible_at = recording.signal(mailbox, "visible_at")
     # A message that nothing had reached when it was written rests on its own tick: before all that counts here.
     begun = max(int(recording.signal(box.name, "visible_at")[0]) for box in boxes)
     real = np.flatnonzero(basis >= begun)
     arrived, at = np.unique(basis[real], return_index=True)
     at = real[at]
-    visible, read = visible_at[at[1:]], layout.read_grid(boxes[-1], boards[-1])
+    visible = visible_at[at[1:]]
+    read = layout.read_grid(boxes[-1], boards[-1])
     acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     seen = np.ones(len(ms), bool)
@@ -129,7 +133,8 @@ def _delays(recording: Recording, levels: Sequence[str], since: int, until: int)
     ]
     yield from (f"{board} was lost" for board in dict.fromkeys(lost))
     for name in levels:
-        rows, last = recording.trace(name), until + recording.layout.task(name).every
+        rows = recording.trace(name)
+        last = until + recording.layout.task(name).every
         missed, skipped = counts(rows[(rows["tick"] >= since) & (rows["tick"] < last)])
         if missed or skipped:
             yield f"{name}: {missed} missed, {skipped} skipped"

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Fate = Literal["acted on", "refused", "superseded", "run over"]
-MEASURED, GRID, SUM, BOUND = "#0072b2", "#009e73", "#e69f00", "#d55e00"
+MEASURED = "#0072b2"
+GRID = "#009e73"
+SUM = "#e69f00"
+BOUND = "#d55e00"
 """Colours of Okabe and Ito's palette, distinguishable to colour-blind readers."""
 BINS = 20
 """Bars of a histogram up to the longest response on the grid."""
@@ -77,7 +80,8 @@ class OperatorResponse:
         return [command for command in self.measured if self._is_beyond(command)]
 
     def _is_beyond(self, command: AnsweredCommand) -> bool:
-        path, ticks = self.paths[command.level], self.ticks(command)
+        path = self.paths[command.level]
+        ticks = self.ticks(command)
         # R_s of eq. 3.2 begins with the release that reads the command.
         return ticks > path.longest or ticks - (command.sampled - command.given) > path.bound_eq_3_2
 
@@ -148,7 +152,8 @@ class OperatorResponse:
 
 def response_of(recording: Recording) -> OperatorResponse | None:
     """Return the response of a run; None if no operator commanded a level of its hierarchy."""
-    config, layout = recording.rack_config, recording.layout
+    config = recording.rack_config
+    layout = recording.layout
     found = command_paths(rack_timing(config, layout), layout)
     paths = {level: path for level, path in found.items() if f"{level}.operator" in recording.mailboxes}
     if not paths:
@@ -167,11 +172,13 @@ def response_of(recording: Recording) -> OperatorResponse | None:
 
 def _commands(recording: Recording, level: str, path: CommandPath) -> Iterator[tuple[AnsweredCommand, int]]:
     """Yield the commands given to a level, each with its time stamp, ns."""
-    box, status = f"{level}.operator", f"{level}.status"
+    box = f"{level}.operator"
+    status = f"{level}.status"
     # A clock that died while giving a command has given it twice: the first one counts.
     serials, at = np.unique(recording.signal(box, "id"), return_index=True)
     whats, given, visible, stamps = (recording.signal(box, n)[at] for n in ("what", "tick", "visible_at", "stamp_ns"))
-    orders, answers = recording.signal(status, "order"), recording.signal(status, "answer")
+    orders = recording.signal(status, "order")
+    answers = recording.signal(status, "answer")
     refused = set(orders[answers == Answer.REFUSED].tolist())
     for serial, what, tick, seen, stamp in zip(serials, whats, given, visible, stamps, strict=True):
         command = AnsweredCommand(
@@ -254,7 +261,8 @@ def plot(response: OperatorResponse, folder: Path) -> list[Path]:
 def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    path, tick_ms = response.paths[level], response.tick_ms
+    path = response.paths[level]
+    tick_ms = response.tick_ms
     own = [command for command in response.measured if command.level == level]
     wait = path.delay + path.reads[0].every - 1
     lines = (

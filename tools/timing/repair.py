@@ -101,10 +101,12 @@ def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
 
 def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
     """Put the board's executor, or its planner, above another task on its core; the smallest rise that helps."""
-    table, limit = rack.config.board[board], rack.config.clock.priority or HIGHEST + 1
+    table = rack.config.board[board]
+    limit = rack.config.clock.priority or HIGHEST + 1
     tried: list[Settings] = []
     for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
-        core, own = rack.timing.cores.get(task), getattr(table, key)
+        core = rack.timing.cores.get(task)
+        own = getattr(table, key)
         above = {other.priority + 1 for other in rack.timing.tasks if other.core == core and other.name != task}
         tried += [{key: priority} for priority in sorted(above) if own < priority < limit]
     return _any(rack, board, tried)
@@ -113,7 +115,8 @@ def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
 def _changes_of_others(rack: JudgedConfig, board: str) -> list[Change]:
     """Return the cheapest change of each board that shares a core with this one: another core, or a longer cycle."""
     timing = rack.timing
-    cores, loads = timing.cores_of(board), {task.board: 0.0 for task in timing.tasks}
+    cores = timing.cores_of(board)
+    loads = {task.board: 0.0 for task in timing.tasks}
     for task in timing.tasks:
         loads[task.board] += task.cost_ns / task.period_ns if task.core in cores else 0.0
     others = [name for name in timing.boards if loads.get(name) and name != board]
@@ -133,7 +136,8 @@ def _more_cycles(rack: JudgedConfig, board: str) -> Change | None:
 
 def _planner_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
     """Couple a planner loosely, or move a loose one to another core; if that is not enough, with more cycles."""
-    level, places = rack.timing.level(board), list(_places(rack, board))
+    level = rack.timing.level(board)
+    places = list(_places(rack, board))
     if (change := _any(rack, board, places)) is not None:
         return change
     older = _cycles(level, (level.within_cycles or 0) + 1)
@@ -186,7 +190,8 @@ def _cycles(level: LevelTiming, least: int) -> range:
 
 def _lengthened(timing: RackTiming, board: str, every: int) -> tuple[RackTiming, Settings]:
     """Return a rack with another cycle of a board, and the settings that make it."""
-    level, settings = timing.level(board), {"every": every, "rate_hz": None}
+    level = timing.level(board)
+    settings = {"every": every, "rate_hz": None}
     if level.within_cycles is not None and level.plan_within_ns is not None:
         cycles = level.plan_within_ns // (every * timing.tick_ns)
         settings["within_cycles"] = max(min(level.within_cycles, cycles), 1)
@@ -237,9 +242,12 @@ def first_that(tried: Sequence[T], attempt: Callable[[T], R | None]) -> R | None
     The items must be ordered: all items after one that works also work.
     """
     # Doubling steps find an item that works, halving steps the first one.
-    low, high, found = -1, 0, None
+    low = -1
+    high = 0
+    found = None
     while high < len(tried) and (found := attempt(tried[high])) is None:
-        low, high = high, min(2 * high + 1, max(len(tried) - 1, high + 1))
+        low = high
+        high = min(2 * high + 1, max(len(tried) - 1, high + 1))
     while found is not None and high - low > 1:
         middle = (low + high) // 2
         earlier = attempt(tried[middle])

@@ -45,7 +45,8 @@ def _schedule_lines(forecast: Forecast, width: int | None) -> Iterator[str]:
     if forecast.schedule is None:
         return
     minor, major = forecast.schedule
-    count, ticks = major // minor, "a tick" if minor == 1 else f"{minor} ticks"
+    count = major // minor
+    ticks = "a tick" if minor == 1 else f"{minor} ticks"
     sizes = f"{count} frames of {ms(minor * forecast.tick_ns)}, {ticks}"
     yield ""
     yield f"static schedule, ms: {sizes}; every budget with two context switches:"
@@ -76,7 +77,9 @@ def _numbers(frames: Sequence[int], count: int) -> str:
     """Return the numbers of frames as text, those at equal distances by the first two and the last."""
     if len(frames) == count:
         return "all"
-    first, second, last = frames[0], frames[min(1, len(frames) - 1)], frames[-1]
+    first = frames[0]
+    second = frames[min(1, len(frames) - 1)]
+    last = frames[-1]
     if len(frames) <= 3:
         return ", ".join(map(str, frames))
     even = all(later - earlier == second - first for earlier, later in pairwise(frames))
@@ -144,7 +147,8 @@ def _level_row(level: LevelTiming) -> list[str]:
 
 
 def _verdict_row(verdict: EquationVerdict) -> list[str]:
-    sides, result = (verdict.left, verdict.right, verdict.margin), _result(verdict.holds)
+    sides = (verdict.left, verdict.right, verdict.margin)
+    result = _result(verdict.holds)
     left, right, margin = (ms(side) if verdict.unit == "ns" else f"{side:.3g}" for side in sides)
     return [verdict.equation, verdict.subject, left, verdict.sign, right, margin, result, verdict.meaning]
 

@@ -65,7 +65,10 @@ class RackViews:
     """The views of one rack: its cell in 3D, curves, lanes, log. Its entities are below `root`."""
 
     def __init__(self, layout: Layout, config: RackConfig, cell: Cell | None, root: Sequence[str] = ()) -> None:
-        self._layout, self._config, self._cell, self._root = layout, config, cell, root
+        self._layout = layout
+        self._config = config
+        self._cell = cell
+        self._root = root
         has_arm = cell is not None and any(mailbox.message in DRIVING for mailbox in layout.mailboxes)
         self._hand = None if cell is None else cell.hand
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
@@ -190,14 +193,17 @@ def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
 
 def eye_on(cell: Cell) -> rrb.EyeControls3D:
     """Return the place from which the eye sees all of a cell at its start, except the ground."""
-    model, data = cell.model, cell.start()
+    model = cell.model
+    data = cell.start()
     geoms = np.flatnonzero(~np.isin(model.geom_type, ENDLESS))
     radii = model.geom_rbound[geoms, None]
     low = (data.geom_xpos[geoms] - radii).min(axis=0, initial=np.inf)
     high = (data.geom_xpos[geoms] + radii).max(axis=0, initial=-np.inf)
     if not np.isfinite([low, high]).all():
-        low, high = model.stat.center - model.stat.extent, model.stat.center + model.stat.extent
-    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        low = model.stat.center - model.stat.extent
+        high = model.stat.center + model.stat.extent
+    centre = (low + high) / 2
+    radius = float(np.linalg.norm(high - low)) / 2
     position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
     return rrb.EyeControls3D(position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1))
 

@@ -17,19 +17,25 @@ from rack.tools.viewer.shapes import shape_of, xyzw
 from rack.tools.viewer.stream import Changes, RowBlock, Sampled, Stream
 from rack.tools.viewer.style import CURRENT, FORCE, GOAL, PLANNED
 
-CELL, COLLISION, FRAMES = "cell", "collision", "frames"
+CELL = "cell"
+COLLISION = "collision"
+FRAMES = "frames"
 WORLD = "world"
 SHOWN_GROUPS = 3
 """MuJoCo's own viewer shows groups 0, 1, 2; by convention those above hold collision shapes."""
 TOOL = (CELL, "tool")
 TOOL_COLOUR = (230, 60, 200)
-PATH, WAYPOINTS = (CELL, "planned_path"), (CELL, "way_points")
-GOALS, CURRENT_GOAL = (CELL, "goals"), (CELL, "current_goal")
+PATH = (CELL, "planned_path")
+WAYPOINTS = (CELL, "way_points")
+GOALS = (CELL, "goals")
+CURRENT_GOAL = (CELL, "current_goal")
 STEP_RAD = 0.03
 """A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this length."""
-POINT_M, LINE_M = 0.008, 0.003
+POINT_M = 0.008
+LINE_M = 0.003
 PUSHES = (CELL, "pushes")
-PUSH_M, PUSH_RADIUS_M = 0.02, 0.0015
+PUSH_M = 0.02
+PUSH_RADIUS_M = 0.0015
 """Length of the arrow of a push for each N, and its radius."""
 
 
@@ -93,8 +99,12 @@ class Poses:
             self._write(block, chosen)
 
     def _write(self, block: RowBlock, chosen: np.ndarray) -> None:
-        model, data, bodies, count = self._cell.model, self._data, self._bodies, len(self._frames)
-        positions, quaternions = np.empty((len(chosen), count, 3)), np.empty((len(chosen), count, 4))
+        model = self._cell.model
+        data = self._data
+        bodies = self._bodies
+        count = len(self._frames)
+        positions = np.empty((len(chosen), count, 3))
+        quaternions = np.empty((len(chosen), count, 4))
         tool = np.empty((len(chosen), 3))
         for row, state in enumerate(block.messages["state"][chosen]):
             mujoco.mj_setState(model, data, np.ascontiguousarray(state), STATE)
@@ -118,12 +128,15 @@ class Pushes:
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
-        self._sampled, self._is_empty = Sampled(clock_ns), True
+        self._sampled = Sampled(clock_ns)
+        self._is_empty = True
         stream.static(PUSHES, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the newest pushes, one set every 20 ms of simulated time."""
-        model, data, bodies = self._cell.model, self._data, self._cell.bodies
+        model = self._cell.model
+        data = self._data
+        bodies = self._cell.bodies
         for row in self._sampled.rows(block.ticks):
             mujoco.mj_setState(model, data, np.ascontiguousarray(block.messages["state"][row]), STATE)
             forces = data.xfrc_applied[bodies, :3]
@@ -149,7 +162,8 @@ class PlannedPath:
     def write(self, block: RowBlock) -> None:
         """Write every plan; a plan for the gripper clears the path."""
         for row in range(len(block.rows)):
-            plan, tick = block.messages[row], int(block.rows["visible_at"][row])
+            plan = block.messages[row]
+            tick = int(block.rows["visible_at"][row])
             moves = plan["kind"] == SegmentKind.PATH and not plan["error"]
             corners = plan["waypoints"][: plan["count"]] if moves else np.empty((0, len(self._cell.qpos)))
             line = [self._tool(joints) for joints in in_pieces(corners)]
@@ -179,9 +193,11 @@ class Goals:
     """Writes the places where a `TASK_PLAN` puts its objects down, and the goal of the current move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
-        self._stream, self._objects = stream, objects
+        self._stream = stream
+        self._objects = objects
         self._moves: dict[int, tuple[list[float], str]] = {}
-        self._plans, self._current = Changes(), Changes()
+        self._plans = Changes()
+        self._current = Changes()
         for entity in (GOALS, CURRENT_GOAL):
             stream.static(entity, stream.within(WORLD))
 

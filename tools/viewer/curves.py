@@ -14,7 +14,9 @@ from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
 SIGNALS = "signals"
 MAX_CURVES = 16
 """Fields with more numbers than this are tables, not curves; they are in signals.parquet."""
-JOINTS, ERROR, GRIPPER = "joints", "tracking_error", "gripper"
+JOINTS = "joints"
+ERROR = "tracking_error"
+GRIPPER = "gripper"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
 """Curves of a joint and their units; the torque is the one applied, after the limit gate."""
 _COMMANDED = {"position": "target", "velocity": "target_velocity"}
@@ -24,7 +26,9 @@ class Joints:
     """Writes the status of what drives the arm: measured and commanded, limits, tracking error and gripper."""
 
     def __init__(self, stream: Stream, names: tuple[str, ...], cell: Cell, has_gripper: bool) -> None:
-        self._stream, self._names, self._has_gripper = stream, names, has_gripper
+        self._stream = stream
+        self._names = names
+        self._has_gripper = has_gripper
         bounds = cell.bounds
         self._limits = {
             "position": np.where(np.isfinite(bounds.position), bounds.position, np.nan),
@@ -44,7 +48,8 @@ class Joints:
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of that level."""
-        messages, times = block.messages, block.times
+        messages = block.messages
+        times = block.times
         for quantity in QUANTITIES:
             measured = messages[quantity]
             commanded = messages[_COMMANDED[quantity]] if quantity in _COMMANDED else None

@@ -18,7 +18,8 @@ from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Stream
 from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
 
-EVENTS, RECORDER = "events", "recorder"
+EVENTS = "events"
+RECORDER = "recorder"
 UNSHOWN = ("printed", "miss")
 """Events without a lane: misses have their own."""
 RACK = "rack"
@@ -39,7 +40,9 @@ class Events:
     """Follows events.jsonl, which the launcher writes line by line."""
 
     def __init__(self, stream: Stream, path: Path, hierarchy: Hierarchy) -> None:
-        self._stream, self._path, self._hierarchy = stream, path, hierarchy
+        self._stream = stream
+        self._path = path
+        self._hierarchy = hierarchy
         self._read = 0
         self._lanes: dict[str, str] = {}  # what each board's lane shows
 
@@ -59,8 +62,10 @@ class Events:
         kind = event["kind"]
         if "tick" not in event:
             return
-        board, code = event.get("board") or RACK, event.get("code", "")
-        tick, stamp_ns = max(0, event["tick"]), self._stream.times.monotonic(event["time_ns"])
+        board = event.get("board") or RACK
+        code = event.get("code", "")
+        tick = max(0, event["tick"])
+        stamp_ns = self._stream.times.monotonic(event["time_ns"])
         text = f"{kind}: {board}: {event['text']}"
         self._stream.say(tick, stamp_ns, "events", text, LEVELS.get(kind, "INFO"))
         if kind not in UNSHOWN:
@@ -111,8 +116,10 @@ class RecorderLoad:
 
     def advance(self, tick: int) -> None:
         """Write the load since the last call."""
-        cpu_s, wall_s = time.process_time(), time.monotonic()
+        cpu_s = time.process_time()
+        wall_s = time.monotonic()
         share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
-        self._cpu_s, self._wall_s = cpu_s, wall_s
+        self._cpu_s = cpu_s
+        self._wall_s = wall_s
         stamp_ns = int(self._stream.times.stamps_of(np.array([tick]))[0])
         self._stream.at(tick, stamp_ns, (RECORDER, "load"), rr.Scalars(100.0 * share))

@@ -14,13 +14,17 @@ from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
 from rack.tools.viewer.stream import RowBlock, Sampled, Stream
 from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
 
-ARROWS, FORCES = ("cell", "forces"), "forces"
-TASK, CONTACT = "task_frame", "contact"
+ARROWS = ("cell", "forces")
+FORCES = "forces"
+TASK = "task_frame"
+CONTACT = "contact"
 """Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
 ARROW_COLOUR = (0, 230, 255)
-LONGEST_M, TOOL_SHAFT_M = 1.0, 0.014
+LONGEST_M = 1.0
+TOOL_SHAFT_M = 0.014
 """Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show beyond the tool."""
-TIP_M, TIP_SHAFT_M = 0.02, 0.003
+TIP_M = 0.02
+TIP_SHAFT_M = 0.003
 """Length of an arrow at a fingertip for 1 N, and its radius."""
 AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
 """Units, by axis of a task frame."""
@@ -60,9 +64,11 @@ class ContactArrows:
     def __init__(self, stream: Stream, cell: Cell, field: str, clock_ns: int) -> None:
         """Take the forces from `field`, whose numbers begin with three for each place."""
         self._stream, self._field, self._places = stream, field, contacts_of(cell)
-        self._scale, shaft = TIP_M, TIP_SHAFT_M
+        self._scale = TIP_M
+        shaft = TIP_SHAFT_M
         if cell.wrist is not None:
-            self._scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
+            self._scale = LONGEST_M / cell.wrist.most[0]
+            shaft = TOOL_SHAFT_M
         self._sampled = Sampled(clock_ns)
         for place in self._places:
             arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)

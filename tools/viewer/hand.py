@@ -10,7 +10,9 @@ from rack.tools.viewer.stream import RowBlock, Stream
 from rack.tools.viewer.style import COMMANDED, dimmed, of_joint, style_curves
 
 HAND = "hand"
-JOINTS, TENSIONS, FORCES = "joints", "tensions", "forces"
+JOINTS = "joints"
+TENSIONS = "tensions"
+FORCES = "forces"
 BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FORCES: "N"}
 """Curves of a finger, and their units."""
 TIPS = (HAND, "tip_forces")
@@ -40,7 +42,8 @@ class HandCurves:
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of the hand."""
-        messages, times = block.messages, block.times
+        messages = block.messages
+        times = block.times
         for at, (finger, joints) in enumerate(self._fingers.items()):
             self._stream.scalars((HAND, finger, JOINTS), times, messages["position"][:, joints])
             tensions = [

@@ -19,7 +19,8 @@ from rack.tools.viewer.style import STATES, style_lane, write_spans
 
 LEVELS = "levels"
 HIERARCHY = "hierarchy"
-ROW, COLUMN = 45.0, 110.0
+ROW = 45.0
+COLUMN = 110.0
 """Distance between nodes, in the graph's units; a letter is about 7 wide."""
 WIDEST = 3
 """Boards of one level in a row: more would make the graph too small to read."""
@@ -34,8 +35,11 @@ class ValueLane:
         self, stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
     ) -> None:
         """Take the value of one field, or the tuple of several; `lane` is the board and what its lane shows."""
-        self._stream, self._lane, self._changes = stream, (LEVELS, *lane), Changes()
-        self._fields, self._name = fields, name
+        self._stream = stream
+        self._lane = (LEVELS, *lane)
+        self._changes = Changes()
+        self._fields = fields
+        self._name = name
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""

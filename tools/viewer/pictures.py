@@ -65,10 +65,12 @@ class Screen:
         """
         shown = None if view is None else self.views[view]
         self._client.set_time(SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused")
-        drawn, deadline = b"", time.monotonic() + PATIENCE_S
+        drawn = b""
+        deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             time.sleep(PAUSE_S)
-            before, drawn = drawn, bytes(self._client.take_screenshot(shown))
+            before = drawn
+            drawn = bytes(self._client.take_screenshot(shown))
             if drawn == before:
                 break
         return Look(drawn, tuple(self._complaints()))

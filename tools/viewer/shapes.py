@@ -85,7 +85,9 @@ def _mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
 
 def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     field = model.geom_dataid[geom]
-    rows, columns, start = model.hfield_nrow[field], model.hfield_ncol[field], model.hfield_adr[field]
+    rows = model.hfield_nrow[field]
+    columns = model.hfield_ncol[field]
+    start = model.hfield_adr[field]
     half_x, half_y, top, _ = model.hfield_size[field]
     x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
     z = model.hfield_data[start : start + rows * columns] * top

@@ -88,13 +88,16 @@ class RackWriter:
     """Writes what one rack left in its rings to a stream, in blocks."""
 
     def __init__(self, stream: Stream, ran: Ran) -> None:
-        layout, config, cell = ran.layout, ran.config, ran.cell
+        layout = ran.layout
+        config = ran.config
+        cell = ran.cell
         self._times = stream.times
         write_document(stream, ran.text, config, layout)
         if cell is not None:
             write_geometry(stream, cell.model, cell.start())
         of_mailbox = _parts_of(stream, layout, config, cell)
-        lockstep, period_ns = config.clock.mode == "lockstep", tick_ns(config)
+        lockstep = config.clock.mode == "lockstep"
+        period_ns = tick_ns(config)
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._of_task: dict[str, list[ViewPart]] = {
@@ -142,13 +145,15 @@ class ViewSink:
     """
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
-        layout, launch = segment.layout, segment.launch
+        layout = segment.layout
+        launch = segment.launch
         ran = Ran.of(layout, segment.config, folder)
         view = blueprint(RackViews(layout, ran.config, ran.cell).everything(), live=port is not None)
         run = f"{folder.name}-{launch.created_ns}"
         recording = new_recording(folder.name, run, next_file(folder), view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
-        self._writer, self._load = RackWriter(self._stream, ran), RecorderLoad(self._stream)
+        self._writer = RackWriter(self._stream, ran)
+        self._load = RecorderLoad(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = block_of(layout)
         self._written = segment.words[System.TICK]
@@ -181,7 +186,8 @@ class ViewSink:
 
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
         self._written = tick
-        waiting, self._waiting = self._waiting, defaultdict(list)
+        waiting = self._waiting
+        self._waiting = defaultdict(list)
         self._writer.write({ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost)
         self._load.advance(tick)
 

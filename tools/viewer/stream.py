@@ -20,7 +20,9 @@ from rack.tools.recording.time_line import RackPlace
 
 Ints = NDArray[np.int64]
 
-SIM_TIME, TICK, WALL = "sim_time", "tick", "wall"
+SIM_TIME = "sim_time"
+TICK = "tick"
+WALL = "wall"
 KEPT = 4096
 """Pairs of tick and time kept, to place what has a tick but no time stamp."""
 APPLICATION = "rack"
@@ -47,7 +49,8 @@ class Timelines:
 
     def __init__(self, clock_ns: int, launch: Launch, placed: RackPlace | None = None) -> None:
         self.clock_ns = clock_ns
-        self._offset_ns, self._placed = launch.wall_offset_ns, placed
+        self._offset_ns = launch.wall_offset_ns
+        self._placed = placed
         self._ticks: Ints = np.zeros(1, dtype=np.int64)
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
@@ -143,12 +146,14 @@ class Sampled:
     """Finds the rows of consecutive blocks that are drawn: the first of every 20 ms of simulated time."""
 
     def __init__(self, clock_ns: int) -> None:
-        self._every, self._last = max(1, round(SHOWN_S * 1e9 / clock_ns)), -1
+        self._every = max(1, round(SHOWN_S * 1e9 / clock_ns))
+        self._last = -1
 
     def rows(self, ticks: Ints) -> Ints:
         """Return the indices of these rows."""
         slots, first = np.unique(ticks // self._every, return_index=True)
-        chosen, self._last = first[slots > self._last], int(slots[-1])
+        chosen = first[slots > self._last]
+        self._last = int(slots[-1])
         return np.asarray(chosen)
 
 
@@ -180,7 +185,9 @@ class Stream:
     """
 
     def __init__(self, recording: rr.RecordingStream, times: Timelines, root: Sequence[str] = ()) -> None:
-        self._recording, self.times, self._root = recording, times, root
+        self._recording = recording
+        self.times = times
+        self._root = root
 
     def frame(self, name: str) -> str:
         """Return the name of a coordinate frame: frames are known to all entities of a recording."""

@@ -10,7 +10,10 @@ from rack.tools.viewer.levels import LEVELS
 from rack.tools.viewer.stream import Ints, RowBlock, Stream
 from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_curves, style_lane, write_spans
 
-BOARDS, LOAD, TIMES, AGES = "boards", "load", "times", "ages"
+BOARDS = "boards"
+LOAD = "load"
+TIMES = "times"
+AGES = "ages"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
 MISSED = "missed"
 SPAN_S = 0.25
@@ -25,7 +28,8 @@ class CycleLanes:
     """
 
     def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
-        self._stream, self._speed = stream, speed
+        self._stream = stream
+        self._speed = speed
         self._lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
         self._last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS) if lockstep else None
         self._work = "process" if task.role == "executor" else "plan"
@@ -53,7 +57,9 @@ class Load:
     """
 
     def __init__(self, stream: Stream, task: TaskSpec, period_ns: int, is_lockstep: bool) -> None:
-        self._stream, self._task, self._is_lockstep = stream, task.name, is_lockstep
+        self._stream = stream
+        self._task = task.name
+        self._is_lockstep = is_lockstep
         self._slice_ns = task.every * task.within_cycles * period_ns
         curves = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
         style_curves(stream, (TIMES, task.name), curves, [of_joint(1), of_joint(0), LIMIT])
@@ -78,7 +84,8 @@ class Misses:
     """
 
     def __init__(self, stream: Stream, task: TaskSpec) -> None:
-        self._stream, self._task = stream, task.name
+        self._stream = stream
+        self._task = task.name
         self._lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
         self._span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
         self._is_styled = False
@@ -112,7 +119,8 @@ class Age:
     """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is visible then."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec, layout: Layout) -> None:
-        self._stream, self._lane = stream, (AGES, mailbox.name)
+        self._stream = stream
+        self._lane = (AGES, mailbox.name)
         own = TickGrid(mailbox.every, mailbox.phase)
         self._releases = min([layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own)
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
@@ -130,10 +138,12 @@ class Age:
         releases = np.arange(self._releases.since(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)
         newest = newest_visible(releases, self._visible_at)
-        releases, newest = releases[newest >= 0], newest[newest >= 0]
+        releases = releases[newest >= 0]
+        newest = newest[newest >= 0]
         if not len(releases):
             return
         times = self._stream.times
         ages = (releases - self._made[newest]) * times.clock_ns * 1e-6
         self._stream.scalars(self._lane, times.columns(releases, times.stamps_of(releases)), ages)
-        self._visible_at, self._made = self._visible_at[newest[-1] :], self._made[newest[-1] :]
+        self._visible_at = self._visible_at[newest[-1] :]
+        self._made = self._made[newest[-1] :]

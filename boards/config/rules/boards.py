@@ -57,7 +57,8 @@ def _name(place: str, name: str) -> Iterator[Mistake]:
 
 
 def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
-    has_planner, is_loose = board.planner is not None, board.coupling == "loose"
+    has_planner = board.planner is not None
+    is_loose = board.coupling == "loose"
     if has_planner != (board.coupling != "none"):
         permitted = '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
         yield Mistake(f"{place}.coupling", board.coupling, f"permitted: {permitted}")
@@ -126,7 +127,8 @@ LONGEST_MAJOR = 10_000
 
 def clock(wiring: Wiring) -> Iterator[Mistake]:
     """Check the tick in simulated time and in real time."""
-    config, clock = wiring.config, wiring.config.clock
+    config = wiring.config
+    clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
         yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
     if clock.mode == "lockstep" and clock.speed != 1.0:
@@ -208,7 +210,8 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
             continue
         board = wiring.config.board[name]
         key = "rate_hz" if board.every is None else "every"
-        below, above = [cycle for cycle in fitting if cycle < every], [cycle for cycle in fitting if cycle > every]
+        below = [cycle for cycle in fitting if cycle < every]
+        above = [cycle for cycle in fitting if cycle > every]
         rates = " or ".join(
             f"{cycle * tick_ms:g} ms, {f'{1e3 / (cycle * tick_ms):g} Hz' if key == 'rate_hz' else f'every {cycle}'}"
             for cycle in (*below[-1:], *above[:1])

@@ -57,7 +57,8 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
 
 def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
     """Check that there is one goal, of a form that the level accepts."""
-    wanted, given = known[command.said], command.goals
+    wanted = known[command.said]
+    given = command.goals
     what = f"{command.what} of '{command.level}'"
     if not wanted:
         for goal in given:

@@ -35,7 +35,8 @@ _MAILBOX = f"mailbox {LAN}."
 
 def lan(wiring: Wiring) -> Iterator[Mistake]:
     """Check what shows without the ports of the boards."""
-    config, table = wiring.config, wiring.config.adapter.lan
+    config = wiring.config
+    table = wiring.config.adapter.lan
     for name, board in config.board.items():
         if board.executor == LAN_ADAPTER and (table is None or name != LAN):
             yield Mistake(f"board.{name}.executor", board.executor, f"permitted: [{PLACE}], which makes its board")

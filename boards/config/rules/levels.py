@@ -83,7 +83,8 @@ def scene(wiring: Wiring) -> Iterator[Mistake]:
         ("goal", "object", "objects"),
     ):
         for at, entry in enumerate(getattr(scene, kind)):
-            name, known = getattr(entry, key), getattr(scene, those)
+            name = getattr(entry, key)
+            known = getattr(scene, those)
             if name not in known:
                 why = f"no such {those[:-1]}; scene.{those}: {', '.join(known) or 'none'}"
                 yield Mistake(f"scene.{kind}[{at}].{key}", name, why)
@@ -111,7 +112,8 @@ def robot(wiring: Wiring) -> Iterator[Mistake]:
 
 def cell(wiring: Wiring) -> Iterator[Mistake]:
     """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only names are checked."""
-    config, found = wiring.config, ""
+    config = wiring.config
+    found = ""
     if config.robot is None:
         return
     if not wiring.broken & {"robot", "scene"} and not [*robot(wiring), *scene(wiring)]:

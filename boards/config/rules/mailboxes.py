@@ -27,7 +27,8 @@ def ports(wiring: Wiring) -> Iterator[Mistake]:
 
 
 def _connected(wiring: Wiring, table: str, ports: TaskPorts) -> Iterator[Mistake]:
-    role, inputs = ports.place.role, ", ".join(ports.kind.inputs) or "none"
+    role = ports.place.role
+    inputs = ", ".join(ports.kind.inputs) or "none"
     for output, told in ports.outputs.items():
         if told.rests_on and told.rests_on not in ports.inputs:
             why = f"its output '{output}' rests on '{told.rests_on}'; inputs: {inputs}"
@@ -58,7 +59,8 @@ def reads(wiring: Wiring) -> Iterator[Mistake]:
     """Check that each mailbox that is read exists, and carries what the port needs."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
-            place, wanted = ports.wired_at(port), ports.inputs[port].type
+            place = ports.wired_at(port)
+            wanted = ports.inputs[port].type
             if not wiring.is_known(mailbox):
                 yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
             elif ports.is_whole and (found := wiring.type_of(mailbox)) is not None and found != wanted:
@@ -83,14 +85,16 @@ def sides(wiring: Wiring) -> Iterator[Mistake]:
 
 def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
     """Return why a task or host board must not read a mailbox; empty if it may."""
-    is_host, is_of_host = task.place.role == "host", mailbox in wiring.of_host
+    is_host = task.place.role == "host"
+    is_of_host = mailbox in wiring.of_host
     if issubclass(task.kind, BusAdapter):
         return "it is on the host side already" if mailbox in wiring.to_host else ""
     if is_host == is_of_host:
         return ""
     if (source := wiring.passed.get(mailbox)) is None:
         return f"it is on the {'host' if is_of_host else 'real-time'} side; {PASS_IT}"
-    writer, same = source.partition(".")[0], "host" if is_host else "real-time"
+    writer = source.partition(".")[0]
+    same = "host" if is_host else "real-time"
     return f"a bus adapter joins the two sides; '{writer}' and '{task.place.board}' are both on the {same} side"
 
 

@@ -23,7 +23,8 @@ class Drives:
 
     def __init__(self, cell: Cell, tick_s: float, timeout_ticks: int) -> None:
         self._dynamics = Dynamics(cell)
-        self._step_s, self._timeout_ticks = tick_s / STEPS, timeout_ticks
+        self._step_s = tick_s / STEPS
+        self._timeout_ticks = timeout_ticks
         self.position: Array = cell.home.copy()  # (joints,), rad
         self.velocity: Array = np.zeros_like(self.position)  # (joints,), rad/s
         self.torque: Array = np.zeros_like(self.position)  # (joints,), N m

@@ -31,7 +31,9 @@ class HardwareArm(Arm):
         finding = self.refused(torque)
         if finding is None:
             self.drives.write(torque)
-            self.torque, self.waited, self.braked = torque.copy(), 0, False
+            self.torque = torque.copy()
+            self.waited = 0
+            self.braked = False
         else:
             self.brake()
         return finding
@@ -39,7 +41,8 @@ class HardwareArm(Arm):
     def brake(self) -> None:
         """Engage the brakes."""
         self.drives.brake()
-        self.torque, self.braked = np.zeros_like(self.torque), True
+        self.torque = np.zeros_like(self.torque)
+        self.braked = True
 
     def step(self, ticks: int) -> None:
         """Let time pass."""

@@ -12,7 +12,8 @@ class PowerMeter(Executor):
     outputs = {"status": POWER}
 
     def process(self, read, write, tick):
-        arm, meter = read.servo.value, write.status
+        arm = read.servo.value
+        meter = write.status
         meter.state = State.EXECUTING
         meter.power = float((arm.torque * arm.velocity).sum())
         meter.energy += max(meter.power, 0.0) * self.context.period_s

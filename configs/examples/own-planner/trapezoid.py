@@ -46,21 +46,25 @@ class TrapezoidPlanner(Planner):
         try:
             path = read_segment(read.command.value, status.wants).path()
         except ValueError as error:
-            write.error, write.reason = Error.LIMIT, str(error)
+            write.error = Error.LIMIT
+            write.reason = str(error)
             return
         sections = self.sections(path, status.begin)
-        write.count, write.duration = len(sections) - 1, sections[-1][0]
+        write.count = len(sections) - 1
+        write.duration = sections[-1][0]
         write.sections[: write.count] = sections[:-1]
         published = tick + (self.context.within_cycles + 1) * self.context.every
         write.earliest = max(published * self.context.tick_s, status.ends) + write.duration
 
     def sections(self, path: BlendedPath, begin: float) -> list[tuple[float, float, float, float, float]]:
         """Return start in s, then s, ds, dds and jerk of the path parameter per section; the last is the end."""
-        found, start_s = [], 0.0
+        found = []
+        start_s = 0.0
         for first, last in pairwise([begin, *(stop for stop in path.stops if begin < stop < path.length), path.length]):
             speed, acceleration = self.limits_of(path, first, last)
             speed = min(speed, np.sqrt(acceleration * (last - first)))
-            ramp_s, ramp = speed / acceleration, 0.5 * speed**2 / acceleration
+            ramp_s = speed / acceleration
+            ramp = 0.5 * speed**2 / acceleration
             cruise_s = (last - first - 2.0 * ramp) / speed
             found.append((start_s, first, 0.0, acceleration, 0.0))
             found.append((start_s + ramp_s, first + ramp, speed, 0.0, 0.0))
@@ -70,7 +74,8 @@ class TrapezoidPlanner(Planner):
 
     def limits_of(self, path: BlendedPath, first: float, last: float) -> tuple[float, float]:
         """Return the speed, rad/s, and acceleration, rad/s2, that every joint keeps between two path parameters."""
-        speeds, accelerations = [], []
+        speeds = []
+        accelerations = []
         for s in np.linspace(first, last, 2 + int((last - first) / SAMPLE_RAD)):
             _, slope, curvature = (np.abs(values) for values in path.evaluate(s))
             speeds.append((self.limits.velocity / np.maximum(slope, 1e-9)).min())

@@ -48,12 +48,15 @@ class PdServo(Executor):
         if self.arm.tick == 0 and read.before.is_there:
             self.arm.restore(read.before.value)  # the board was restarted
         self.arm.step(tick - self.arm.tick)
-        sensed, command = self.arm.sense(), read.command.value
+        sensed = self.arm.sense()
+        command = read.command.value
         holding = not command.due or tick > command.due + 4 * self.context.every
         if not holding:
             ahead_s = (tick - command.due) * self.context.tick_s
-            self.target, self.target_velocity = command.position + ahead_s * command.velocity, command.velocity
-        error, slip = self.target - sensed.position, self.target_velocity - sensed.velocity
+            self.target = command.position + ahead_s * command.velocity
+            self.target_velocity = command.velocity
+        error = self.target - sensed.position
+        slip = self.target_velocity - sensed.velocity
         load = Payload(read.plan.value.payload_mass, read.plan.value.payload_offset)
         inertia, gravity = self.dynamics.terms(sensed.position, self.rest, load)
         torque = inertia.diagonal() * (self.gains.stiffness * error + self.gains.damping * slip) + gravity
@@ -62,11 +65,16 @@ class PdServo(Executor):
         force = 0.0 if self.grip is None else self.grip.force(sensed.opening, sensed.opening_velocity)
         self.arm.drive(torque, force)
         status = write.status
-        status.echo, status.operator = command.id, command.operator
+        status.echo = command.id
+        status.operator = command.operator
         status.state = State.IDLE if holding else State.EXECUTING
         status.holding = holding  # the level above begins to move when it has seen the arm hold
-        status.position, status.velocity, status.torque = sensed.position, sensed.velocity, self.arm.torque
-        status.target, status.target_velocity = self.target, self.rest if holding else self.target_velocity
-        status.opening, status.opening_velocity = sensed.opening, sensed.opening_velocity
+        status.position = sensed.position
+        status.velocity = sensed.velocity
+        status.torque = self.arm.torque
+        status.target = self.target
+        status.target_velocity = self.rest if holding else self.target_velocity
+        status.opening = sensed.opening
+        status.opening_velocity = sensed.opening_velocity
         self.arm.save(write.state)
         self.arm.look(write.scene)

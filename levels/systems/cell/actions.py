@@ -20,8 +20,12 @@ def write_action(action: AnyAction, message: Message) -> None:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0
     if isinstance(action, Transfer):
-        message.action, message.object, message.position = OrderAction.TRANSFER, action.object, action.to
-        message.turned, message.yaw, message.lift = action.yaw is not None, action.yaw or 0.0, action.lift
+        message.action = OrderAction.TRANSFER
+        message.object = action.object
+        message.position = action.to
+        message.turned = action.yaw is not None
+        message.yaw = action.yaw or 0.0
+        message.lift = action.lift
     elif isinstance(action, Goto):
         message.action = OrderAction.GOTO
         _write_goal(action, message)
@@ -31,7 +35,8 @@ def write_action(action: AnyAction, message: Message) -> None:
 
 def _write_goal(action: Goto, message: Message) -> None:
     if action.joints is not None:
-        message.goal, message.count = Goal.JOINTS, len(action.joints)
+        message.goal = Goal.JOINTS
+        message.count = len(action.joints)
         message.joints[: message.count] = action.joints
     elif action.position is not None:
         message.position = action.position
@@ -56,7 +61,8 @@ def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> Any
 
 
 def _table(message: Message) -> dict[str, Any]:
-    what, goal = message.action, message.goal
+    what = message.action
+    goal = message.goal
     if what == OrderAction.HOME:
         return {"do": "home"}
     if what == OrderAction.TRANSFER:

@@ -44,21 +44,33 @@ class Agreement:
     def __init__(self, program: int, steps: Sequence[Collection[str]], margin_s: float) -> None:
         """`margin_s`: time in which an order reaches its arm."""
         self.program = program
-        self._steps, self._margin_s = steps, margin_s
+        self._steps = steps
+        self._margin_s = margin_s
         self._arms = list(dict.fromkeys(arm for step in steps for arm in step))
-        self.phase, self.step, self.attempt = Phase.AWAITING, 0, 0
-        self.error, self.reason = Error.NONE, ""
+        self.phase = Phase.AWAITING
+        self.step = 0
+        self.attempt = 0
+        self.error = Error.NONE
+        self.reason = ""
         self.ending_s = 0.0  # since when the arms are ended, simulated time; 0: not yet
 
     def recall(self, last: Message) -> None:
         """Continue from a `CELL_PROGRESS`."""
-        self.phase, self.step, self.attempt = Phase(last.phase), last.step, last.attempt
-        self.error, self.reason, self.ending_s = Error(last.error), last.reason, last.ending
+        self.phase = Phase(last.phase)
+        self.step = last.step
+        self.attempt = last.attempt
+        self.error = Error(last.error)
+        self.reason = last.reason
+        self.ending_s = last.ending
 
     def write_to(self, progress: Message) -> None:
         """Fill a `CELL_PROGRESS`, but for the count of moves."""
-        progress.phase, progress.step, progress.attempt = self.phase, self.step, self.attempt
-        progress.error, progress.reason, progress.ending = self.error, self.reason, self.ending_s
+        progress.phase = self.phase
+        progress.step = self.step
+        progress.attempt = self.attempt
+        progress.error = self.error
+        progress.reason = self.reason
+        progress.ending = self.ending_s
 
     @property
     def order(self) -> int:
@@ -99,7 +111,8 @@ class Agreement:
         ended = [answer for answer in ours if answer.response is Response.ENDED]
         newest = max([answer.order for answer in ended or ours], default=0)
         if newest // ATTEMPTS in range(1, len(self._steps) + 2):
-            self.step, self.attempt = newest // ATTEMPTS - 1, newest % ATTEMPTS
+            self.step = newest // ATTEMPTS - 1
+            self.attempt = newest % ATTEMPTS
         if ended:
             self.end(Error(ended[0].error), ended[0].reason, now_s)
         elif all(answers[arm].is_there for arm in self._arms):
@@ -132,7 +145,8 @@ class Agreement:
         if self._ends_by(said, (*NO, *BROKEN_OFF), answers, now_s):
             return
         if all(response is Response.DONE for response in said.values()):
-            self.step, self.attempt = self.step + 1, 0
+            self.step = self.step + 1
+            self.attempt = 0
             self._go_on(now_s)
 
     def _cancel(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
@@ -158,7 +172,8 @@ class Agreement:
         arm = next((arm for arm, response in said.items() if response in kinds), None)
         if arm is None:
             return False
-        answer, word = answers[arm], said[arm].name.lower()
+        answer = answers[arm]
+        word = said[arm].name.lower()
         reason = f"step {self.step} {word}: {arm}: {answer.reason}".removesuffix(": ")
         self.end(Error(answer.error) or Error.GIVEN_UP, reason, now_s)
         return True
@@ -166,7 +181,10 @@ class Agreement:
     def end(self, error: Error, reason: str, now_s: float) -> None:
         """End the program, and with it the runs of the arms."""
         if self.phase not in (Phase.ENDING, Phase.OVER):
-            self.phase, self.error, self.reason, self.ending_s = Phase.ENDING, error, reason, now_s
+            self.phase = Phase.ENDING
+            self.error = error
+            self.reason = reason
+            self.ending_s = now_s
 
     def take_leave(self, answers: Mapping[str, ArmAnswer], now_s: float, farewell_s: float) -> None:
         """Be over once every arm has confirmed the end, or had time to."""

@@ -99,7 +99,8 @@ class Coordinator(Executor):
         agreement = self._agreement
         if not self._steps:
             return
-        step, moves = agreement.step, self._moves_of_step(readings)[1]
+        step = agreement.step
+        moves = self._moves_of_step(readings)[1]
         agreement.advance(answers, now_s)
         if agreement.step > step:
             self._moves += moves
@@ -138,7 +139,8 @@ class Coordinator(Executor):
         operated = self._operated.standing is not Operation.NONE or any(report.operated for report in reports)
         stage = (agreement.phase, agreement.order, *((r.echo, r.response, r.moves_done, r.moves) for r in reports))
         if operated or stage != self._stage or not self._steps:
-            self._stage, self._moved_at = stage, tick
+            self._stage = stage
+            self._moved_at = tick
         elif (tick - self._moved_at) * self.context.tick_s > self._table.stalled_s:
             awaited = waits or f"step {agreement.step}: {', '.join(agreement.partners)}"
             reason = f"nothing has happened for {self._table.stalled_s:g} s: {awaited}"
@@ -152,7 +154,8 @@ class Coordinator(Executor):
             write_action(self._steps[agreement.step][arm], order)
         is_none = what is OrderVerb.NONE
         order.id, order.program = (0, 0) if is_none else (agreement.order, agreement.program)
-        order.what, order.hold = what, bool(held)
+        order.what = what
+        order.hold = bool(held)
         order.reason = agreement.reason if what is OrderVerb.END else held
 
     def _report(self, readings: Mapping[str, Reading], waits: str, status: Message) -> None:
@@ -163,7 +166,8 @@ class Coordinator(Executor):
         is_over = agreement.phase is Phase.OVER
         status.error = agreement.error if is_over else Error.NONE
         status.reason = agreement.reason if is_over else waits if status.state == State.HOLDING else ""
-        status.action, status.actions = agreement.step, len(self._steps)
+        status.action = agreement.step
+        status.actions = len(self._steps)
         done, moves = self._moves_of_step(readings)
         fill_counts(status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves))
         if self._operated.standing is Operation.HOLD:

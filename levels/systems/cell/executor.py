@@ -80,14 +80,16 @@ class OrderedTaskExecutor(TaskExecutor):
     def _recall(self, read: Ports, write: Ports) -> None:
         super()._recall(read, write)
         last = read.last_status.value
-        self._orders_begun, self._orders_done = last.actions, last.action
+        self._orders_begun = last.actions
+        self._orders_done = last.action
         self._moves = last.moves_done, last.moves
         if not read.last_report.is_there:
             return
         report: Message = read.last_report.value
         write.report.copy_from(report)
         write.request.copy_from(read.last_request.value)
-        self._taken, self._halted = TakenOrder(report), bool(report.halted)
+        self._taken = TakenOrder(report)
+        self._halted = bool(report.halted)
         self._is_end_reported = self._taken.response is Response.ENDED
         if self._taken.is_under_way and report.moves:
             self._begun = write.request.id
@@ -97,7 +99,9 @@ class OrderedTaskExecutor(TaskExecutor):
         """Follow the orders; return the plan of the one under way."""
         self._listen(read.order)
         self._waits = ""
-        taken, request, plan = self._taken, write.request, read.plan.value
+        taken = self._taken
+        request = write.request
+        plan = read.plan.value
         if taken.is_asked:
             self._answer_order(read, request, tick)
         elif taken.is_under_way and not self._begun:
@@ -122,19 +126,23 @@ class OrderedTaskExecutor(TaskExecutor):
             self._held = order.reason if order.hold and self._taken.is_under_way else ""
         if self._taken.response is Response.ENDED:
             if self._is_end_reported and not self._error:
-                self._error, self._reason = self._taken.error, self._taken.reason
+                self._error = self._taken.error
+                self._reason = self._taken.reason
             self._absent = ""
 
     def _answer_order(self, read: Ports, request: Message, tick: int) -> None:
         """Answer when the order is planned; have it planned as soon as the arm rests."""
-        plan, taken = read.plan.value, self._taken
+        plan = read.plan.value
+        taken = self._taken
         if (request.program, request.order) == (taken.program, taken.order):
             if plan.id == request.id and not plan.error:
                 taken.promise()
             elif plan.id == request.id:
                 taken.fail(Error(plan.error), bare(plan.reason))
             return
-        order, ahead_s, now_s = read.order.value, self._ahead(read), tick * self.context.tick_s
+        order = read.order.value
+        ahead_s = self._ahead(read)
+        now_s = tick * self.context.tick_s
         self._waits = self._not_ready(read)
         if self._waits:
             return
@@ -146,7 +154,9 @@ class OrderedTaskExecutor(TaskExecutor):
         if action.by is not None and action.by - ahead_s <= now_s:
             taken.fail(Error.TOO_LATE, f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already")
             return
-        request.program, request.order, request.ahead = taken.program, taken.order, ahead_s
+        request.program = taken.program
+        request.order = taken.order
+        request.ahead = ahead_s
         copy_action(order, request)
         planned_s = (self.context.within_cycles + 1) * self.context.period_s
         self._request(read, request, now_s + planned_s + self._table.decision)
@@ -154,7 +164,9 @@ class OrderedTaskExecutor(TaskExecutor):
     def _request(self, read: Ports, request: Message, begin_s: float) -> None:
         """Have the action in `request` planned, to begin at `begin_s`."""
         request.id += 1
-        request.begin, request.revision, request.start = begin_s, read.world.value.revision, read.status.value.start
+        request.begin = begin_s
+        request.revision = read.world.value.revision
+        request.start = read.status.value.start
 
     def _ahead(self, read: Ports) -> float:
         """Return the coordinator's simulated time less that here, s."""
@@ -184,7 +196,9 @@ class OrderedTaskExecutor(TaskExecutor):
             if not self._waits:
                 self._request(read, request, 0.0)
         elif read.plan.value.id == request.id:
-            self._begun, self._done, self._halted = request.id, 0, False
+            self._begun = request.id
+            self._done = 0
+            self._halted = False
             self._window.renumber(0)
             self._orders_begun += 1
 
@@ -196,7 +210,8 @@ class OrderedTaskExecutor(TaskExecutor):
         """Interrupt the order for an operator, or break it off."""
         done = super()._step_aside(plan, below)
         self._halted = self._halted and not self._detour.move
-        self._breaking_off, rested = None, self._rests
+        self._breaking_off = None
+        rested = self._rests
         self._rests = False
         if self._taken.stops and self._detour.move:
             self._taken.finish(Response.STOPPED)
@@ -228,7 +243,9 @@ class OrderedTaskExecutor(TaskExecutor):
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _report(self, plan: Message, waits: str, write: Ports) -> None:
-        report, status, echo = write.report, write.status, write.status.echo
+        report = write.report
+        status = write.status
+        echo = write.status.echo
         self._settle(plan)
         taken = self._taken
         if self._begun:
@@ -239,11 +256,16 @@ class OrderedTaskExecutor(TaskExecutor):
         status.echo = echo
         fill_counts(status.record[["action", "actions"]], (self._orders_done, self._orders_begun))
         status.moves_done, status.moves = self._moves
-        report.program, report.echo, report.response = taken.program, taken.order, taken.response
-        report.state, report.error, report.halted = status.state, taken.error, self._halted
+        report.program = taken.program
+        report.echo = taken.order
+        report.response = taken.response
+        report.state = status.state
+        report.error = taken.error
+        report.halted = self._halted
         report.reason = taken.reason or waits
         if not taken.is_under_way:
-            self._begun, self._actions = 0, ()
+            self._begun = 0
+            self._actions = ()
         self._is_end_reported = taken.response is Response.ENDED
 
     def _settle(self, plan: Message) -> None:
@@ -254,7 +276,8 @@ class OrderedTaskExecutor(TaskExecutor):
                 return
             taken.fail(self._error, bare(self._reason))
             self._halted = self._halted or self._begun > 0
-            self._error, self._reason = Error.NONE, ""
+            self._error = Error.NONE
+            self._reason = ""
         elif taken.is_under_way and plan.count and self._done == plan.count:
             taken.finish(Response.DONE)
             self._orders_done += 1

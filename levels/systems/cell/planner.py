@@ -35,8 +35,11 @@ class OrderedTaskPlanner(TaskPlanner):
         if request.id not in (0, self._id):
             # Whoever requests it has found that it suits the arm.
             action = read_action(request, self.context.robot, self.context.scene)
-            self._program, self._id, self._plan = TaskConfig(action=(action,)), request.id, None
-            self._begin_s, self._ahead_s = request.begin, request.ahead
+            self._program = TaskConfig(action=(action,))
+            self._id = request.id
+            self._plan = None
+            self._begin_s = request.begin
+            self._ahead_s = request.ahead
         return super().wanted(read, tick)
 
     def _visible_s(self, tick: int) -> float:

@@ -11,7 +11,8 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
 from rack.levels.tables import SceneConfig
 
-POSE, MOTION = 7, 6
+POSE = 7
+MOTION = 6
 """Numbers of a free body in qpos and qvel."""
 
 
@@ -43,7 +44,8 @@ class SharingArm(SimulatedArm):
 
     def place(self, row: int, pose: Array) -> None:
         """Put an object to a pose, (7,), at rest."""
-        model, at = self._model, self.cell.object_qpos[row]
+        model = self._model
+        at = self.cell.object_qpos[row]
         dof = model.body_dofadr[self.cell.bodies[row]]
         self._data.qpos[at : at + POSE], self._data.qvel[dof : dof + MOTION] = pose, 0.0
         if row in self._kept:

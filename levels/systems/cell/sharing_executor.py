@@ -56,7 +56,8 @@ class SharingServoExecutor(ServoExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        names, rack = cast(SharingServoParams, self.given).shared, context.rack.encode()
+        names = cast(SharingServoParams, self.given).shared
+        rack = context.rack.encode()
         self._shared = {context.scene.objects.index(name): SharedBody(name.encode(), rack) for name in names}
 
     @classmethod
@@ -64,7 +65,8 @@ class SharingServoExecutor(ServoExecutor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
         """Yield shared bodies that are no objects or named twice, besides what any servo level finds."""
-        names, scene = context.params["shared"], context.scene
+        names = context.params["shared"]
+        scene = context.scene
         for name in dict.fromkeys(names):
             if name not in scene.objects:
                 kind = "an obstacle, which moves by itself" if name in scene.obstacles else "not in the scene"

@@ -34,9 +34,12 @@ class TakenOrder:
         self.error, self.reason = Error.NONE, ""  # of a refusal, a failure, or a program that ends early
         self.stops = False  # under way, and to be broken off
         if report is not None and report.echo:
-            self.program, self.order, self.response = report.program, report.echo, Response(report.response)
+            self.program = report.program
+            self.order = report.echo
+            self.response = Response(report.response)
             if report.error:
-                self.error, self.reason = Error(report.error), report.reason
+                self.error = Error(report.error)
+                self.reason = report.reason
 
     @property
     def is_asked(self) -> bool:
@@ -56,7 +59,8 @@ class TakenOrder:
         if self.is_under_way:
             self.stops = self.stops or not is_same or what in (OrderVerb.CANCEL, OrderVerb.END)
         elif what == OrderVerb.END or not is_same:
-            self.program, self.order = program, order
+            self.program = program
+            self.order = order
             self._answer(TAKEN[OrderVerb(what)], reason if what == OrderVerb.END else "")
         elif what == OrderVerb.CANCEL and self.response in (Response.NONE, Response.POSSIBLE):
             self._answer(Response.CANCELLED)
@@ -65,7 +69,8 @@ class TakenOrder:
         elif what == OrderVerb.DO and self.is_asked:
             self._answer(Response.FAILED)
         if self.response is Response.FAILED and not self.error:
-            self.error, self.reason = Error.GIVEN_UP, NOT_PROMISED
+            self.error = Error.GIVEN_UP
+            self.reason = NOT_PROMISED
 
     def promise(self) -> None:
         """Answer that it is possible."""
@@ -80,5 +85,7 @@ class TakenOrder:
         self._answer(response)
 
     def _answer(self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP) -> None:
-        self.response, self.reason, self.stops = response, reason, False
+        self.response = response
+        self.reason = reason
+        self.stops = False
         self.error = error if reason else Error.NONE

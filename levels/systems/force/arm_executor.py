@@ -81,7 +81,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def feel(self, tick: int) -> None:
         """Sense the contact; stop the arm if it is too strong."""
-        raw, velocity = self.arm.feel(), self._velocity
+        raw = self.arm.feel()
+        velocity = self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
         passed_s = self.context.tick_s * (self.context.every if self._since is None else tick - self._since)
         known = self._since is not None and not self.sensors.faulty and (self._exact or not self.abandoned)
@@ -126,5 +127,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def _show_contact(self, wrench: Message, tick: int) -> None:
         contact = self.contact
-        wrench.tick, wrench.saturated, wrench.exceeded = tick, contact.saturated, self._exceeded
-        wrench.wrench, wrench.sample = contact.wrench, contact.raw
+        wrench.tick = tick
+        wrench.saturated = contact.saturated
+        wrench.exceeded = self._exceeded
+        wrench.wrench = contact.wrench
+        wrench.sample = contact.raw

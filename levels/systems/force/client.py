@@ -76,7 +76,8 @@ class ForceMotions(Motions):
 
     def _wanted(self, call: str, name: str, changes: Mapping[str, Any]) -> Wanted:
         """Return a contact of the program, with changes. Raises `LevelError`."""
-        contact, known = self._program.contact.get(name), ", ".join(self._program.contact)
+        contact = self._program.contact.get(name)
+        known = ", ".join(self._program.contact)
         if contact is None:
             raise LevelError(f"{call}: contact '{name}' is not in [task.contact]; permitted: {known or 'none'}")
         try:

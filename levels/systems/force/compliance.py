@@ -23,7 +23,8 @@ class ComplianceWatch:
 
     def __init__(self, most: tuple[float, float], every: int) -> None:
         """`most`: of a contact, N and N m; `every`: ticks of a cycle."""
-        self._most, self._oldest = most, OLDEST_CYCLES * every
+        self._most = most
+        self._oldest = OLDEST_CYCLES * every
         self.task: ForceTask | None = None  # axes of force; None: there are none
         self.struck, self.axis = 0, -1  # id of the newest command whose guard was struck, and its axis
         self.sensed = -1  # tick of the newest wrench; -1: none yet
@@ -34,12 +35,16 @@ class ComplianceWatch:
     def recall(self, last: Reading) -> None:
         """Continue after a restart from the last `FORCE_STATUS`: a guard strikes once."""
         if last.is_there:
-            self.struck, self.axis = last.value.struck, last.value.axis
+            self.struck = last.value.struck
+            self.axis = last.value.axis
 
     def look(self, read: Ports, tick: int) -> None:
         """Judge the commands and the wrench of this cycle."""
-        compliance, wrench = read.compliance.value, read.wrench
-        self.task, self.rests, self.reason = None, False, ""
+        compliance = read.compliance.value
+        wrench = read.wrench
+        self.task = None
+        self.rests = False
+        self.reason = ""
         self.sensed = wrench.value.tick if wrench.is_there else -1
         reason = objection(compliance) if compliance.active else ""
         rotation = rotation_of(compliance.frame) if compliance.frame.any() and not reason else np.eye(3)
@@ -59,7 +64,8 @@ class ComplianceWatch:
             self._guard(read.compliance.value)
 
     def _rest(self, reason: str) -> None:
-        self.rests, self.reason = True, reason
+        self.rests = True
+        self.reason = reason
 
     def _blind(self, wrench: Reading, tick: int) -> str:
         """Return why the contact is not known; empty: it is."""
@@ -106,7 +112,8 @@ def objection(compliance: Message) -> str:
 
 def rotation_of(quaternion: Array) -> Array:
     """Return the rotation matrix (3, 3) of a quaternion of any length but 0."""
-    unit, rotation = quaternion.copy(), np.zeros(9)
+    unit = quaternion.copy()
+    rotation = np.zeros(9)
     mujoco.mju_normalize4(unit)
     mujoco.mju_quat2Mat(rotation, unit)
     return rotation.reshape(3, 3)

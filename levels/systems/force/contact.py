@@ -80,8 +80,11 @@ class Contact:
     def fill(self, compliance: Message) -> None:
         """Fill a `COMPLIANCE`."""
         compliance.id, compliance.active = self.id, self.complies or bool(self.guard.any())
-        compliance.frame, compliance.selected, compliance.wrench = self.frame, self.selected, self.wrench
-        compliance.speed, compliance.guard = self.speed, self.guard
+        compliance.frame = self.frame
+        compliance.selected = self.selected
+        compliance.wrench = self.wrench
+        compliance.speed = self.speed
+        compliance.guard = self.guard
 
     def recall(self, compliance: Message) -> None:
         """Continue from the last message of a level that was restarted."""

@@ -74,7 +74,8 @@ class HybridExecutor(WristLevel):
         if self._tick is None:
             self._watch.recall(read.last_force)
             self._tick = tick - self.context.every
-        passed_s, self._tick = (tick - self._tick) * self.context.tick_s, tick
+        passed_s = (tick - self._tick) * self.context.tick_s
+        self._tick = tick
         if self._boards.update(read.statuses):
             self._begin(self._boards.position, tick)
         if read.command.is_new:
@@ -98,7 +99,8 @@ class HybridExecutor(WristLevel):
 
     def _move(self, command: Message, tick: int, passed_s: float) -> None:
         """Write the reference of two cycles later."""
-        watch, reference = self._watch, self._reference
+        watch = self._watch
+        reference = self._reference
         motion = reference.rest(tick) if watch.rests else reference.at(tick)
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
@@ -113,22 +115,31 @@ class HybridExecutor(WristLevel):
         values = [reading.value for reading in read.statuses.values()]
         status.position = values[0].position
         status.torque, status.driven = sum(v.torque for v in values), np.any([v.driven for v in values], axis=0)
-        status.target, status.target_velocity = self._target, self._moving
-        status.echo, status.operator = read.command.value.id, max(v.operator for v in values)
-        status.holding, status.stopped = self._reference.holding, not self._boards.in_step
+        status.target = self._target
+        status.target_velocity = self._moving
+        status.echo = read.command.value.id
+        status.operator = max(v.operator for v in values)
+        status.holding = self._reference.holding
+        status.stopped = not self._boards.in_step
         status.due = read.command.value.due
         worst = max(values, key=lambda value: value.error)
         kept = self._watch.reason if self._boards.in_step else self._boards.awaited
         resting = State.IDLE if self._reference.holding else State.EXECUTING
         status.state = State.ERROR if worst.error else State.HOLDING if kept else resting
-        status.error, status.reason = worst.error, worst.reason if worst.error else kept
+        status.error = worst.error
+        status.reason = worst.reason if worst.error else kept
 
     def _report_force(self, compliance: Message, force: Message) -> None:
         watch = self._watch
-        force.echo, force.operator = compliance.id, compliance.operator
-        force.sensed, force.wrench, force.offset = watch.sensed, watch.felt, self._law.offset
-        force.struck, force.axis = watch.struck, watch.axis
+        force.echo = compliance.id
+        force.operator = compliance.operator
+        force.sensed = watch.sensed
+        force.wrench = watch.felt
+        force.offset = self._law.offset
+        force.struck = watch.struck
+        force.axis = watch.axis
         force.wanted = 0.0 if watch.task is None else watch.task.wanted
         force.selected = 0 if watch.task is None else watch.task.selected
         resting = State.IDLE if watch.task is None else State.EXECUTING
-        force.state, force.reason = State.HOLDING if watch.reason else resting, watch.reason
+        force.state = State.HOLDING if watch.reason else resting
+        force.reason = watch.reason

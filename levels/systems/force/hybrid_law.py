@@ -73,7 +73,8 @@ class ToolKinematics:
     """Pose and Jacobian of the tool, and the equation of motion, at a state."""
 
     def __init__(self, cell: Cell) -> None:
-        self._cell, self._dynamics = cell, Dynamics(cell)
+        self._cell = cell
+        self._dynamics = Dynamics(cell)
         self._whole = np.zeros((AXES, cell.model.nv))
 
     def look(self, position: Array, velocity: Array, payload: Payload | None = None) -> None:
@@ -91,10 +92,13 @@ class HybridLaw:
     """Turns the motion of the level above into commands for the joints, cycle by cycle."""
 
     def __init__(self, cell: Cell, gains: HybridGains) -> None:
-        self._limits, joints = cell.limits, len(cell.dof)
+        self._limits = cell.limits
+        joints = len(cell.dof)
         self._gain = np.repeat([gains.bandwidth / gains.stiffness, gains.bandwidth / gains.turning_stiffness], 3)
-        self._pace, self._smoothing_s = gains.bandwidth, gains.smoothing
-        self._there, self._here = ToolKinematics(cell), ToolKinematics(cell)
+        self._pace = gains.bandwidth
+        self._smoothing_s = gains.smoothing
+        self._there = ToolKinematics(cell)
+        self._here = ToolKinematics(cell)
         self._away, self._speed, self._base = np.zeros((3, joints))  # dq, its velocity; dq of a motion without force
         self._forward = np.zeros(AXES)  # N, N m: fed forward, in the world's frame
         self._forced = np.zeros(AXES)  # m/s, rad/s: on the axes of force, in the task frame
@@ -112,15 +116,18 @@ class HybridLaw:
 
     def step(self, motion: Motion, task: ForceTask | None, passed_s: float, payload: Payload) -> JointCommand:
         """Return the command for a `motion`, `passed_s` after the last; without a `task` all axes are of motion."""
-        q, qd = motion.position, motion.velocity
+        q = motion.position
+        qd = motion.velocity
         wanted = np.zeros(len(q)) if task is None else self._velocity(motion, task, passed_s) - qd
-        change, most = wanted - self._speed, self._limits.acceleration * passed_s
+        change = wanted - self._speed
+        most = self._limits.acceleration * passed_s
         part = float((np.abs(change) / most).max())
         before = self._speed.copy()
         self._speed += change / part if part > 1.0 else change
         self._away += (0.5 * passed_s) * (before + self._speed)
         low, high = self._limits.position.T
-        position, velocity = np.clip(q + self._away, low, high), qd + self._speed
+        position = np.clip(q + self._away, low, high)
+        velocity = qd + self._speed
         velocity[(q + self._away < low) | (q + self._away > high)] = 0.0
         self._away[:] = position - q
         if task is None:
@@ -130,10 +137,12 @@ class HybridLaw:
 
     def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
         """Return the joint velocities, rad/s, that follow the motion on its axes, and move for force on the others."""
-        there, here = self._there, self._here
+        there = self._there
+        here = self._here
         there.look(motion.position + self._base, motion.velocity)
         here.look(motion.position + self._away, motion.velocity + self._speed)
-        turn, error = np.zeros(3), np.zeros(AXES)
+        turn = np.zeros(3)
+        error = np.zeros(AXES)
         error[:3] = there.position - here.position
         self.offset[:] = -error[:3]
         mujoco.mju_subQuat(turn, there.quaternion, here.quaternion)

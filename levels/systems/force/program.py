@@ -35,7 +35,9 @@ class FrameConfig(Table):
     @property
     def quaternion(self) -> Array:
         """Orientation of the frame in the world, (4,), w, x, y, z."""
-        x, z, quaternion = np.array(self.x) / norm(self.x), np.array(self.z) / norm(self.z), np.zeros(4)
+        x = np.array(self.x) / norm(self.x)
+        z = np.array(self.z) / norm(self.z)
+        quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, np.column_stack((x, np.cross(z, x), z)).ravel())
         return quaternion
 

@@ -82,7 +82,8 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             self._work.contact.recall(read.last_compliance.value)
             status = read.last_status.value
             self._work.guarded, self._work.axis = status.guarded, status.axis
-            self._without, self._since = Mode(status.mode), self._now
+            self._without = Mode(status.mode)
+            self._since = self._now
 
     def _follow_boards(self, read: Ports) -> None:
         super()._follow_boards(read)
@@ -94,7 +95,8 @@ class ForceServer(WristLevel, TrajectoryExecutor):
 
     def _feel(self, force: Reading) -> None:
         """Take over the newest contact; a guard that was struck ends the request under way."""
-        status, work = force.value, self._work
+        status = force.value
+        work = self._work
         answers = force.is_there and not force.is_lost and status.echo == work.contact.id and status.sensed >= 0
         work.force = status if answers else None
         if answers and status.struck == work.contact.id and work.contact.guard.any():
@@ -102,7 +104,9 @@ class ForceServer(WristLevel, TrajectoryExecutor):
 
     def _miss_client(self) -> None:
         """Outlive a client that is lost."""
-        work, params, agenda = self._work, self._params, self._agenda
+        work = self._work
+        params = self._params
+        agenda = self._agenda
         if agenda.error is not Error.CLIENT:
             if self._passed_s(self._heard) > params.silence and (agenda.held or work.contact.complies):
                 self._lose_client()
@@ -122,7 +126,8 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         self._enter(mode, f"{what} for {self._params.hold:g} s" if complies else what)
 
     def _enter(self, mode: Mode, what: str) -> None:
-        self._without, self._since = mode, self._now
+        self._without = mode
+        self._since = self._now
         silent = f"no sign of life from the client for {self._params.silence:g} s"
         self._agenda.reason = f"{silent}: {what}; cancel, then go on"
 
@@ -131,9 +136,13 @@ class ForceServer(WristLevel, TrajectoryExecutor):
 
     def _show(self, status: Message) -> None:
         """Fill what a server's status says beyond a trajectory level's."""
-        work, force = self._work, self._work.force
+        work = self._work
+        force = self._work.force
         status.mode, (status.place, status.quaternion) = self.mode, self._ik.tool_at(self._sensed)
-        status.frame, status.selected, status.wanted = work.contact.frame, work.contact.selected, work.contact.wrench
+        status.frame = work.contact.frame
+        status.selected = work.contact.selected
+        status.wanted = work.contact.wrench
         if force is not None:
             status.wrench = -force.wrench
-        status.guarded, status.axis = work.guarded, work.axis
+        status.guarded = work.guarded
+        status.axis = work.axis

@@ -65,7 +65,8 @@ class ServerWork(RequestWork):
         """End the request under way: a guard was struck."""
         current = self.agenda.current
         if current is not None and current.kind != MotionKind.CANCEL:
-            self.guarded, self.axis = current.id, axis
+            self.guarded = current.id
+            self.axis = axis
             self.agenda.end(RequestEnd.GUARDED)
         self.contact.unguard()
         self._begin_anew(f"the arm comes to rest: guard of axis {AXIS_NAMES[axis]}")
@@ -84,7 +85,8 @@ class ServerWork(RequestWork):
 
     def off(self) -> Array:
         """Return by how much forces are off, (6,), as parts of what is tolerated; 0 on axes of motion."""
-        contact, force = self.contact, self.force
+        contact = self.contact
+        force = self.force
         if force is None:
             return np.where(contact.selected, np.inf, 0.0)
         # The tool exerts the opposite of what it feels.
@@ -100,7 +102,10 @@ class ServerWork(RequestWork):
 
     def _judge(self) -> None:
         """Count how long forces have been as wanted; end compliance when they have not settled for too long."""
-        off, current, params, period_s = self.off(), self.agenda.current, self._params, self._tools.period_s
+        off = self.off()
+        current = self.agenda.current
+        params = self._params
+        period_s = self._tools.period_s
         self._on_s = 0.0 if (off > 1.0).any() else self._on_s + period_s
         self._off_s = 0.0 if self._on_s >= params.settle else self._off_s + period_s
         if current is not None and current.kind == MotionKind.COMPLY:
@@ -126,7 +131,8 @@ class ServerWork(RequestWork):
         return super()._misfit(request)
 
     def _start(self, request: MotionRequest) -> None:
-        contact, r = self.contact, request.record
+        contact = self.contact
+        r = request.record
         if request.kind == MotionKind.GUARD:
             contact.watch(r["frame"], r["guard"])
         elif request.kind == MotionKind.COMPLY and r["selected"].any():

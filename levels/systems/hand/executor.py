@@ -132,7 +132,8 @@ class HandExecutor(Executor):
         """Give the valves the tensions of the boards above, or close them and say why."""
         since = 0 if self._closed_at is None or not self._opened else self._closed_at
         missing = self.tensions.missing(read.tensions, tick, since)
-        found, refused = None, ""
+        found = None
+        refused = ""
         if not missing:
             self.tensions.join(read.tensions)
             found, refused = self.tensions.check()
@@ -147,7 +148,8 @@ class HandExecutor(Executor):
             if held:
                 self.orders.done()
         else:
-            self._closed_at, self._opened = None, True
+            self._closed_at = None
+            self._opened = True
             self.hand.pull(self.tensions.tension)
 
     def _find(self, found: Finding | None) -> None:
@@ -161,8 +163,12 @@ class HandExecutor(Executor):
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
         """Fill the status; the fields that seldom change only when they do."""
         hand = self.hand
-        status.tick, status.position, status.velocity = tick, sample.position, sample.velocity
-        status.torque, status.tension, status.force = sample.torque, sample.tension, sample.force
+        status.tick = tick
+        status.position = sample.position
+        status.velocity = sample.velocity
+        status.torque = sample.torque
+        status.tension = sample.tension
+        status.force = sample.force
         status.wanted = hand.wanted
         counts = hand.clipped, hand.touches, hand.violations, hand.pushed
         shown = self._waiting, self._opened, self.demand, counts, hand.fault, self._slack.note
@@ -170,10 +176,14 @@ class HandExecutor(Executor):
             return
         self._shown = shown
         closed = bool(self._waiting)
-        status.holding, status.stopped, status.demand = closed, closed and self._opened, self.demand
+        status.holding = closed
+        status.stopped = closed and self._opened
+        status.demand = self.demand
         status.clipped, status.touches, status.violations, status.pushed = counts
         if hand.fault:
-            status.state, status.error, status.reason = State.ERROR, Error.SIMULATION, hand.fault
+            status.state = State.ERROR
+            status.error = Error.SIMULATION
+            status.reason = hand.fault
             return
         status.state = State.EXECUTING if not closed else State.HOLDING if self._opened else State.IDLE
         status.error = Error.LIMIT if hand.violations else Error.TOUCHED if hand.touches else Error.NONE

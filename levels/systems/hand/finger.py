@@ -47,7 +47,8 @@ class FingerExecutor(HandLoop):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params, hand = read_params(FingerParams, context.params), self.hand
+        params = read_params(FingerParams, context.params)
+        hand = self.hand
         finger = hand.names.index(params.finger)
         self.driven = np.arange(len(hand.names)) == finger
         self._joints = hand.fingers[finger]
@@ -69,7 +70,8 @@ class FingerExecutor(HandLoop):
     ) -> Iterable[tuple[str, Any, str]]:
         """Yield a finger that the hand does not have, in addition to a lack of a hand or of neighbours."""
         yield from super().misfits(context, above, below)
-        hand, name = context.robot.hand, read_params(FingerParams, context.params).finger
+        hand = context.robot.hand
+        name = read_params(FingerParams, context.params).finger
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):
             yield "params.finger", name, f"the hand has no such finger; fingers: {', '.join(names)}"
 

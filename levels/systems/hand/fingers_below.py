@@ -17,7 +17,8 @@ class FingersBelow:
     def __init__(self, context: LevelContext, fingers: Sequence[NDArray[np.int_]]) -> None:
         """`fingers` are the joints of each finger, as indices of `robot.joints`."""
         self._joints = fingers
-        joints, count = context.sizes["joints"], len(fingers)
+        joints = context.sizes["joints"]
+        count = len(fingers)
         self.position = np.zeros(joints)  # (joints,), rad: as sensed
         self.target = np.zeros(joints)  # (joints,), rad: wanted by the loops below
         self.tip = np.zeros((count, 3))  # m
@@ -28,7 +29,8 @@ class FingersBelow:
 
     def look(self, statuses: Mapping[str, Reading]) -> None:
         """Read the statuses of all boards."""
-        self.awaited, self.error = "", Error.NONE
+        self.awaited = ""
+        self.error = Error.NONE
         for board, reading in statuses.items():
             status = reading.value
             if reading.is_lost or not reading.is_there:

@@ -42,8 +42,10 @@ class FingertipLaw:
         self, kinematics: FingerKinematics, fingers: Sequence[int], gains: FingertipGains, period_s: float
     ) -> None:
         """Drive `fingers`, by index, every `period_s`."""
-        self.kinematics, self._fingers = kinematics, fingers
-        self._posture, self._period_s = gains.posture, period_s
+        self.kinematics = kinematics
+        self._fingers = fingers
+        self._posture = gains.posture
+        self._period_s = period_s
         self._most = kinematics.limits.velocity * period_s  # (joints,), rad: farthest that a target goes in a cycle
         self.wanted = np.zeros(len(self._most))  # (joints,), rad: targets of the last cycle
         self._rest = self.wanted.copy()  # (joints,), rad: posture to which an undetermined joint tends
@@ -65,7 +67,8 @@ class FingertipLaw:
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
         for finger in self._fingers:
-            own, mode = self.kinematics.joints[finger], grasp.mode[finger]
+            own = self.kinematics.joints[finger]
+            mode = grasp.mode[finger]
             out.stiff[own], out.torque[own], out.spring[own] = 1.0, 0.0, 0.0
             if mode == FingerMode.JOINTS:
                 self.wanted[own] = grasp.position[own] + ahead_s * grasp.velocity[own]

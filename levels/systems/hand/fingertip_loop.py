@@ -42,7 +42,8 @@ class FingertipLoop(HandLoop):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(self.hand.names), True)
-        kinematics, gains = FingerKinematics(self.cell, self.hand), read_params(FingertipParams, context.params)
+        kinematics = FingerKinematics(self.cell, self.hand)
+        gains = read_params(FingertipParams, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
     def meet(self, read: Ports, hand: Message) -> None:
@@ -61,5 +62,6 @@ def follow_grasp(loop: HandLoop, law: FingertipLaw, hand: Message, target: Messa
     target.active = loop.command.active
     if loop.command.active:
         law.targets(loop.command, loop.ahead_s(tick), target)
-    status.position, status.target = hand.position, law.wanted
+    status.position = hand.position
+    status.target = law.wanted
     status.force[loop.driven] = hand.force[loop.driven]

@@ -69,7 +69,8 @@ class GraspExecutor(Executor):
         kinematics = FingerKinematics(cell, cell.hand)
         self._from_world = kinematics.palm.inverse()  # from the world's frame into the palm's
         self._orders = Orders(self.commands)
-        names, params = cell.hand.names, read_params(GraspParams, context.params)
+        names = cell.hand.names
+        params = read_params(GraspParams, context.params)
         self._opposing = names.index(self._program.opposing)
         self._grasp = Grasp(
             params=params,
@@ -140,7 +141,8 @@ class GraspExecutor(Executor):
 
     def _posture(self, posture: Posture) -> Array:
         """Return a posture of all fingers as one of all joints, (joints,), rad."""
-        hand, joints = self.context.robot.hand, self.context.robot.joints
+        hand = self.context.robot.hand
+        joints = self.context.robot.joints
         assert hand is not None
         position = np.zeros(len(joints))
         for finger in hand.finger:
@@ -195,12 +197,14 @@ class GraspExecutor(Executor):
             return
         self._passed_s += self.context.period_s
         if done:
-            self._work, self._passed_s = None, 0.0
+            self._work = None
+            self._passed_s = 0.0
             self._done += 1
 
     def _begin(self) -> None:
         """Begin a step, for the first time or after a restart."""
-        grasp, step = self._grasp, self._prepared(self._done)
+        grasp = self._grasp
+        step = self._prepared(self._done)
         if isinstance(step, CloseStep):
             self._take_up(step)
             if not self._passed_s:
@@ -210,13 +214,16 @@ class GraspExecutor(Executor):
 
     def _take_up(self, close: CloseStep) -> None:
         """Grip by a CLOSE from now on."""
-        grasp, gripping = self._grasp, np.array([name in close.points for name in self._grasp.names])
-        grasp.close, grasp.base = close, 0.0
+        grasp = self._grasp
+        gripping = np.array([name in close.points for name in self._grasp.names])
+        grasp.close = close
+        grasp.base = 0.0
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepared(self, index: int) -> Step:
         """Return a step of the program with what the plan says, and with ways in the frame of the palm."""
-        step, plan = self._program.step[index], self._plan
+        step = self._program.step[index]
+        plan = self._plan
         if isinstance(step, ShiftStep):
             turned = np.zeros(3)
             mujoco.mju_rotVecQuat(turned, np.array(step.by), self._from_world.quaternion)
@@ -237,11 +244,13 @@ class GraspExecutor(Executor):
 
     def _recall(self, read: Ports) -> None:
         """Continue after a restart, from the level's own last messages."""
-        status, grasp = read.last_status.value, self._grasp
+        status = read.last_status.value
+        grasp = self._grasp
         if not (read.last_status.is_there and read.last_command.is_there):
             return
         grasp.target.copy_from(read.last_command.value)
-        self._done, self._passed_s = status.step, status.passed
+        self._done = status.step
+        self._passed_s = status.passed
         if status.plan and read.plan:
             self._plan.copy_from(self._newest(read.plan))
         for index in range(min(self._done + 1, len(self._program.step))):
@@ -252,18 +261,27 @@ class GraspExecutor(Executor):
                 grasp.base = step.grip if index < self._done else status.grip
         grasp.grip.force, grasp.grip.load[:] = status.grip, status.load
         grasp.touching[:], grasp.anchor[:] = status.touching, status.anchor
-        grasp.moved, grasp.farthest = status.moved, status.farthest
+        grasp.moved = status.moved
+        grasp.farthest = status.farthest
         if status.state == State.ERROR:
             self._failed = Refused(status.error, status.reason)
 
     def _report(self, status: Message, waits: str) -> None:
-        grasp, steps = self._grasp, self._program.step
-        status.echo, status.step, status.steps = grasp.target.id, self._done, len(steps)
+        grasp = self._grasp
+        steps = self._program.step
+        status.echo = grasp.target.id
+        status.step = self._done
+        status.steps = len(steps)
         status.kind = GraspKind.NONE if self._work is None else self._work.kind
-        status.passed, status.touching, status.grip = self._passed_s, grasp.touching, grasp.grip.force
+        status.passed = self._passed_s
+        status.touching = grasp.touching
+        status.grip = grasp.grip.force
         status.object = -1 if grasp.close is None else self.context.scene.objects.index(grasp.close.object)
-        status.load, status.anchor, status.plan = grasp.grip.load, grasp.anchor, self._plan.id
-        status.moved, status.farthest = grasp.moved, grasp.farthest
+        status.load = grasp.grip.load
+        status.anchor = grasp.anchor
+        status.plan = self._plan.id
+        status.moved = grasp.moved
+        status.farthest = grasp.farthest
         status.error = self._failed.code or grasp.fingers.error
         status.reason = str(self._failed) or waits
         if status.error:

@@ -62,7 +62,9 @@ class GraspPlanner:
         names = cell.hand.names
         if opposing not in names:
             raise LevelError(f"params.opposing = {opposing}: the hand has no such finger; fingers: {', '.join(names)}")
-        self._cell, self._rules, self._kinematics = cell, rules, FingerKinematics(cell, cell.hand)
+        self._cell = cell
+        self._rules = rules
+        self._kinematics = FingerKinematics(cell, cell.hand)
         self._data, self._opposing = cell.start(), names.index(opposing)
         self._palm = self._data.site_xmat[cell.tool].reshape(3, 3).copy()
         self._origin = self._data.site_xpos[cell.tool].copy()
@@ -83,7 +85,8 @@ class GraspPlanner:
 
     def _along(self, row: int, angle: float) -> PlannedGrasp | None:
         """Return the grasp along one line across the palm, if it is possible."""
-        across, out = self._palm[:, 0], self._palm[:, 2]
+        across = self._palm[:, 0]
+        out = self._palm[:, 2]
         line = math.cos(angle) * across + math.sin(angle) * out
         contact, normal = np.zeros((2, len(self._bases), 3))
         for finger, base in enumerate(self._bases):
@@ -99,7 +102,8 @@ class GraspPlanner:
         low, high = self._cell.limits.position.T
         margin = float((np.minimum(closed - low, high - closed) / (high - low)).min())
         body = self._cell.bodies[row]
-        turned, origin = self._data.xmat[body].reshape(3, 3), self._data.xpos[body]
+        turned = self._data.xmat[body].reshape(3, 3)
+        origin = self._data.xpos[body]
         return PlannedGrasp(
             contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
             normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
@@ -110,15 +114,19 @@ class GraspPlanner:
 
     def _touched(self, row: int, base: Array, way: Array) -> Array | None:
         """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it does not."""
-        model, data, body = self._cell.model, self._data, self._cell.bodies[row]
+        model = self._cell.model
+        data = self._data
+        body = self._cell.bodies[row]
         along = self._palm[:, 1]  # the knuckles' line
         centre = data.xipos[body]
         centre = centre + float(((base - centre) * along).sum()) * along
-        start, nearest = centre - OUTSIDE_M * way, math.inf
+        start = centre - OUTSIDE_M * way
+        nearest = math.inf
         for own in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
             if not model.geom_contype[own]:
                 continue
-            size, kind = model.geom_size[own], int(model.geom_type[own])
+            size = model.geom_size[own]
+            kind = int(model.geom_type[own])
             distance = mujoco.mju_rayGeom(data.geom_xpos[own], data.geom_xmat[own], size, start, way, kind, None)
             nearest = min(nearest, distance if distance >= 0.0 else math.inf)
         return None if nearest > OUTSIDE_M else start + nearest * way
@@ -141,7 +149,8 @@ class GraspPlanner:
 
     def _touches(self, position: Array) -> bool:
         """Return whether the hand touches anything at joint positions, also itself."""
-        model, data = self._cell.model, self._data
+        model = self._cell.model
+        data = self._data
         data.qpos[self._cell.qpos] = position
         mujoco.mj_fwdPosition(model, data)
         hand = np.isin(data.contact.geom, self._cell.gripper_geoms).any(axis=1)
@@ -149,7 +158,8 @@ class GraspPlanner:
 
     def _grip(self, row: int) -> float:
         """Return the force of each finger, N, with which friction on both sides bears weight and pull."""
-        model, body = self._cell.model, self._cell.bodies[row]
+        model = self._cell.model
+        body = self._cell.bodies[row]
         first = model.body_geomadr[body]
         friction = float(model.geom_friction[first : first + model.body_geomnum[body], 0].max())
         weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)

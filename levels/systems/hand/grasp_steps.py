@@ -81,7 +81,9 @@ class StepWork(ABC):
     kind: GraspKind
 
     def __init__(self, grasp: Grasp, step: Any, passed_s: float) -> None:
-        self.grasp, self.step, self.begun_s = grasp, step, passed_s
+        self.grasp = grasp
+        self.step = step
+        self.begun_s = passed_s
 
     @abstractmethod
     def do(self, passed_s: float) -> bool:
@@ -110,15 +112,19 @@ class PreshapeWork(StepWork):
 
     def __init__(self, grasp: Grasp, step: PreshapeStep, passed_s: float) -> None:
         super().__init__(grasp, step, passed_s)
-        self._start, self._posture = grasp.fingers.target.copy(), grasp.postures[step.posture]
+        self._start = grasp.fingers.target.copy()
+        self._posture = grasp.postures[step.posture]
 
     def do(self, passed_s: float) -> bool:
         """Move the joints."""
-        grasp, target = self.grasp, self.grasp.target
+        grasp = self.grasp
+        target = self.grasp.target
         part, rate = self.progress(passed_s)
         way = self._posture - self._start
-        target.mode, target.force = FingerMode.JOINTS, 0.0
-        target.position, target.velocity = self._start + part * way, rate * way
+        target.mode = FingerMode.JOINTS
+        target.force = 0.0
+        target.position = self._start + part * way
+        target.velocity = rate * way
         away = np.abs(grasp.fingers.position - self._posture)
         if part < 1.0 or bool((away < grasp.params.astray).all()):
             return part >= 1.0
@@ -149,7 +155,9 @@ class CloseWork(StepWork):
 
     def do(self, passed_s: float) -> bool:
         """Move the tips."""
-        grasp, target, closing = self.grasp, self.grasp.target, self.grasp.grip.fingers
+        grasp = self.grasp
+        target = self.grasp.target
+        closing = self.grasp.grip.fingers
         part = min((passed_s - self.begun_s) / self._seconds, 1.0)
         for finger in np.flatnonzero(closing & ~grasp.touching).tolist():
             way = self._ways[finger]
@@ -169,7 +177,8 @@ class CloseWork(StepWork):
 
     def _stay(self, finger: int, force: Array) -> None:
         """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
-        target, grasp = self.grasp.target, self.grasp
+        target = self.grasp.target
+        grasp = self.grasp
         target.mode[finger], target.stiffness[finger] = FingerMode.FORCE, grasp.grip.stiffness[finger]
         target.tip[finger], target.tip_velocity[finger] = grasp.fingers.tip[finger], 0.0
         target.force[finger] = force
@@ -184,7 +193,8 @@ class GrippingWork(StepWork):
 
     def keep(self) -> None:
         """Press with the grip that the load asks for; raises `Refused` when the object is lost."""
-        grasp, fingers = self.grasp, self.grasp.fingers
+        grasp = self.grasp
+        fingers = self.grasp.fingers
         away = grasp.object_at - grasp.anchor
         grasp.moved = norm(away)
         grasp.farthest = max(grasp.farthest, grasp.moved)
@@ -199,7 +209,9 @@ class GrippingWork(StepWork):
         self._notice()
 
     def _notice(self) -> None:
-        grasp, params, close = self.grasp, self.grasp.params, self.grasp.close
+        grasp = self.grasp
+        params = self.grasp.params
+        close = self.grasp.close
         assert close is not None, "checked with the program"
         silent = np.array([norm(force) < SLIPPED_PART * close.touch for force in grasp.fingers.force])
         self._silent_s[:] = np.where(silent, self._silent_s + grasp.period_s, 0.0)
@@ -245,9 +257,11 @@ class ShiftWork(GrippingWork):
 
     def do(self, passed_s: float) -> bool:
         """Move the object."""
-        grasp, target = self.grasp, self.grasp.target
+        grasp = self.grasp
+        target = self.grasp.target
         part, rate = self.progress(passed_s)
-        gone, self._part = (part - self._part) * self._way, part
+        gone = (part - self._part) * self._way
+        self._part = part
         grasp.anchor += gone
         target.tip[grasp.grip.fingers] += gone
         target.tip_velocity[grasp.grip.fingers] = rate * self._way
@@ -280,7 +294,9 @@ class ReleaseWork(StepWork):
 
     def do(self, passed_s: float) -> bool:
         """Let go."""
-        grasp, target, half = self.grasp, self.grasp.target, 0.5 * self.step.seconds
+        grasp = self.grasp
+        target = self.grasp.target
+        half = 0.5 * self.step.seconds
         if passed_s < half:
             left = 1.0 - passed_s / half
             grasp.grip.force, grasp.grip.load[:] = left * self._force, left * self._load

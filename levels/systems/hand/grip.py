@@ -42,7 +42,9 @@ class HandGrip:
 
     def __init__(self, gains: GripGains, fingers: NDArray[np.bool_], opposing: int, period_s: float) -> None:
         """Grip with `fingers`, (fingers,), every `period_s`."""
-        self._gains, self._period_s, self._opposing = gains, period_s, opposing
+        self._gains = gains
+        self._period_s = period_s
+        self._opposing = opposing
         self.fingers = fingers.copy()
         self._others = fingers.copy()
         self._others[opposing] = False

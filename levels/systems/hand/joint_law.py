@@ -80,7 +80,8 @@ def set_joint_torques(
 ) -> bool:
     """Set the torques; return whether a limit cut one."""
     dry, viscous, limit, driven = constants[0], constants[1], constants[2], constants[3]  # N m, N m s/rad, N m, 1
-    joints, clipped = len(torque), False
+    joints = len(torque)
+    clipped = False
     for j in range(joints):
         torque[j] = 0.0
         if driven[j] != 0.0:
@@ -104,5 +105,6 @@ def set_joint_torques(
 
 def preload() -> None:
     """Load this module's compiled function."""
-    joint, table = np.zeros(1), np.zeros((4, 1))
+    joint = np.zeros(1)
+    table = np.zeros((4, 1))
     set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], table[:1], joint, joint)

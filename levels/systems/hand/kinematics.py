@@ -24,7 +24,8 @@ class FingerKinematics:
     """The fingers of one hand."""
 
     def __init__(self, cell: Cell, hand: Hand) -> None:
-        self._cell, self._tips = cell, hand.tips
+        self._cell = cell
+        self._tips = hand.tips
         self.joints = [np.flatnonzero(row) for row in hand.fingers]  # of each finger, as indices of `robot.joints`
         self._data = d = mujoco.MjData(cell.model)
         mujoco.mj_resetDataKeyframe(cell.model, d, 0)
@@ -59,7 +60,8 @@ class FingerKinematics:
         `look(position)` comes before. A finger has more joints than its tip needs: of the motions that do so it takes
         the one nearest to `homing`, (joints of the finger,), rad.
         """
-        own, jacobian = self.joints[finger], self.jacobian(finger)
+        own = self.joints[finger]
+        jacobian = self.jacobian(finger)
         square = np.empty((3, 3))
         mujoco.mju_mulMatMatT(square, jacobian, jacobian)
         square.flat[::4] += DAMPING_M2

@@ -101,7 +101,8 @@ class HandLoop(Executor):
 
     def _take(self, command: Reading, tick: int) -> None:
         """Follow what is new, unless an operator holds the loop."""
-        released, self._held = self._held, self.orders.standing is Operation.HOLD
+        released = self._held
+        self._held = self.orders.standing is Operation.HOLD
         if self._held:
             for name in self.velocities:
                 setattr(self.command, name, 0.0)
@@ -111,10 +112,14 @@ class HandLoop(Executor):
             self._rejected = f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
             if not wrong:
                 self.command.copy_from(command.value)
-                self.commanded, self._taken = True, tick
+                self.commanded = True
+                self._taken = tick
 
     def _wait(self, status: Message) -> None:
-        status.driven, status.sensed, status.holding, status.stopped = self.driven, -1, True, True
+        status.driven = self.driven
+        status.sensed = -1
+        status.holding = True
+        status.stopped = True
         status.reason = NO_HAND_YET
 
     def _kept(self, read: Ports, tick: int) -> str:
@@ -134,8 +139,10 @@ class HandLoop(Executor):
 
     def _report(self, read: Ports, status: Message, kept: str) -> None:
         """Fill the status; its steady fields when they change."""
-        hand, lost = read.hand.value, self.commanded and read.command.is_lost
-        status.sensed, status.echo = hand.tick, self.command.id
+        hand = read.hand.value
+        lost = self.commanded and read.command.is_lost
+        status.sensed = hand.tick
+        status.echo = self.command.id
         note = kept or self._rejected
         if lost and not note:
             note = f"no command from '{self._above}': its last one is kept"

@@ -14,7 +14,8 @@ from rack.backplane.message import Field, command, status
 from rack.backplane.words import Demand
 from rack.levels.operator import ANSWER, RESTS_ON
 
-FLEXOR, EXTENSOR = 0, 1
+FLEXOR = 0
+EXTENSOR = 1
 """Rows of tensions."""
 
 

@@ -18,7 +18,9 @@ from rack.levels.robot.cell import Cell
 
 VIEWS = (("from the front", 0, 2), ("from above", 0, 1))
 """Title, axis to the right, axis up."""
-SIDE, GAP, LINE = 420, 16, 17
+SIDE = 420
+GAP = 16
+LINE = 17
 """Pixels: sides of a view, between views, from line to line of text."""
 REACH_M = 0.16
 """Half of a view's side."""
@@ -28,7 +30,11 @@ LEAST_N = 0.05
 """Forces below it are not drawn."""
 RIM = 24
 """Points on the rim of a round geom."""
-HAND, OBJECT, REST, FORCE, PLAN = "#4a4f5a", "#5588cc", "#c9ccd2", "#cc3311", "#118833"
+HAND = "#4a4f5a"
+OBJECT = "#5588cc"
+REST = "#c9ccd2"
+FORCE = "#cc3311"
+PLAN = "#118833"
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,8 @@ class HandPicture:
     def __init__(self, cell: Cell) -> None:
         assert cell.hand is not None, "a cell with a hand"
         self._cell, self._hand, self._data = cell, cell.hand, cell.start()
-        model, own = cell.model, set(cell.gripper_geoms.tolist())
+        model = cell.model
+        own = set(cell.gripper_geoms.tolist())
         self._palm = model.site_bodyid[cell.tool]
         shown = self._data.site_xpos[[cell.tool, *self._hand.tips]]
         self._centre = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
@@ -65,7 +72,8 @@ class HandPicture:
     def draw(self, scene: HandScene, text: Sequence[str] = ()) -> str:
         """Return the picture, with lines of text to its right."""
         self._pose(scene)
-        width, height = len(VIEWS) * (SIDE + GAP) + SIDE, SIDE + 2 * GAP
+        width = len(VIEWS) * (SIDE + GAP) + SIDE
+        height = SIDE + 2 * GAP
         parts = [f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif">']
         parts.append(f'<rect width="{width}" height="{height}" fill="white"/>')
         for number, (name, right, up) in enumerate(VIEWS):
@@ -79,7 +87,8 @@ class HandPicture:
         return "\n".join([*parts, "</svg>", ""])
 
     def _pose(self, scene: HandScene) -> None:
-        model, data = self._cell.model, self._data
+        model = self._cell.model
+        data = self._data
         data.qpos[self._cell.qpos] = scene.position
         for row, address in enumerate(self._cell.object_qpos):
             data.qpos[address : address + 7] = *scene.bodies[row], *scene.quaternions[row]
@@ -115,7 +124,9 @@ class HandPicture:
         if length < LEAST_N * scale:
             return
         (x, y), (u, v) = start, way / length
-        end_x, end_y, head = x + way[0], y + way[1], min(9.0, length)
+        end_x = x + way[0]
+        end_y = y + way[1]
+        head = min(9.0, length)
         corners = ((0.0, 0.0), (-head, 0.45 * head), (-head, -0.45 * head))
         points = " ".join(f"{end_x + a * u - b * v:.1f},{end_y + a * v + b * u:.1f}" for a, b in corners)
         yield f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{end_x:.1f}" y2="{end_y:.1f}" stroke="{FORCE}" stroke-width="2"/>'
@@ -125,7 +136,8 @@ class HandPicture:
         """Yield the contacts of a plan, (3,), m."""
         if len(scene.contact):
             body = self._cell.bodies[scene.held]
-            turned, origin = self._data.xmat[body].reshape(3, 3), self._data.xpos[body]
+            turned = self._data.xmat[body].reshape(3, 3)
+            origin = self._data.xpos[body]
             yield from (origin + mat_vec(turned, point) for point in np.asarray(scene.contact, dtype=float))
 
     def _pixel(self, point: Array, axes: tuple[int, int]) -> tuple[float, float]:

@@ -54,7 +54,8 @@ class SimulatedHand(Simulation):
 
     def _start_with(self, tension: Array) -> None:
         """Let the valves have had tensions, (2, joints), N, for ever."""
-        model, d = self.cell.model, self._data
+        model = self.cell.model
+        d = self._data
         for actuator, pull in zip(self.hand.actuators.ravel().tolist(), tension.ravel().tolist(), strict=True):
             d.ctrl[actuator] = pull
             if model.actuator_actnum[actuator]:
@@ -74,13 +75,15 @@ class SimulatedHand(Simulation):
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
-        tension, force = self._data.actuator_force[self.hand.actuators], self._data.sensordata[self.hand.forces]
+        tension = self._data.actuator_force[self.hand.actuators]
+        force = self._data.sensordata[self.hand.forces]
         in_palm = (force[:, :, None] * self._palm).sum(axis=1)
         return HandSample(position, velocity, self._steps.seen[-1, 2], tension, in_palm)
 
     def pull(self, tension: Array) -> None:
         """Open the valves, and let them follow tensions, (2, joints), N, which are within the limits."""
-        self.waited, self.braked = 0, False
+        self.waited = 0
+        self.braked = False
         self._data.ctrl[self.hand.actuators] = tension
 
     def tear(self, torn: NDArray[np.bool_]) -> None:
@@ -110,7 +113,8 @@ class SimulatedHand(Simulation):
         """
         if not self.braked:
             return super()._simulate()
-        position, before = self._state[0], self._before
+        position = self._state[0]
+        before = self._before
         before[:] = position
         super()._simulate()
         drawn = self._spring * (position - before)

@@ -23,7 +23,9 @@ class SlackMonitor:
     """Judges the tensions sensed in every cycle."""
 
     def __init__(self, hand: Hand, joints: Sequence[str]) -> None:
-        self._joints, self._least, self._slack = joints, hand.least, SLACK_PART * hand.least
+        self._joints = joints
+        self._least = hand.least
+        self._slack = SLACK_PART * hand.least
         self._cycles = np.zeros((2, len(joints)), dtype=int)  # for which each tendon has been slack
         self._any = False  # one was, in the last cycle
         self.note = ""  # which tendons are slack, readable; empty: none

@@ -51,7 +51,9 @@ class TendonLaw:
         self._constants[0], self._constants[1] = hand.arms, hand.least + gains.margin
         self._constants[2], self._constants[3] = hand.most, driven
         self._numbers = hand.rest, gains.lead, 1.0 - math.exp(-context.period_s / gains.lag), gains.most_trim
-        self._lag, self._trim, self._tick_s = gains.lag, gains.trim, context.tick_s
+        self._lag = gains.lag
+        self._trim = gains.trim
+        self._tick_s = context.tick_s
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
         self._elapsed, self._shares = 0, (0.0, 0.0)  # ticks between two samples, and shares of that time
         self._set = set_tensions.load()
@@ -63,7 +65,8 @@ class TendonLaw:
     def start(self, status: Message) -> None:
         """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same place."""
         self._valves[0], self._valves[1], self._valves[2] = status.wanted, status.tension, 0.0
-        self._status, self._sampled = status, status.tick
+        self._status = status
+        self._sampled = status.tick
         self._sensed = numbers(status, "tension", "wanted")
 
     def tensions(self, torque: Array, out: Array) -> None:
@@ -72,7 +75,8 @@ class TendonLaw:
         elapsed = 0 if self._status.holding else self._status.tick - self._sampled
         self._sampled = self._status.tick
         if elapsed != self._elapsed:
-            self._elapsed, elapsed_s = elapsed, elapsed * self._tick_s
+            self._elapsed = elapsed
+            elapsed_s = elapsed * self._tick_s
             self._shares = 1.0 - math.exp(-elapsed_s / self._lag), min(self._trim * elapsed_s, MOST_LEARNED)
         if self._set(self._numbers, self._shares, self._constants, self._valves, self._sensed, torque, out):
             self.clipped += 1
@@ -92,7 +96,8 @@ def set_tensions(
     rest, lead, share, most_trim = numbers
     arm, least, most, driven = constants[0], constants[1], constants[2], constants[3]  # m, N, N, 1
     reached, expected, trim = valves[0], valves[1], valves[2]  # model now, model at the sample, correction
-    joints, clipped = len(arm), False
+    joints = len(arm)
+    clipped = False
     for j in range(joints):
         if driven[j] == 0.0:
             continue

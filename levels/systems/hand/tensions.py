@@ -23,7 +23,9 @@ class Tensions(CommandsAbove):
     def __init__(self, context: LevelContext, hand: Hand, patience: MotorPatience) -> None:
         # A tension takes a cycle of its board, and one of the board that gave that the torque.
         super().__init__(context, patience, 2, "tensions", "valves closed")
-        self._joints, self._low, self._high = context.robot.joints, hand.least, hand.most
+        self._joints = context.robot.joints
+        self._low = hand.least
+        self._high = hand.most
         self._margin = MARGIN * hand.most
         self.tension = np.zeros((2, len(hand.most)))  # N
         self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
@@ -38,7 +40,9 @@ class Tensions(CommandsAbove):
 
     def check(self) -> tuple[Finding | None, str]:
         """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused; empty: it is not."""
-        tension, low, high = self.tension, self._low, self._high
+        tension = self.tension
+        low = self._low
+        high = self._high
         within = (tension >= low - self._margin) & (tension <= high + self._margin)  # NaN is not
         if within.all():
             np.clip(tension, low, high, out=tension)

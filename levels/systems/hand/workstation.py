@@ -64,7 +64,8 @@ class Workstation(HostProgram):
             raise LevelError(f"params.object = {p.object}: not in the scene; objects: {known}")
         self._row = context.scene.objects.index(p.object)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self._planner, self._drawing = GraspPlanner(cell, p.opposing, p.rules), HandPicture(cell)
+        self._planner = GraspPlanner(cell, p.opposing, p.rules)
+        self._drawing = HandPicture(cell)
         self._planned: PlannedGrasp | None = None
         self._at = np.full(3, np.inf)  # (3,), m: where the object was when a grasp was planned last
         self._picture = None if p.picture is None else Path(p.picture.format(rack=context.rack))
@@ -81,13 +82,16 @@ class Workstation(HostProgram):
 
     def plan(self, bus: Bus) -> PlannedGrasp | None:
         """Plan and send a grasp if one is wanted; return the newest, None without one."""
-        world, grasp = bus.read("world"), bus.read("grasp")
+        world = bus.read("world")
+        grasp = bus.read("grasp")
         if not (world.is_there and grasp.is_there) or grasp.value.kind > GraspKind.PRESHAPE:
             return self._planned
-        position, quaternion = world.value.position[self._row], world.value.quaternion[self._row]
+        position = world.value.position[self._row]
+        quaternion = world.value.quaternion[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned
-        self._at, sensed = np.array(position), int(world.value.sensed)
+        self._at = np.array(position)
+        sensed = int(world.value.sensed)
         self._planned = found = self._planner.plan(self._row, self._at, np.array(quaternion))
         if found is not None:
             parts = {"contact": found.contact, "normal": found.normal, "posture": found.posture, "grip": found.grip}
@@ -96,7 +100,8 @@ class Workstation(HostProgram):
 
     def draw(self, bus: Bus) -> None:
         """Replace the picture by one of now; a reader of the file never finds a part of it."""
-        hand, world = bus.read("hand"), bus.read("world")
+        hand = bus.read("hand")
+        world = bus.read("world")
         if self._picture is None or not (hand.is_there and world.is_there):
             return
         contact = np.empty((0, 3)) if self._planned is None else self._planned.contact

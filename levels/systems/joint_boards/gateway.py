@@ -40,7 +40,8 @@ class JointGateway(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params, every = read_params(GatewayParams, context.params), context.every
+        params = read_params(GatewayParams, context.params)
+        every = context.every
         self._delay = -(-round(params.delay / context.tick_s) // every) * every  # ticks: whole cycles
         self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
         self._missing, self._period = params.missing, max(pace.every for pace in context.above.values())
@@ -72,7 +73,8 @@ class JointGateway(Executor):
         assert newest is not None
         if not newest.due:
             command.raw[:] = newest.raw
-            self._due, self._frozen = 0, False
+            self._due = 0
+            self._frozen = False
         elif newest.due + self.latency > max(self._due, tick):
             command.raw[:] = newest.raw
             self._due = command.due = newest.due + self.latency
@@ -89,7 +91,8 @@ class JointGateway(Executor):
             return
         self._due += self._period
         ahead_s = ahead * self.context.tick_s
-        command.due, command.id = self._due, newest.id
+        command.due = self._due
+        command.id = newest.id
         command.position[:] = newest.position + ahead_s * newest.velocity
         command.velocity[:], command.acceleration[:] = newest.velocity, 0.0
 
@@ -115,11 +118,16 @@ class JointGateway(Executor):
         worst = max(values, key=lambda value: (bool(value.error), bool(value.stopped), bool(value.holding)))
         merged.holding = any(bool(value.holding) for value in values)
         merged.stopped = bool(silent) or any(bool(value.stopped) for value in values)
-        merged.echo, merged.due = min([value.echo for value in values]), min([value.due for value in values])
+        merged.echo = min([value.echo for value in values])
+        merged.due = min([value.due for value in values])
         merged.operator = max([value.operator for value in values])
-        merged.state, merged.error, merged.reason = worst.state, worst.error, worst.reason
+        merged.state = worst.state
+        merged.error = worst.error
+        merged.reason = worst.reason
         if silent:
-            merged.state, merged.reason = State.HOLDING, f"no status from '{silent[0]}': waiting for its board"
+            merged.state = State.HOLDING
+            merged.reason = f"no status from '{silent[0]}': waiting for its board"
         elif self._frozen and not worst.stopped:
             late = f"no reference from '{self._above}'"
-            merged.state, merged.reason = State.HOLDING, f"{late}: held after {self._missing} extrapolated"
+            merged.state = State.HOLDING
+            merged.reason = f"{late}: held after {self._missing} extrapolated"

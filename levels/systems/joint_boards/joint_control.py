@@ -14,7 +14,8 @@ from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload
 
 MOVED_RAD = 0.01
 """Distance of a joint from where the loads were computed at which they are computed again."""
-AT, DUE = slice(0, 2), slice(2, 4)
+AT = slice(0, 2)
+DUE = slice(2, 4)
 """Rows of inertia, kg m2, and load, N m: at the beginning of an interval, and at its end."""
 
 
@@ -26,7 +27,8 @@ class JointLoads:
         self.table = np.zeros((4, joints))  # in the rows `AT` and `DUE`
         self._begin = self._due = 0  # tick
         self._payload = Payload(0.0, np.zeros(3))
-        self._dynamics, self._still = Dynamics(cell), np.zeros(joints)
+        self._dynamics = Dynamics(cell)
+        self._still = np.zeros(joints)
         self._computed_at = np.full(joints, np.nan)  # (joints,), rad; NaN: they are those of a reference
 
     @staticmethod
@@ -40,7 +42,8 @@ class JointLoads:
         """Go over to those of a good `JOINT_REFERENCE` until it is due."""
         self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
-        self._begin, self._due = tick, command.due
+        self._begin = tick
+        self._due = command.due
         self._payload = Payload(command.payload_mass, command.payload_offset.copy())
         self._computed_at[:] = np.nan
 

@@ -62,7 +62,8 @@ class JointServo(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params, robot = read_params(JointServoParams, context.params), context.robot
+        params = read_params(JointServoParams, context.params)
+        robot = context.robot
         cell = build_cell(robot, context.scene, context.clock_ns)
         names = robot.joints if params.joints is None else params.joints
         self._driven = np.array([name in names for name in robot.joints])
@@ -104,7 +105,8 @@ class JointServo(Executor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
         """Yield joints that the arm lacks or that are named twice, an idle board, and modifications that do not fit."""
-        params, known = read_params(JointServoParams, context.params), context.robot.joints
+        params = read_params(JointServoParams, context.params)
+        known = context.robot.joints
         named = known if params.joints is None else params.joints
         for joint in dict.fromkeys(named):
             if joint not in known:
@@ -121,7 +123,10 @@ class JointServo(Executor):
         if not self._met and not self._meet(read.status.is_there, arm, write):
             return
         self._take_messages(read, write)
-        sampled, every, reference, operator = arm.tick, self.context.every, self.reference, self.operator
+        sampled = arm.tick
+        every = self.context.every
+        reference = self.reference
+        operator = self.operator
         away = read.status.is_lost or tick - sampled > self._oldest
         stopped = away or bool(arm.stopped)
         if away or (stopped and arm.braked):
@@ -148,9 +153,12 @@ class JointServo(Executor):
 
     def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
         """Replace the torques just set by those of the modified law."""
-        joints, table, part = len(self._driven), self.loads.table, times[0]
+        joints = len(self._driven)
+        table = self.loads.table
+        part = times[0]
         given, shown = self._shown_numbers
-        torque, status = self._unmodified[: 3 * joints], self._unmodified[3 * joints :]
+        torque = self._unmodified[: 3 * joints]
+        status = self._unmodified[3 * joints :]
 
         def law(motion: Motion, state: Array) -> Array:
             self._servo(*times, state.reshape(-1), motion.table, torque, status)
@@ -164,11 +172,14 @@ class JointServo(Executor):
 
     def _meet(self, is_there: bool, arm: Message, write: Ports) -> bool:
         """Begin with the first status of the arm; return whether there is one."""
-        status, torque = write.status, write.command
+        status = write.status
+        torque = write.command
         self._met = is_there
         if not is_there:
             torque.sampled = -1
-            status.driven, status.holding, status.stopped = self._driven, True, True
+            status.driven = self._driven
+            status.holding = True
+            status.stopped = True
             return False
         if self._grip is not None and arm.grip_force:
             self._grip.keep(arm.grip_force)
@@ -182,7 +193,8 @@ class JointServo(Executor):
             self.operator.take(read.operator, read.status.value.position)
         if read.command.verdict is Verdict.NEW:
             command: Message = read.command.value
-            self._command, self._rests_on = command.id, command.operator
+            self._command = command.id
+            self._rests_on = command.operator
             if not self.loads.are_good(command):
                 return
             self.reference.take(command)
@@ -197,12 +209,15 @@ class JointServo(Executor):
             self.loads.hold(arm.position)
         elif self._offered is not None:
             self.loads.take(self._offered, tick)
-            self._due, self._offered = self._offered.due, None
+            self._due = self._offered.due
+            self._offered = None
 
     def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
         """Fill the steady fields of the status when they change."""
-        operator, holding = self.operator, self.reference.holding
-        kept, error = operator.reason if operator.stands else "", Error.NONE
+        operator = self.operator
+        holding = self.reference.holding
+        kept = operator.reason if operator.stands else ""
+        error = Error.NONE
         if away:
             kept = ARM_LOST
         elif stopped:

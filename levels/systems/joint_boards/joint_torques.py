@@ -75,7 +75,8 @@ def add_up(
     begins: NDArray[np.int64],  # (boards,): where in `memory` the numbers of a board begin
 ) -> bool:
     """Add up the numbers of messages; return whether a joint is wanted to move."""
-    joints, moves = motion.shape[1], False
+    joints = motion.shape[1]
+    moves = False
     for number in range(len(total)):
         total[number] = 0.0
         for board in range(len(begins)):

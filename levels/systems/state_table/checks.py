@@ -94,7 +94,8 @@ def _states(text: TableText) -> Iterator[str]:
     for number, row in text.rows.items():
         if row.next is not None and row.next not in (*names, SAME):
             yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
-    reached, ahead = set[str](), [text.start]
+    reached = set[str]()
+    ahead = [text.start]
     while ahead:
         state = ahead.pop()
         if state not in reached:
@@ -148,9 +149,11 @@ def _box(row: RowConfig) -> Box:
 
 def without(box: Box, taken: Box) -> Sequence[Box]:
     """Return disjoint boxes that hold the cases of `box` that are not in `taken`; both name the same conditions."""
-    pieces, rest = [], dict(box)
+    pieces = []
+    rest = dict(box)
     for condition, values in taken.items():
-        outside, inside = rest[condition] - values, rest[condition] & values
+        outside = rest[condition] - values
+        inside = rest[condition] & values
         if not inside:
             return [box]
         if outside:

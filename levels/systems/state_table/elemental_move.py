@@ -109,7 +109,8 @@ class MoveTable(StateTableExecutor):
         super().__init__(context)
         self._cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._ik = InverseKinematics(self._cell, context.seed)
-        self._sent, self._reached = 0, True
+        self._sent = 0
+        self._reached = True
         self._what, self._speed = "", 1.0  # the newest command sent down
         self._joints = self._cell.home.copy()  # (joints,), rad: where it ends
         self._aim = np.zeros(3)  # m: where the object, or the place, was for it
@@ -131,17 +132,24 @@ class MoveTable(StateTableExecutor):
         if read.last_status.is_there and read.last_command.is_there:
             last = read.last_command.value
             write.command.copy_from(last)
-            self._sent, self._reached = read.last_status.value.sent, bool(read.last_status.value.reached)
+            self._sent = read.last_status.value.sent
+            self._reached = bool(read.last_status.value.reached)
             self._put = read.last_status.value.put
-            self._what, self._speed, self._row = last.words, last.speed, last.object
+            self._what = last.words
+            self._speed = last.speed
+            self._row = last.object
             self._joints[:], self._aim[:], self._yaw = last.joints, last.aim, last.yaw
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
         """Return where the level below, the object and the gripper are."""
-        below, world = read.status.value, read.world.value
-        self.detail, self.resting = below.reason, not below.moving
-        self._holds, self._carried = below.held > 0, below.object if below.held else -1
-        self._positions, self._quaternions = world.position, world.quaternion
+        below = read.status.value
+        world = read.world.value
+        self.detail = below.reason
+        self.resting = not below.moving
+        self._holds = below.held > 0
+        self._carried = below.object if below.held else -1
+        self._positions = world.position
+        self._quaternions = world.quaternion
         is_seen = not read.world.is_lost and world.revision > 0
         return {
             "below": answer_of(read.status, self._sent),
@@ -209,14 +217,22 @@ class MoveTable(StateTableExecutor):
 
     def _send(self, what: str, joints: Array, speed: float) -> None:
         self._sent += 1
-        self._what, self._speed = what, speed
+        self._what = what
+        self._speed = speed
         self._joints[:] = joints
 
     def give(self, write: Ports, tick: int) -> None:
         """Write the command, and what a restarted board needs."""
-        command, shown = write.command, write.status
-        command.id, command.words, command.hold = self._sent, self._what, self.holds
+        command = write.command
+        shown = write.status
+        command.id = self._sent
+        command.words = self._what
+        command.hold = self.holds
         command.joints[:], command.speed = self._joints, self._speed
-        command.object, command.aim, command.yaw = self._row, self._aim, self._yaw
-        shown.sent, shown.reached, shown.resting = self._sent, self._reached, self.resting
+        command.object = self._row
+        command.aim = self._aim
+        command.yaw = self._yaw
+        shown.sent = self._sent
+        shown.reached = self._reached
+        shown.resting = self.resting
         shown.put = self._put

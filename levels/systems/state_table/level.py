@@ -94,7 +94,8 @@ def vocabulary(
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come with them."""
     late = Condition(YES_NO, "whether the state has lasted longer than the table's patience")
-    found, acts = {**conditions, LATE: late}, dict(actions)
+    found = {**conditions, LATE: late}
+    acts = dict(actions)
     if commands:
         found["command"] = Condition(
             ("none", UNKNOWN, *commands),
@@ -170,7 +171,8 @@ class StateTableExecutor(Executor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterator[tuple[str, Any, str]]:
         """Yield every mistake in every table, and commands that one of them does not know."""
-        files, tables = read_params(StateTableParams, context.params).tables, {}
+        files = read_params(StateTableParams, context.params).tables
+        tables = {}
         for name, path in files.items():
             try:
                 tables[name] = cls.read(path, context.scene)
@@ -202,7 +204,8 @@ class StateTableExecutor(Executor):
         """Put a table in force. It goes on in the state of the same name; without one, in the state it starts in."""
         self.table_name, self.table = name, self.tables[name]
         if self.state not in self.table.rows:
-            self.state, self._since = self.table.start, None
+            self.state = self.table.start
+            self._since = None
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Do one cycle: read, let one row fire, write."""
@@ -222,7 +225,8 @@ class StateTableExecutor(Executor):
             for verb, *parameters in row.do:
                 getattr(self, f"do_{verb}")(*parameters)
             if row.next not in (SAME, self.state):
-                self.state, self._since = row.next, tick
+                self.state = row.next
+                self._since = tick
         self.give(write, tick)
         self._report(write, row, values)
 
@@ -257,7 +261,8 @@ class StateTableExecutor(Executor):
         self.state = last.in_state
         self.use(last.table if last.table in self.tables else self.table_name)
         self._recalled = last.order
-        self._words, self._done = last.words, last.done
+        self._words = last.words
+        self._done = last.done
         self._taken = (True, last.ordered) if last.ordered else (False, last.echo)
 
     def _preprocess(self, read: Ports) -> None:
@@ -302,7 +307,8 @@ class StateTableExecutor(Executor):
         shown: Message = write.status
         state, reason = (row.status, row.reason) if row is not None else (State.ERROR, self._no_row(values))
         if self._kept and state is State.EXECUTING:
-            state, reason = State.HOLDING, self._kept
+            state = State.HOLDING
+            reason = self._kept
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
         if row is not None and row.next == SAME and state is State.ERROR and shown.state == state:
@@ -310,11 +316,17 @@ class StateTableExecutor(Executor):
         is_operators, serial = self._taken
         if state is State.DONE and not is_operators:
             self._done = serial
-        shown.state, shown.error, shown.reason = state, Error.TABLE if state is State.ERROR else Error.NONE, reason
+        shown.state = state
+        shown.error = Error.TABLE if state is State.ERROR else Error.NONE
+        shown.reason = reason
         shown.echo = serial if not is_operators else 0 if self.orders.standing is Operation.DO else self._done
-        shown.table, shown.checksum, shown.in_state = self.table_name, self.table.checksum, self.state
+        shown.table = self.table_name
+        shown.checksum = self.table.checksum
+        shown.in_state = self.state
         shown.row, shown.fired = (row.number, row.name) if row is not None else (0, "")
-        shown.words, shown.ordered, shown.done = self._words, serial * is_operators, self._done
+        shown.words = self._words
+        shown.ordered = serial * is_operators
+        shown.done = self._done
         if is_operators and serial == self.orders.serial and state is State.ERROR:
             self.orders.fail(reason)
         elif self.resting if self.orders.standing is Operation.HOLD else state is State.DONE:

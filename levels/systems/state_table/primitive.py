@@ -112,7 +112,8 @@ class PrimitiveTable(StateTableExecutor):
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         if context.robot.gripper is None:
             raise RobotError("the level works a gripper, and [robot] has none")
-        self._gripper, self._limits = context.robot.gripper, cell.limits
+        self._gripper = context.robot.gripper
+        self._limits = cell.limits
         self._dynamics = Dynamics(cell)
         self._masses = cell.model.body_subtreemass[cell.bodies].copy()  # kg
         self._point = np.zeros((3, len(cell.home)))  # the newest set point: rad, rad/s, rad/s2
@@ -122,7 +123,9 @@ class PrimitiveTable(StateTableExecutor):
         self._curve: Curve | None = None  # None: at rest
         self._from = 0  # tick at which it began
         self._follows = 0  # cycles for which the boards below have followed; 0: they do not
-        self._closed, self._held, self._object = False, False, -1
+        self._closed = False
+        self._held = False
+        self._object = -1
         self._target = -1  # row of the object that the newest command concerns
         self._last_due = 0  # tick at which the set point before the next one is due
         self._grips = 0  # cycles until the gripper's motion must show
@@ -137,14 +140,18 @@ class PrimitiveTable(StateTableExecutor):
         super().recall(read, write)
         if read.last_status.is_there:
             last = read.last_status.value
-            self._closed, self._held, self._object = bool(last.closed), bool(last.held), last.object
+            self._closed = bool(last.closed)
+            self._held = bool(last.held)
+            self._object = last.object
             self._point[0], self._end[:] = last.position, last.end
             write.command.copy_from(read.last_command.value)
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
         """Return whether the arm follows and has arrived, and what the gripper does."""
         for reading in read.command.values():
-            self._goal, self._speed, self._target = reading.value.joints, reading.value.speed, reading.value.object
+            self._goal = reading.value.joints
+            self._speed = reading.value.speed
+            self._target = reading.value.object
         position = self._follow(read)
         due = self._due(tick)
         if self._curve is not None and (due - self._from) * self.context.tick_s >= self._curve.ends_s:
@@ -194,7 +201,8 @@ class PrimitiveTable(StateTableExecutor):
         """Begin the motion to the joints of the command in force, from rest."""
         if self._curve is not None:
             return self.do_halt()
-        start, limits = self._point[0], self._limits
+        start = self._point[0]
+        limits = self._limits
         goal = np.clip(self._goal, limits.position[:, 0], limits.position[:, 1])
         self._end[:] = goal
         speed = min(max(self._speed, MIN_SPEED), 1.0)
@@ -208,15 +216,20 @@ class PrimitiveTable(StateTableExecutor):
             self._start(Ramp(self._point[0].copy(), self._point[1].copy(), self._limits.acceleration))
 
     def _start(self, curve: Curve) -> None:
-        self._curve, self._from = curve, self._last_due
+        self._curve = curve
+        self._from = self._last_due
 
     def do_open(self) -> None:
         """Open the gripper."""
-        self._closed, self._grips, self._object = False, GRIP_CYCLES, -1
+        self._closed = False
+        self._grips = GRIP_CYCLES
+        self._object = -1
 
     def do_close(self) -> None:
         """Close the gripper."""
-        self._closed, self._grips, self._object = True, GRIP_CYCLES, self._target
+        self._closed = True
+        self._grips = GRIP_CYCLES
+        self._object = self._target
 
     def _due(self, tick: int) -> int:
         """Return the tick at which the set point of the cycle released at `tick` is due."""
@@ -225,7 +238,9 @@ class PrimitiveTable(StateTableExecutor):
 
     def give(self, write: Ports, tick: int) -> None:
         """Write the set point, with inertia and load there, and what a restarted board needs."""
-        command, shown, due = write.command, write.status, self._due(tick)
+        command = write.command
+        shown = write.status
+        due = self._due(tick)
         if self._curve is not None:
             self._point[:] = self._curve.at((due - self._from) * self.context.tick_s).table
         command.id = tick // self.context.every + 1
@@ -233,8 +248,14 @@ class PrimitiveTable(StateTableExecutor):
         command.position, command.velocity, command.acceleration = self._point
         load = Payload(self._masses[self._object] if self._held and self._object >= 0 else 0.0, np.zeros(3))
         inertia, bias = self._dynamics.terms(self._point[0], self._point[1], load)
-        command.inertia, command.load = np.diagonal(inertia), bias
+        command.inertia = np.diagonal(inertia)
+        command.load = bias
         command.opening = self._gripper.closed if self._closed else self._gripper.open
-        command.force, command.payload_mass = self._gripper.force, load.mass
-        shown.position, shown.end, shown.moving = self._point[0], self._end, not self.resting
-        shown.closed, shown.held, shown.object = self._closed, self._held, self._object if self._held else -1
+        command.force = self._gripper.force
+        command.payload_mass = load.mass
+        shown.position = self._point[0]
+        shown.end = self._end
+        shown.moving = not self.resting
+        shown.closed = self._closed
+        shown.held = self._held
+        shown.object = self._object if self._held else -1

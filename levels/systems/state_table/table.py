@@ -178,7 +178,9 @@ def read_text(path: Path, vocabulary: Vocabulary) -> TableText:
         raise TableError(_flaws(error, "", TableConfig)) from error
     except (ValueError, TypeError, RecursionError) as error:  # ValueError: TOML, UTF-8
         raise TableError([f"not TOML: {error}"]) from error
-    rows, flaws, plan = {}, list[str](), None
+    rows = {}
+    flaws = list[str]()
+    plan = None
     for number, row in enumerate(config.row, 1):
         try:
             rows[number] = RowConfig(**row)

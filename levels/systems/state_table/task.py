@@ -111,7 +111,9 @@ class TaskTable(StateTableExecutor):
         super().recall(read, write)
         if read.last_status.is_there and read.last_command.is_there:
             last = read.last_status.value
-            self._step, self._sent, self._answered = last.action, last.sent, last.moves_done
+            self._step = last.action
+            self._sent = last.sent
+            self._answered = last.moves_done
             write.command.copy_from(read.last_command.value)
             self._command = read.last_command.value.words
 
@@ -138,9 +140,14 @@ class TaskTable(StateTableExecutor):
 
     def give(self, write: Ports, tick: int) -> None:
         """Write the command, and the progress."""
-        command, shown = write.command, write.status
-        command.id, command.words, command.hold = self._sent, self._command, self.holds
+        command = write.command
+        shown = write.status
+        command.id = self._sent
+        command.words = self._command
+        command.hold = self.holds
         steps = len(self.table.plan.step)
-        shown.action, shown.actions, shown.sent = min(self._step, steps), steps, self._sent
+        shown.action = min(self._step, steps)
+        shown.actions = steps
+        shown.sent = self._sent
         shown.moves = steps * COMMANDS_A_STEP
         shown.moves_done = min(self._step, steps) * COMMANDS_A_STEP

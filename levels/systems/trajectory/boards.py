@@ -39,20 +39,24 @@ class JointBoards:
             self._silent[board] = 0 if heard else self._silent.get(board, 0) + 1
         why = self._kept(statuses)
         if why:
-            self.in_step, self.awaited = False, f"waiting for {why}"
+            self.in_step = False
+            self.awaited = f"waiting for {why}"
         if self.in_step or why or not self._hold(statuses):
             return False
-        self.in_step, self._cycles = True, 0
+        self.in_step = True
+        self._cycles = 0
         return True
 
     def leave(self, why: str) -> None:
         """Let all fall out of step: they come to rest by themselves, and motion begins again from where they hold."""
-        self.in_step, self.awaited = False, why
+        self.in_step = False
+        self.awaited = why
 
     def _kept(self, statuses: Mapping[str, Reading]) -> str:
         """Return the board that does not follow, and why; empty: all do, or could."""
         for board, reading in statuses.items():
-            status, silent = reading.value, self._silent[board]
+            status = reading.value
+            silent = self._silent[board]
             if silent > MAX_SILENT_CYCLES or not reading.is_there:
                 return f"{board}: no status for {silent} cycles"
             if status.stopped:

@@ -55,7 +55,9 @@ class Motions:
     """Those that scripts and prompts have by name."""
 
     def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
-        self._bus, self._robot, self._bodies = bus, robot, scene.bodies
+        self._bus = bus
+        self._robot = robot
+        self._bodies = scene.bodies
         # No request of a former process has a greater number than it has sent messages.
         self._newest = bus.sent("requests")
         self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
@@ -143,7 +145,8 @@ class Motions:
     def _look(self) -> None:
         """Wait for news; send the requests again that are lost: nothing is under way, and not all are done."""
         self._bus.wait(LOOK_S)
-        status, now = self._bus.read("motion").value, self._bus.time_s
+        status = self._bus.read("motion").value
+        now = self._bus.time_s
         self._open = {number: request for number, request in self._open.items() if number > status.done}
         if status.current or not self._open:
             self._idle_since = None

@@ -54,7 +54,8 @@ class TrajectoryExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params, robot = read_params(self.params, context.params), context.robot
+        params = read_params(self.params, context.params)
+        robot = context.robot
         cell = build_cell(robot, context.scene, context.clock_ns)
         self._ik = InverseKinematics(cell, context.seed)
         self._sight = WorldSight(context.scene.bodies, params.blind, context.tick_s)
@@ -87,7 +88,8 @@ class TrajectoryExecutor(Executor):
         if self._tick is None:
             self._recall(read)
             self._tick = tick - self.context.every
-        cycles, self._tick = (tick - self._tick) // self.context.every, tick
+        cycles = (tick - self._tick) // self.context.every
+        self._tick = tick
         self._orders.take(read.operator)
         self._sight.look(read.world)
         cancelled = self._agenda.take(read.requests)
@@ -123,7 +125,8 @@ class TrajectoryExecutor(Executor):
 
     def _watch(self, read: Ports, cycles: int) -> None:
         """End the request under way if its guard is struck; `cycles` since the last one."""
-        current, leg = self._agenda.current, self._motion.leg
+        current = self._agenda.current
+        leg = self._motion.leg
         # At half its speed the arm has long broken away from rest, where friction changes torques.
         steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
         if current is None or not current.is_guarded or not steady:
@@ -146,7 +149,9 @@ class TrajectoryExecutor(Executor):
         command.operator = self._orders.rests_on(self._agenda.rests_on)
 
     def _write_status(self, status: Message) -> None:
-        agenda, motion, goal = self._agenda, self._motion, self._work.goal
+        agenda = self._agenda
+        motion = self._motion
+        goal = self._work.goal
         agenda.report(status)
         status.echo = agenda.taken
         reason = self._reason_to_wait() if agenda.held or agenda.missing else ""
@@ -156,8 +161,10 @@ class TrajectoryExecutor(Executor):
             status.state = State.HOLDING if reason else State.EXECUTING
         else:
             status.state = State.DONE if agenda.done else State.IDLE
-        status.error, status.reason = agenda.error, agenda.reason or reason
-        status.progress, status.resting = self._work.progress, motion.resting
+        status.error = agenda.error
+        status.reason = agenda.reason or reason
+        status.progress = self._work.progress
+        status.resting = motion.resting
         position, velocity, _ = motion.state
         status.position[:], status.velocity[:] = position, velocity
         tool = self._ik.tool_at(position)

@@ -23,7 +23,9 @@ class WorldSight:
 
     def __init__(self, bodies: tuple[str, ...], blind_s: float, tick_s: float) -> None:
         """See `bodies`, in the model's order; extrapolate for `blind_s` at most."""
-        self._bodies, self._blind_s, self._tick_s = bodies, blind_s, tick_s
+        self._bodies = bodies
+        self._blind_s = blind_s
+        self._tick_s = tick_s
         self._model: Message | None = None
 
     def look(self, world: Reading) -> None:
@@ -58,10 +60,15 @@ class ToolGoal:
 
     def __init__(self, goal: Pose, body: int, live: bool, sight: WorldSight, follow_s: float) -> None:
         """Follow a live goal with the time constant `follow_s`; `goal` is in the frame of `body`, -1: the world."""
-        self._goal, self._body, self.live, self._sight, self._follow_s = goal, body, live and body >= 0, sight, follow_s
+        self._goal = goal
+        self._body = body
+        self.live = live and body >= 0
+        self._sight = sight
+        self._follow_s = follow_s
         self._stamp_s = -1.0  # of the sample for which `pose` was evaluated
         self._frame: Pose | None = None
-        self._velocity, self._turning = np.zeros(3), np.zeros(3)
+        self._velocity = np.zeros(3)
+        self._turning = np.zeros(3)
         self._pose = goal
         self.evaluations = 0
 
@@ -72,10 +79,12 @@ class ToolGoal:
         seen, velocity = self._sight.frame(self._body, time_s)
         self.evaluations += 1
         if self._frame is None:
-            self._frame, self._velocity = seen, velocity
+            self._frame = seen
+            self._velocity = velocity
         else:
             self._follow(seen, velocity, time_s - self._stamp_s)
-        self._stamp_s, self._pose = time_s, self._frame @ self._goal
+        self._stamp_s = time_s
+        self._pose = self._frame @ self._goal
 
     def pose(self) -> Pose:
         """Return the goal of the tool for that sample."""
@@ -87,9 +96,11 @@ class ToolGoal:
 
     def _follow(self, seen: Pose, velocity: Array, passed_s: float) -> None:
         """Go after the body, critically damped; its turning is followed with a lag."""
-        frame, pace = self._frame, 1.0 / self._follow_s
+        frame = self._frame
+        pace = 1.0 / self._follow_s
         assert frame is not None
-        turn, quaternion = np.zeros(3), frame.quaternion.copy()
+        turn = np.zeros(3)
+        quaternion = frame.quaternion.copy()
         mujoco.mju_subQuat(turn, seen.quaternion, quaternion)
         # The body moves at its velocity in the step that ends at `seen`.
         off = seen.position - velocity * passed_s - frame.position

@@ -36,7 +36,8 @@ class TouchGuard:
             self._past.append(sum(board.value.torque for board in boards.values()))
         else:
             self.begin_anew()
-        past, count = np.array(self._past), self._lasting
+        past = np.array(self._past)
+        count = self._lasting
         if len(past) < 2 * count:
             return False
         change = np.median(past[-count:], axis=0) - np.median(past[:count], axis=0)

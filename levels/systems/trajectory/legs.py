@@ -23,7 +23,8 @@ BLEND_PART = 0.5
 """Part of the acceleration limits that one leg takes: two blended ones take all."""
 PEAK = 0.75
 """Greatest acceleration of a change of speed by 1 over 2a, times a."""
-STEP_M, STEP_RAD = 0.04, 0.1
+STEP_M = 0.04
+STEP_RAD = 0.1
 """Distance and turn between the poses of a tool path that are tried before it begins."""
 MAX_STEPS = 40
 SAMPLED = 1.15
@@ -67,7 +68,8 @@ class TimeLaw:
         """Return the part done after `time_s`."""
         if time_s <= 0.0:
             return 0.0
-        a, left = self.half_blend_s, self.ends_s - time_s
+        a = self.half_blend_s
+        left = self.ends_s - time_s
         if left <= 0.0:
             return 1.0
         if left < 2.0 * self.leaving_s:
@@ -98,7 +100,8 @@ class JointLeg:
     live = False
 
     def __init__(self, start: Array, goal: Array, times: Times, limits: Limits) -> None:
-        self._start, self._way = start.copy(), goal - start
+        self._start = start.copy()
+        self._way = goal - start
         self.law, self.least_s = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
 
     def at(self, time_s: float) -> Array:
@@ -117,7 +120,9 @@ class ToolLeg:
     ) -> None:
         """Prepare the way from the joint positions `start`. Raises `Unfit`."""
         self._ik, limits = solver
-        self._from, self._goal, self.live = self._ik.tool_at(start), goal, live
+        self._from = self._ik.tool_at(start)
+        self._goal = goal
+        self.live = live
         self._last = start.copy()
         speed, bend = self._try_out(start, goal())
         self.law, self.least_s = timed(times, speed, bend, limits)
@@ -137,7 +142,8 @@ class ToolLeg:
 
     def _try_out(self, start: Array, goal: Pose) -> tuple[Array, Array]:
         """Return the greatest first and second derivative of the joints by the part of the way, (joints,) each."""
-        way, turn = norm(goal.position - self._from.position), self._from.angle_to(goal)
+        way = norm(goal.position - self._from.position)
+        turn = self._from.angle_to(goal)
         steps = min(max(ceil(way / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
         points = [start]
         for k in range(1, steps + 1):
@@ -153,7 +159,8 @@ def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> tuple[Time
     `speed` and `bend` are the first and second derivatives of joint positions by the part of the way, (joints,) each. A
     segment time that is too short for a limit, or for two blends, is stretched.
     """
-    half, most = times.half_blend, BLEND_PART * limits.acceleration
+    half = times.half_blend
+    most = BLEND_PART * limits.acceleration
     slope = PEAK * speed / half
     needed = np.maximum(speed / limits.velocity, (slope + np.sqrt(slope * slope + 4.0 * most * bend)) / (2.0 * most))
     segment = max(float(needed.max()), times.segment, 2.0 * half)

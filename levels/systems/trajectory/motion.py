@@ -38,7 +38,9 @@ class SampledMotion:
     """Begins legs, blends them, stops: without a step in position or velocity, within the limits of every joint."""
 
     def __init__(self, limits: Limits, joints: tuple[str, ...], period_s: float) -> None:
-        self._limits, self._joints, self._period_s = limits, joints, period_s
+        self._limits = limits
+        self._joints = joints
+        self._period_s = period_s
         self._leg: Leg | None = None
         self._begun_s = 0.0
         self._settling: Settling | None = None
@@ -113,7 +115,8 @@ class SampledMotion:
         Raises `Unfit` with the arm ramping to rest.
         """
         if self.settled and self._leg is not None and not self._leg.live:
-            self._rest, self._settling = self._samples[1], None
+            self._rest = self._samples[1]
+            self._settling = None
         elif not self.settled or self._leg is not None:
             self._settle(self.state, BLEND_PART, max(2.0 * half_blend_s, LEAST_STOP_CYCLES * self._period_s))
         self._leg = None
@@ -152,5 +155,6 @@ class SampledMotion:
             # Written so that NaN is outside.
             if not (np.abs(values) <= EXCESS * limits).all():
                 joint = int((np.abs(values) / limits).argmax())
-                name, most = self._joints[joint], limits[joint]
+                name = self._joints[joint]
+                most = limits[joint]
                 raise Unfit(f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted: {most:.2f}")

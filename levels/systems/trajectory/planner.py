@@ -59,11 +59,14 @@ class RequestExecutor(Executor):
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report the requests done."""
-        below, status = read.status.value, write.status
-        status.echo, status.operator = below.echo, below.operator
+        below = read.status.value
+        status = write.status
+        status.echo = below.echo
+        status.operator = below.operator
         status.action = status.moves_done = min(below.done, self._count)
         status.actions = status.moves = self._count
-        status.error, status.reason = below.error, below.reason
+        status.error = below.error
+        status.reason = below.reason
         if below.error:
             status.state = State.ERROR
         elif not self._count:
@@ -92,7 +95,8 @@ class RequestPlanner(Planner):
         self._steps = self.program.read(context.task, context.robot, context.scene).step
         self._ahead = read_params(PlanningParams, context.params).ahead
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self._ik, self._home = InverseKinematics(cell, context.seed), cell.home
+        self._ik = InverseKinematics(cell, context.seed)
+        self._home = cell.home
         self._upright = self._ik.tool_at(cell.home).quaternion
         self._bodies = context.scene.bodies
         self._goals: dict[int, Array] = {}  # joint positions (joints,), rad, at the end of each step planned
@@ -113,7 +117,8 @@ class RequestPlanner(Planner):
         if below.taken != self._taken[0]:
             self._taken = below.taken, tick
         elif below.taken < self._sent and self._since_s(self._taken, tick) > PATIENCE_S and not read.status.is_lost:
-            self._sent, self._taken = below.taken, (below.taken, tick)
+            self._sent = below.taken
+            self._taken = (below.taken, tick)
         return self._may_send(self._sent, below.done, tick)
 
     def plan(self, read: Ports, write: Any, tick: int) -> None:
@@ -143,18 +148,23 @@ class RequestPlanner(Planner):
         """Make a request of step k."""
         step = self._steps[k]
         request.clear()
-        request.id, request.body = k + 1, -1
+        request.id = k + 1
+        request.body = -1
         if isinstance(step, MotionStep):
-            request.segment, request.acceleration = step.segment, step.acceleration
+            request.segment = step.segment
+            request.acceleration = step.acceleration
             self._fill_motion(request, step, k, world)
             return
         self._goals[k] = self._goal_before(k, world)
         if isinstance(step, StayStep):
-            request.kind, request.segment = MotionKind.STAY, step.seconds
+            request.kind = MotionKind.STAY
+            request.segment = step.seconds
         elif isinstance(step, GripStep):
             gripper = self.context.robot.gripper
             default = gripper.force if gripper is not None else 0.0
-            request.kind, request.segment, request.opening = MotionKind.GRIP, step.seconds, step.opening
+            request.kind = MotionKind.GRIP
+            request.segment = step.seconds
+            request.opening = step.opening
             request.force = default if step.force is None else step.force
         else:
             request.kind = MotionKind.CANCEL
@@ -166,9 +176,11 @@ class RequestPlanner(Planner):
         if tool is not None and (isinstance(step, LineStep) or unsolved):
             request.kind, request.position, request.quaternion = MotionKind.POSE, *tool
         else:
-            request.kind, request.joints = MotionKind.JOINTS, joints
+            request.kind = MotionKind.JOINTS
+            request.joints = joints
         if isinstance(step, LineStep) and step.body is not None:
-            request.body, request.live = self._bodies.index(step.body), step.live
+            request.body = self._bodies.index(step.body)
+            request.live = step.live
 
     def _goal_before(self, k: int, world: Message) -> Array:
         """Return joint positions at the end of the step before step k, planning it if need be, as after a restart."""
@@ -180,7 +192,8 @@ class RequestPlanner(Planner):
 
     def _goal(self, k: int, world: Message) -> Array:
         """Return joint positions at the end of step k; those before it where there are none."""
-        step, before = self._steps[k], self._goal_before(k, world)
+        step = self._steps[k]
+        before = self._goal_before(k, world)
         if isinstance(step, HomeStep):
             return self._home
         if isinstance(step, MoveStep) and step.joints is not None:

@@ -64,7 +64,8 @@ class MotionRequest(NamedTuple):
         numbers = self.record["acceleration"], self.record["segment"], self.record["opening"], self.record["force"]
         if not np.isfinite(numbers).all() or self.acceleration < 0.0 or self.segment < 0.0:
             return f"times {self.acceleration:g} and {self.segment:g} s; permitted: finite, 0 or more"
-        place, turn = self.record["position"], self.record["quaternion"]
+        place = self.record["position"]
+        turn = self.record["quaternion"]
         if self.kind == MotionKind.POSE and not (np.isfinite(place).all() and np.isfinite(turn).all() and turn.any()):
             return "the pose is not finite, or its quaternion is zero"
         # Written so that NaN is one.
@@ -93,7 +94,8 @@ class Agenda:
         self.goal: MotionRequest | None = None  # at whose goal the arm is, or to which it goes
         self.taken = 0  # newest id taken
         self.rests_on = 0  # newest command of an operator on which a request taken rests
-        self.error, self.reason = Error.NONE, ""
+        self.error = Error.NONE
+        self.reason = ""
         self.missing = False  # the request after `taken` was lost, with a board that died as it took it
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
@@ -137,8 +139,11 @@ class Agenda:
         self.taken, self.rests_on = request.id, max(self.rests_on, request.operator)
         if request.kind == MotionKind.CANCEL:
             self._flush(RequestEnd.CANCELLED)
-            self.error, self.reason = Error.NONE, ""
-            self.held, self.begun, self.goal = [request], True, None
+            self.error = Error.NONE
+            self.reason = ""
+            self.held = [request]
+            self.begun = True
+            self.goal = None
             return True
         if self.error:
             self._end(request, RequestEnd.REFUSED)
@@ -163,7 +168,9 @@ class Agenda:
 
     def fail(self, how: RequestEnd, code: Error, reason: str) -> None:
         """End the first request so, drop the others, refuse those that come."""
-        self.error, self.reason, self.goal = code, reason, None
+        self.error = code
+        self.reason = reason
+        self.goal = None
         if self.held:
             self.reason = f"request {self.held[0].id}: {reason}"
             self.end(how)
@@ -172,7 +179,8 @@ class Agenda:
     def _flush(self, how: RequestEnd) -> None:
         for request in self.held:
             self._end(request, how)
-        self.held, self.begun = [], False
+        self.held = []
+        self.begun = False
 
     def _end(self, request: MotionRequest, how: RequestEnd) -> None:
         self._ended.appendleft((request.id, how))
@@ -180,13 +188,16 @@ class Agenda:
     def report(self, status: Message) -> None:
         """Fill the ids, the ends and the error of a `MOTION_STATUS`."""
         current = self.current
-        status.taken, status.current, status.done = self.taken, current.id if current is not None else 0, self.done
+        status.taken = self.taken
+        status.current = current.id if current is not None else 0
+        status.done = self.done
         for k, (request, how) in enumerate(self._ended):
             status.ended[k], status.ends[k] = request, how
 
     def save(self, state: Message) -> None:
         """Fill a `MOTION_STATE`."""
-        state.begun, state.count = self.begun, len(self.held)
+        state.begun = self.begun
+        state.count = len(self.held)
         for k, request in enumerate(self.held):
             state.requests[k] = request.record
         if self.goal is not None:
@@ -199,8 +210,10 @@ class Agenda:
         self.held = [MotionRequest.of(record) for record in records(state)]
         self.begun = bool(state.begun)
         self.goal = MotionRequest.of(state.goal) if state.goal["id"] else None
-        self.taken, self.rests_on = status.taken, status.operator
-        self.error, self.reason = Error(status.error), status.reason if status.error else ""
+        self.taken = status.taken
+        self.rests_on = status.operator
+        self.error = Error(status.error)
+        self.reason = status.reason if status.error else ""
         ends = zip(status.ended.tolist(), status.ends.tolist(), strict=True)
         self._ended.extend((request, RequestEnd(how)) for request, how in ends if request)
 

@@ -41,7 +41,9 @@ class RequestWork:
     """Begins, blends and ends requests; interrupted motion goes on from where the arm rests."""
 
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
-        self.agenda, self.motion, self._tools = agenda, motion, tools
+        self.agenda = agenda
+        self.motion = motion
+        self._tools = tools
         self.goal: ToolGoal | None = None  # of the leg under way or reached; None: it is one in joint space
         self.passed_s = 0.0  # time that the request under way has stayed or gripped
         self.grip = 0.0, 0.0  # opening, m, and force, N, wanted by the last GRIP
@@ -50,17 +52,21 @@ class RequestWork:
 
     def recall(self, passed_s: float, progress: float) -> None:
         """Continue after a restart of the level."""
-        self.passed_s, self._left = passed_s, 1.0 - progress
+        self.passed_s = passed_s
+        self._left = 1.0 - progress
 
     def interrupt(self) -> None:
         """Note that the arm was brought to rest elsewhere than at the goal."""
         if not self._interrupted:
             self._left = 1.0 - self.progress
-        self._interrupted, self.goal = True, None
+        self._interrupted = True
+        self.goal = None
 
     def cancel(self) -> None:
         """Ramp to rest; no request is under way but a CANCEL."""
-        self._left, self._interrupted, self.goal = 1.0, False, None
+        self._left = 1.0
+        self._interrupted = False
+        self.goal = None
         self.motion.stop()
 
     def end_guarded(self) -> None:
@@ -71,7 +77,8 @@ class RequestWork:
 
     def step(self, time_s: float, hold: bool) -> None:
         """Go on to the sample at `time_s`; with `hold`, ramp to rest."""
-        motion, agenda = self.motion, self.agenda
+        motion = self.motion
+        agenda = self.agenda
         try:
             if self.goal is not None:
                 self.goal.update(time_s + self._tools.period_s)
@@ -93,7 +100,8 @@ class RequestWork:
     @property
     def progress(self) -> float:
         """Part of the time of the request under way that has passed, 0 to 1."""
-        current, leg = self.agenda.current, self.motion.leg
+        current = self.agenda.current
+        leg = self.motion.leg
         if current is None:
             return 0.0
         if not current.moves:
@@ -105,15 +113,19 @@ class RequestWork:
 
     def _fail(self, how: RequestEnd, reason: str, code: Error = Error.NONE) -> None:
         self.agenda.fail(how, code or (Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT), reason)
-        self.goal, self._left, self._interrupted = None, 1.0, False
+        self.goal = None
+        self._left = 1.0
+        self._interrupted = False
 
     def _go_on(self) -> None:
         """Begin anew the motion that was interrupted, once the arm rests."""
-        goal, current = self.agenda.goal, self.agenda.current
+        goal = self.agenda.goal
+        current = self.agenda.current
         if not self.motion.settled:
             return
         if goal is None or (current is None and not goal.live):
-            self._interrupted, self._left = False, 1.0
+            self._interrupted = False
+            self._left = 1.0
         elif self._can_begin(goal):
             self._interrupted = False
             under_way = current is not None and current.id == goal.id
@@ -132,7 +144,8 @@ class RequestWork:
 
     def _consider(self, request: MotionRequest) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be blended into it."""
-        current, leg = self.agenda.current, self.motion.leg
+        current = self.agenda.current
+        leg = self.motion.leg
         if not self._can_begin(request):
             return
         if current is None:
@@ -145,7 +158,8 @@ class RequestWork:
 
     def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
         """Return half the time in which `leg` slows down, if now is the time to blend it into `request`."""
-        law, passed_s = leg.law, self.motion.leg_s
+        law = leg.law
+        passed_s = self.motion.leg_s
         if passed_s > law.ends_s - 2.0 * law.leaving_s:
             return max(0.5 * (law.ends_s - passed_s), 0.0)  # it slows down already
         wanted_s = max(request.acceleration or self._tools.params.acceleration, leg.least_s)
@@ -159,7 +173,8 @@ class RequestWork:
 
     def _begin(self, request: MotionRequest, half_s: float) -> None:
         self.agenda.begin()
-        self.passed_s, self._left = 0.0, 1.0
+        self.passed_s = 0.0
+        self._left = 1.0
         reason = self._misfit(request)
         if reason:
             self._fail(RequestEnd.REFUSED, reason)
@@ -180,7 +195,8 @@ class RequestWork:
 
     def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of `request`; the motion so far slows down over twice `half_s`."""
-        params, limits = self._tools.params, self._tools.limits
+        params = self._tools.params
+        limits = self._tools.limits
         times = Times(segment_s, max(request.acceleration or params.acceleration, half_s))
         goal = None
         if request.kind == MotionKind.POSE:

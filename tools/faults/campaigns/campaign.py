@@ -30,7 +30,8 @@ SHORTEST_S = 1.0
 """Shortest run of faultless time."""
 ROUNDS = 8
 """Draws of a fault that does not strike, each at another instant; then it is missing."""
-ORDER, TRIALS = "order.json", "trials"
+ORDER = "order.json"
+TRIALS = "trials"
 """In a campaign's folder: the file with its order, and the folder of its trials."""
 
 
@@ -63,7 +64,8 @@ class Campaign:
     """One campaign. Raises `ConfigError`, and `Failure` for a task that is not done even without faults."""
 
     def __init__(self, order: Order, folder: Path, progress: Progress) -> None:
-        self.order, self.folder = order, folder
+        self.order = order
+        self.folder = folder
         self._progress = progress
         # Only the campaign's faults: the config's own would strike every trial.
         self._config = order.config.model_copy(update={"fault": ()})
@@ -88,7 +90,8 @@ class Campaign:
             if nominal.shortfalls or nominal.ended != "task done":
                 why = "; ".join(nominal.shortfalls)
                 raise Failure(f"{order.name}: the task is not done even without faults: {why}")
-            results, self._ticks = Results(nominal), nominal.ticks
+            results = Results(nominal)
+            self._ticks = nominal.ticks
             self._inject(results)
             rack = self._under_test(True)
             results.sizes += self._made(size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1))
@@ -98,7 +101,8 @@ class Campaign:
 
     def _open(self) -> None:
         """Make the folder, or continue in it. Raises `Failure` where it is another campaign's."""
-        path, wanted = self.folder / ORDER, json.loads(json.dumps(self.order.document()))
+        path = self.folder / ORDER
+        wanted = json.loads(json.dumps(self.order.document()))
         if path.exists():
             there = json.loads(path.read_text())
             if other := [key for key in wanted if wanted[key] != there.get(key)]:
@@ -113,12 +117,14 @@ class Campaign:
 
     def _inject(self, results: Results) -> None:
         """Make trials until every kind has struck as often as ordered; in real time those that lockstep cannot have."""
-        order, both = self.order, len(self.order.modes) > 1
+        order = self.order
+        both = len(self.order.modes) > 1
         for lockstep in order.modes:
             kinds = [k for k in self.kinds if needs_real_time(k) != lockstep] if both or lockstep else self.kinds
             lacking = dict.fromkeys(kinds if order.injections else (), order.injections)
             for turn in range(ROUNDS):
-                rack, seed = self._under_test(lockstep), f"{order.seed} {turn}"
+                rack = self._under_test(lockstep)
+                seed = f"{order.seed} {turn}"
                 found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
                 results.trials += found
                 struck = Counter(f.kind for run in found for f in run.faults if f.is_judged and f.seen != "not struck")
@@ -178,7 +184,8 @@ class Campaign:
 
     def _calm(self, place: int, under: str) -> Iterator[TrialResult]:
         """Yield faultless runs in real time."""
-        left, nth = self.order.faultless_s, 0
+        left = self.order.faultless_s
+        nth = 0
         while left >= SHORTEST_S and not INTERRUPT.number:
             self._progress.begin(f"faultless{f' under {under}' if under else ''}, {left:.0f} s left")
             seconds = left if left < self._ticks / self._second else self.order.seconds
@@ -192,12 +199,14 @@ class Campaign:
             yield found
             # A run that has not ended would not end the next time either.
             ran_s = found.ticks / self._second or left
-            left, nth = left - ran_s, nth + 1
+            left = left - ran_s
+            nth = nth + 1
             self._progress.end(ran_s, found.ended, found.shortfalls)
 
     def _guess_s(self, plans: Sequence[Plan]) -> float:
         """Estimate the time that runs take: in lockstep a core simulates the default rack in a third of real time."""
-        real_s, cores = self._ticks / self._second, len(os.sched_getaffinity(0))
+        real_s = self._ticks / self._second
+        cores = len(os.sched_getaffinity(0))
         return sum(LAUNCH_S + (real_s / 3.0 / cores if plan.lockstep else real_s) for plan in plans)
 
 

@@ -52,8 +52,10 @@ class RackUnderTest:
 
     def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the ticks from the beginning of a fault to the next: it is found, over, and recovered from."""
-        layout, kind = self.targets.layout, target.record
-        tasks, boxes = [task.name for task in layout.tasks], [box.name for box in layout.mailboxes]
+        layout = self.targets.layout
+        kind = target.record
+        tasks = [task.name for task in layout.tasks]
+        boxes = [box.name for box in layout.mailboxes]
         entry = Injection(
             kind.number,
             tasks.index(target.board) if target.board in tasks else -1,
@@ -81,7 +83,8 @@ class Card:
     def draw(cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
         """Draw a fault as the kind's record says; with a `size`, of a single joint, as a point of a curve."""
         target = rng.choice(rack.targets.by_kind[kind])
-        record, joints = target.record, rack.targets.joints
+        record = target.record
+        joints = rack.targets.joints
         drawing = Drawing(rng, target.cycle, target.reader, rack.second, joints)
         ticks = record.lasts(drawing) if record.lasts is not None else 0
         parameters = {p.name: p.drawn(drawing) for p in record.parameters if p.drawn is not None}
@@ -99,7 +102,8 @@ class Card:
 
     def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> dict[str, Any]:
         """Return the fault as a `[[fault]]` table that begins at `tick`."""
-        target, kind = self.target, self.target.record
+        target = self.target
+        kind = self.target.record
         table: dict[str, Any] = {"kind": kind.name, "board": target.board}
         if kind.where != "start":
             table["tick"] = tick
@@ -125,7 +129,8 @@ def fault_plans(rack: RackUnderTest, counts: Mapping[str, int], seed: str, locks
 
 def kill_plans(rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int) -> Iterator[Plan]:
     """Yield plans of kills from outside, `count` in all, in these modes by turns, numbered from `first`."""
-    rng, gap = Random(f"{seed} kills"), KILL_GAP_S * rack.second
+    rng = Random(f"{seed} kills")
+    gap = KILL_GAP_S * rack.second
     a_run = max(1, int((rack.last() - rack.first()) / gap))
     for place, done in enumerate(range(0, count, a_run)):
         kills = []
@@ -161,10 +166,12 @@ def _packed(
     rack: RackUnderTest, first: int, lockstep: bool, purpose: Purpose, cards: Sequence[Card], rng: Random
 ) -> list[Plan]:
     """Return plans with all of these faults, as many in each as fit into the task."""
-    plans, waiting = list[Plan](), list(cards)
+    plans = list[Plan]()
+    waiting = list(cards)
     while waiting:
         chosen = _chosen(rack, waiting)
-        faults, kills = list[dict[str, Any]](), list[Kill]()
+        faults = list[dict[str, Any]]()
+        kills = list[Kill]()
         for card, start in zip(chosen, _starts(rack, [card.window for card in chosen], rng), strict=True):
             if card.target.kind == EXTERNAL:
                 kills.append(Kill(card.target.board, start, card.phase))
@@ -179,9 +186,11 @@ def _chosen(rack: RackUnderTest, waiting: list[Card]) -> list[Card]:
     if not waiting[0].target.record.recoverable:
         return [waiting.pop(0)]
     chosen: list[Card] = []
-    free, busy = rack.last() - rack.first(), set[str]()
+    free = rack.last() - rack.first()
+    busy = set[str]()
     for card in waiting[:AHEAD]:
-        target, is_first = card.target, not chosen
+        target = card.target
+        is_first = not chosen
         is_reported = target.mailbox is None or target.mailbox not in busy
         fits = card.window <= free and is_reported and target.record.recoverable and len(chosen) < MOST_FAULTS
         if is_first or fits:
@@ -198,7 +207,8 @@ def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[in
     free = max(0, rack.last() - rack.first() - sum(windows))
     cuts = sorted(rng.randint(0, free) for _ in windows)
     gaps = [later - earlier for earlier, later in pairwise([0, *cuts])]
-    starts, at = [], rack.first()
+    starts = []
+    at = rack.first()
     for gap, window in zip(gaps, windows, strict=True):
         starts.append(at + gap)
         at += gap + window

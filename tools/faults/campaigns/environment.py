@@ -96,14 +96,16 @@ def examine(config: RackConfig) -> None:
         if not isfinite(limit):
             continue
         arm = SimulatedArm(cell, config.scene, config.clock_ns)
-        data, state = cell.start(), Message(ARM_STATE.dtype(sizes(cell)))
+        data = cell.start()
+        state = Message(ARM_STATE.dtype(sizes(cell)))
         arm.save(state)
         data.qvel[dof] = FACTOR * limit
         mujoco.mj_getState(cell.model, data, state.state, STATE)
         arm.restore(state)
         arm.step(1)
         if not arm.violations:
-            name, speed = config.robot.joints[joint], f"{FACTOR * limit:g} rad/s"
+            name = config.robot.joints[joint]
+            speed = f"{FACTOR * limit:g} rad/s"
             raise Failure(f"violation counter: joint '{name}' at {speed}, twice its limit, is not counted")
 
 
@@ -134,7 +136,8 @@ def load() -> Iterator[str]:
 
 def main() -> None:
     """Run a part of the load until the parent ends."""
-    parent, what = int(sys.argv[1]), sys.argv[2]
+    parent = int(sys.argv[1])
+    what = sys.argv[2]
     die_with_parent(parent)
     if what == "stress-ng":
         os.execvp(what, sys.argv[2:])

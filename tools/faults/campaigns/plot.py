@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 Report = dict[str, Any]
 SIZE_IN = (13.0, 8.0)
-DOT, MIDDLE, BOUND = "#4477aa", "#222222", "#cc3311"
+DOT = "#4477aa"
+MIDDLE = "#222222"
+BOUND = "#cc3311"
 """Colours that people with any kind of colour vision can distinguish (Paul Tol's)."""
 WIDEST = 1.5
 """Part of a bound up to which delays are drawn; later ones are arrows at the edge."""
@@ -54,8 +56,10 @@ def _delays(axes: Axes, report: Report) -> None:
         axes.scatter([WIDEST] * len(late), [row] * len(late), marker=">", s=40, color=BOUND, clip_on=False)
         if parts:
             axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
-        place, frame = (1.02, row), ("axes fraction", "data")
-        figures, cycles = report["by_kind"][kind], report["by_kind"][kind]["cycles"]
+        place = (1.02, row)
+        frame = ("axes fraction", "data")
+        figures = report["by_kind"][kind]
+        cycles = report["by_kind"][kind]["cycles"]
         numbers = f"{figures['detected']} of {figures['injected']}"
         numbers += "" if cycles is None else f"; {cycles['median']:.3g}, {cycles['max']:.3g}"
         axes.annotate(numbers, place, xycoords=frame, fontsize=8, va="center")
@@ -84,12 +88,14 @@ def _part(fault: Report) -> float | None:
 
 def _sizes(axes: Axes, report: Report) -> None:
     """Draw the size of a sensor's error against the time to its detection."""
-    edge, clock_ms = axes.get_xaxis_transform(), report["clock_ms"]
+    edge = axes.get_xaxis_transform()
+    clock_ms = report["clock_ms"]
     longest = 10 * clock_ms
     for (kind, found), marker in zip(report["sizes"].items(), "os", strict=False):
         seen = [point for point in found["curve"] if point["delay_ms"] is not None]
         unseen = [point["size"] for point in found["curve"] if point["delay_ms"] is None]
-        sizes, delays = [point["size"] for point in seen], [point["delay_ms"] for point in seen]
+        sizes = [point["size"] for point in seen]
+        delays = [point["delay_ms"] for point in seen]
         longest = max([longest, *delays])
         (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
         axes.plot(unseen, [1.0] * len(unseen), "x", color=line.get_color(), transform=edge, clip_on=False)

@@ -28,7 +28,9 @@ ENDS = {"tasks_done": "task done", "safely_stopped": "safely stopped", "not_arme
 
 def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
     """Return all results of a campaign as plain data; `shortfalls` is empty when nothing falls short."""
-    order, clock_ns, run = campaign.order, campaign.layout.clock_ns, results.nominal
+    order = campaign.order
+    clock_ns = campaign.layout.clock_ns
+    run = results.nominal
     kinds = by_kind(results.faults, clock_ns)
     for kind, figures in kinds.items():
         with_it = [one for one in results.trials if any(f.kind == kind and f.struck >= 0 for f in one.faults)]
@@ -60,7 +62,8 @@ def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
 
 
 def _figures(results: Results, second: float) -> Report:
-    trials, runs = results.trials, results.runs
+    trials = results.trials
+    runs = results.runs
     ended = Counter[str](run.ended for run in trials)
     calm_s = sum(part.seconds for part in results.faultless)
     trips = sum(part.trips for part in results.faultless)

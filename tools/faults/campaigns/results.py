@@ -47,7 +47,8 @@ class Judged:
     @property
     def ended(self) -> Ended:
         """How the task ended; safely: with the arm at rest and no limit violated."""
-        trial, outcome = self.trial, self.trial.outcome
+        trial = self.trial
+        outcome = self.trial.outcome
         if trial.refused:
             return "not armed" if self.is_to_be_refused else "neither"
         if outcome is None or outcome.cause == "stopped":
@@ -82,14 +83,16 @@ class Judged:
         return any(f.is_latched for f in faults) or (self.trial.is_late and any(f.reactions for f in faults))
 
     def _why_neither(self) -> str:
-        trial, outcome = self.trial, self.trial.outcome
+        trial = self.trial
+        outcome = self.trial.outcome
         if trial.refused or outcome is None:
             return trial.refused or f"it does not end; {trial.levels}"
         return "; ".join(filter(None, [outcome.cause, *outcome.faults, trial.levels]))
 
     def result(self) -> TrialResult:
         """Return the part of the trial that is kept."""
-        trial, outcome = self.trial, self.trial.outcome
+        trial = self.trial
+        outcome = self.trial.outcome
         return TrialResult(
             plan=trial.plan,
             ended=self.ended,
@@ -109,7 +112,8 @@ class Judged:
 
     def document(self) -> dict[str, Any]:
         """Return the trial as plain data, with all that happened in it."""
-        trial, outcome = self.trial, self.trial.outcome
+        trial = self.trial
+        outcome = self.trial.outcome
         return {
             "finding": asdict(self.result()),
             "outcome": asdict(outcome) if outcome else None,

@@ -30,7 +30,8 @@ def wilson(count: int, of: int) -> tuple[float, float] | None:
     """Return the bounds of Wilson's 95 % interval of a share; None where `of` is 0."""
     if not of:
         return None
-    share, z2 = count / of, Z95**2
+    share = count / of
+    z2 = Z95**2
     middle = (share + z2 / (2 * of)) / (1 + z2 / of)
     half = Z95 / (1 + z2 / of) * sqrt(share * (1 - share) / of + z2 / (4 * of * of))
     return max(0.0, round(middle - half, 6)), min(1.0, round(middle + half, 6))
@@ -43,7 +44,8 @@ def rate(count: int, seconds: float) -> Figures | None:
     """
     if seconds <= 0.0:
         return None
-    low, high = float(count), count + 10.0 + 5.0 * sqrt(count)
+    low = float(count)
+    high = count + 10.0 + 5.0 * sqrt(count)
     for _ in range(60):
         middle = 0.5 * (low + high)
         chance = sum(exp(k * log(middle) - middle - lgamma(k + 1)) for k in range(count + 1)) if middle else 1.0

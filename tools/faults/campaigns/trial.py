@@ -23,7 +23,8 @@ from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import ArmEnd, Killed, Strike, arm_of, is_late, levels_of, strikes
 
-MAX_LENGTH, GRACE_S = 4, 60.0
+MAX_LENGTH = 4
+GRACE_S = 60.0
 """A run with faults is stopped after this multiple of a faultless run's length, and this simulated time more."""
 NOMINAL_S = 1800.0
 """Simulated time of a run whose length is unknown."""
@@ -45,7 +46,8 @@ class Killer:
     """Kills boards of one rack by SIGKILL, at their instants, without the fault table. `done` are the kills so far."""
 
     def __init__(self, segment: Segment, kills: Sequence[Kill]) -> None:
-        self._segment, self._words = segment, segment.words
+        self._segment = segment
+        self._words = segment.words
         self._waiting = list(kills)
         self._retry_at = 0.0
         self.done: list[Killed] = []
@@ -72,13 +74,15 @@ class Killer:
 
     def _await_phase(self) -> None:
         # In lockstep the phase only spreads kills over what boards do in their ticks.
-        kill, period = self._waiting[0], self._words[System.PERIOD_NS]
+        kill = self._waiting[0]
+        period = self._words[System.PERIOD_NS]
         lockstep = self._words[System.LOCKSTEP]
         until = time.monotonic_ns() + round(kill.phase * period) if lockstep else self._instant_ns()
         time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)
 
     def _instant_ns(self) -> int:
-        kill, words = self._waiting[0], self._words
+        kill = self._waiting[0]
+        words = self._words
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
 
     def _kill(self, board: str) -> bool:
@@ -91,7 +95,8 @@ class Killer:
             try:
                 # The number may have become another process's between the two looks.
                 if (pid, True) == self._process(board) and is_alive(pid, started):
-                    tick, now = self._words[System.TICK], time.monotonic_ns()
+                    tick = self._words[System.TICK]
+                    now = time.monotonic_ns()
                     signal.pidfd_send_signal(descriptor, signal.SIGKILL)
                     self.done.append(Killed(board, tick, now))
                     return True
@@ -139,17 +144,23 @@ def run_trial(config: RackConfig, plan: Plan, rack_name: str, ticks: int, second
     `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task ends. Raises
     `ConfigError` for a plan that does not fit the config.
     """
-    before, started = children(), time.monotonic()
+    before = children()
+    started = time.monotonic()
     rack = Rack(plan.config(config, rack_name))
-    refused, levels, late, arm = "", "", False, ArmEnd()
+    refused = ""
+    levels = ""
+    late = False
+    arm = ArmEnd()
     found: tuple[Strike, ...] = ()
     try:
         with rack:
             killer = Killer(rack.segment, plan.kills)
             _watch(rack, killer, ticks, seconds)
             joints = config.robot.joints if config.robot is not None else ()
-            found, arm = strikes(rack.segment, joints, killer.done), arm_of(rack.segment)
-            levels, late = levels_of(rack.segment), is_late(rack.segment)
+            found = strikes(rack.segment, joints, killer.done)
+            arm = arm_of(rack.segment)
+            levels = levels_of(rack.segment)
+            late = is_late(rack.segment)
     except ConfigError:
         raise
     except (BackplaneError, BoardError) as error:
@@ -188,14 +199,18 @@ def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> Non
     words = rack.segment.words
     most_s = NOMINAL_S if not ticks else GRACE_S
     most_ticks = MAX_LENGTH * ticks + max(most_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
-    seen, deadline, stopped = -1, 0.0, False
+    seen = -1
+    deadline = 0.0
+    stopped = False
     while rack.watch(killer.due_in_s()):
         killer.advance()
         if not stopped and (tick := words[System.TICK]) != seen:
-            seen, deadline = tick, time.monotonic() + STILL_S
+            seen = tick
+            deadline = time.monotonic() + STILL_S
         if not stopped and (why := _why_stop(seen > most_ticks, deadline)):
             rack.stop(why)
-            stopped, deadline = True, time.monotonic() + STUCK_S
+            stopped = True
+            deadline = time.monotonic() + STUCK_S
         elif stopped and time.monotonic() > deadline:
             return
 

@@ -62,7 +62,8 @@ class Workers:
         Trials that are `alone` have the machine for themselves. Others get one core each: boards that share a core hand
         messages to each other sooner.
         """
-        waiting, busy = list(jobs), dict[Any, TrialJob]()
+        waiting = list(jobs)
+        busy = dict[Any, TrialJob]()
         most = 1 if alone else len(self._cores)
         while (waiting or busy) and not INTERRUPT.number:
             for place, line in enumerate(self._some(min(most, len(waiting) + len(busy)))):
@@ -113,7 +114,8 @@ class Workers:
 def main() -> None:
     """Make the trials that come over a line, one after the other."""
     INTERRUPT.catch()
-    line, parent = Connection(int(sys.argv[1])), int(sys.argv[2])
+    line = Connection(int(sys.argv[1]))
+    parent = int(sys.argv[2])
     die_with_parent(parent)
     with suppress(EOFError):
         config = line.recv()

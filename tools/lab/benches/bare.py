@@ -68,7 +68,9 @@ class PostReader:
     """One reader of a mailbox."""
 
     def __init__(self, post: Post) -> None:
-        self._post, self._serial, self._message = post, 0, Message(post.dtype)
+        self._post = post
+        self._serial = 0
+        self._message = Message(post.dtype)
         self._readings = {verdict: Reading(self._message, verdict) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading:

@@ -43,7 +43,8 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
 
     `against` is another checkout, which runs the same in lockstep. Raises `Failure` if it cannot.
     """
-    absent, cores = absent_cyclictest(), tuple(sorted(os.sched_getaffinity(0)))
+    absent = absent_cyclictest()
+    cores = tuple(sorted(os.sched_getaffinity(0)))
     peers = () if absent else cores
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-bench-")))
@@ -79,7 +80,8 @@ class _ChainRuns:
     def __init__(
         self, chain: Chain, runs: Runs, peers: tuple[int, ...], configs: list[tuple[RackCommand, Path]]
     ) -> None:
-        self.chain, self._settings = chain, runs
+        self.chain = chain
+        self._settings = runs
         self._grid = WakeGrid(peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY)
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []
@@ -121,7 +123,8 @@ class _ChainRuns:
     def figures(self) -> ChainFigures:
         """Return the figures of all runs; the response in lockstep is that of one more."""
         lockstep = self._observe(self.chain._replace(mode="lockstep"))
-        names, late = self.chain.names, np.concatenate(self._late) if self._late else None
+        names = self.chain.names
+        late = np.concatenate(self._late) if self._late else None
         counts = [run.cycles(name) for run in self._runs for name in names]
         rows = [np.concatenate([run.traces[name] for run in self._runs]) for name in names]
         return ChainFigures(

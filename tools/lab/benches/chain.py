@@ -13,7 +13,8 @@ from rack.boards.config.toml import to_toml
 
 LONGEST = LAST_SLOT - CLOCK_SLOT
 """Boards that a crate takes."""
-CLOCK_PRIORITY, PRIORITY = 90, 80
+CLOCK_PRIORITY = 90
+PRIORITY = 80
 """SCHED_FIFO priorities, as in the bundled configs."""
 MODULE = "rack.tools.lab.benches.relay"
 
@@ -47,7 +48,8 @@ class Chain(NamedTuple):
     def _boards(self, module: str, cores: Sequence[int]) -> Iterator[tuple[str, dict[str, Any]]]:
         before = None
         for number, name in enumerate(self.names):
-            slot, core = CLOCK_SLOT + 1 + number, cores[-1 - number % len(cores)]
+            slot = CLOCK_SLOT + 1 + number
+            core = cores[-1 - number % len(cores)]
             board: dict[str, Any] = {"slot": slot, "core": core, "every": 1, "priority": PRIORITY}
             if before is None:
                 yield name, board | {"executor": f"{module}:Sender"}

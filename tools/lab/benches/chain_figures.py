@@ -15,7 +15,10 @@ from rack.tools.lab.benches.comparison import Absent
 from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond
 
 RATE_HZ = 400
-RACK, OTHER, PEER, SPREAD = "#4477aa", "#ee6677", "#222222", "#bbccdd"
+RACK = "#4477aa"
+OTHER = "#ee6677"
+PEER = "#222222"
+SPREAD = "#bbccdd"
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,8 @@ class ChainFigures(MissesBeyond):
     @property
     def exact(self) -> bool:
         """Whether every message took one cycle a board: in lockstep always, in real time if no cycle was missed."""
-        took, least = {*self.responses}, self.boards
+        took = {*self.responses}
+        least = self.boards
         return {*self.lockstep_responses} == {least} and (min(took) >= least if self.missed else took == {least})
 
 

@@ -41,7 +41,8 @@ Contestants = dict[str, Callable[[WakeGrid], np.ndarray]]
 def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Comparison:
     """Return the lateness of every contestant at each rate, us."""
     contestants, absent = _contestants(runs.share)
-    core, is_fifo = max(os.sched_getaffinity(0)), permits_fifo()
+    core = max(os.sched_getaffinity(0))
+    is_fifo = permits_fifo()
     cost_s = (runs.seconds + LAUNCH_S) * runs.rounds * len(contestants)
     progress.total(cost_s * len(rates_hz))
     samples = []

@@ -31,7 +31,9 @@ ROW_IN = 0.34
 """Height of a contestant's row."""
 WIDE = 15.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
-MEDIAN, BASELINE, SPREAD = "#4477aa", "#222222", "#bbccdd"
+MEDIAN = "#4477aa"
+BASELINE = "#222222"
+SPREAD = "#bbccdd"
 """Colours that people with any kind of colour vision can distinguish (after Paul Tol's)."""
 KEY = "dot: median (ratio to the black one of the case); line: best to p99"
 _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
@@ -181,7 +183,8 @@ class Comparison:
 
     def plot(self, folder: Path) -> list[Path]:
         """Write the comparison as PNG and SVG, a panel a case, into `folder`; return their paths."""
-        cases, who = self.cases, self.contestants
+        cases = self.cases
+        who = self.contestants
         columns = min(COLUMNS, len(cases))
         rows = -(-len(cases) // columns)
         paths = paths_of(folder / self.name)
@@ -204,7 +207,8 @@ class Comparison:
         own = [sample for sample in self.samples if sample.case == case]
         alike = [sample for sample in self.samples if sample.unit == own[0].unit]
         # A best of 0 has no place on a logarithmic axis.
-        low, high = min(sample.best or sample.median for sample in alike), max(sample.p99 for sample in alike)
+        low = min(sample.best or sample.median for sample in alike)
+        high = max(sample.p99 for sample in alike)
         for sample in own:
             row = self.contestants.index(sample.who)
             is_baseline = self.baselines.get(case) == sample.who

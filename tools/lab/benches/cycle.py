@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 PARTS = ("wake", "read", "process", "write", "bookkeeping")
 """Parts of a cycle, in the order of time; where a trace does not separate the last one, it is in the first."""
 COLOURS = ("#bbbbbb", "#88ccee", "#ddcc77", "#44aa99", "#aa4499")
-PHYSICS, HATCH = "#882255", "////"
+PHYSICS = "#882255"
+HATCH = "////"
 STEADY_TICKS = 40
 """Ticks at the start that are not judged: a new process touches its memory for the first time."""
 EMPTY = "empty"
@@ -46,7 +47,8 @@ BOUND_S = 120.0
 """Longest time for a run, in addition to ten times its simulated time."""
 REPLAYED_TICKS = 1000
 """Ticks of one replay of physics, at most."""
-ROW, PACED = "mj_step, tick after tick", "mj_step, at the servo's rate"
+ROW = "mj_step, tick after tick"
+PACED = "mj_step, at the servo's rate"
 SHARE = f"{EMPTY}, lockstep, wall-clock time of a tick, a board"
 
 
@@ -198,7 +200,9 @@ class CycleRuns:
 
     def __init__(self, seconds: float, folder: Path, share: bool) -> None:
         self.found = Found(defaultdict(list), defaultdict(list), defaultdict(list))
-        self._seconds, self._folder, self._share = seconds, folder, share
+        self._seconds = seconds
+        self._folder = folder
+        self._share = share
         self._runs = 0
         config = load("nasrem")
         servo = wire(config).task(SERVO)
@@ -286,11 +290,13 @@ def _medians(traces: Iterable[Trace]) -> dict[str, float]:
 
 def parts_of(trace: Trace) -> dict[str, np.ndarray]:
     """Return the processor time of each part of each cycle but the first, us, shape (n - 1,)."""
-    rows, units = trace.rows, trace.units[1:]
+    rows = trace.rows
+    units = trace.units[1:]
     exchange, read, process, write = units.T
     beyond = rows["processor_ns"][1:] - units.sum(axis=1)
     # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it is written.
-    closing, gap = rows["closed_ns"][1:] - rows["end_ns"][:-1], rows["start_ns"][1:] - rows["closed_ns"][1:]
+    closing = rows["closed_ns"][1:] - rows["end_ns"][:-1]
+    gap = rows["start_ns"][1:] - rows["closed_ns"][1:]
     # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the next start is known.
     closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
     closing[rows["closed_ns"][1:] == 0] = 0

@@ -62,7 +62,8 @@ def exchange_times(recording: Recording) -> list[ExchangeTimes]:
 
 
 def _all_times(recording: Recording) -> Iterator[ExchangeTimes]:
-    layout, boards = recording.layout, dict[int, BoardInterrupts]()
+    layout = recording.layout
+    boards = dict[int, BoardInterrupts]()
     tasks = {task.name: task for task in layout.tasks}
     for box in layout.timed:
         if box.protocol == "queue" or is_position(box) or box.writer == CLOCK:
@@ -77,9 +78,11 @@ def _all_times(recording: Recording) -> Iterator[ExchangeTimes]:
 
 
 def _times(recording: Recording, box: MailboxSpec, reader: str, board: BoardInterrupts | None) -> ExchangeTimes:
-    clock_ns, serials = recording.layout.clock_ns, recording.signal(box.name, "serial")
+    clock_ns = recording.layout.clock_ns
+    serials = recording.signal(box.name, "serial")
     found = _arrivals(recording, box, reader, board)
-    cycles, reads = recording.trace(reader)["tick"], found.reads
+    cycles = recording.trace(reader)["tick"]
+    reads = found.reads
     newest = newest_visible(reads, found.seen_from)
     known = newest >= 0
     read = np.unique(newest[known])
@@ -100,20 +103,23 @@ def _times(recording: Recording, box: MailboxSpec, reader: str, board: BoardInte
 
 def _arrivals(recording: Recording, box: MailboxSpec, reader: str, board: BoardInterrupts | None) -> _Arrivals:
     """Return the arrivals of a mailbox at a reader, and when that reads, by its protocol."""
-    layout, rows = recording.layout, recording.trace(reader)
+    layout = recording.layout
+    rows = recording.trace(reader)
     released, visible_at = (recording.signal(box.name, name).astype(np.int64) for name in ("tick", "visible_at"))
     grid = layout.read_grid(box, reader)
     # Between two reads the message of the last one stays.
     reads = rows["tick"] - (rows["tick"] - grid.phase) % grid.every
     if board is not None and box.name in board.mailboxes:
         delivered = board.mailboxes[box.name]
-        served, ends = delivered.is_served, delivered.end_ns[delivered.is_served]
+        served = delivered.is_served
+        ends = delivered.end_ns[delivered.is_served]
         return _Arrivals(released[served], ends, ends, reads * layout.clock_ns)
     is_early = any(exchange.task == reader and exchange.asynchronous for exchange in box.exchanges)
     if box.is_by_ticks and not is_early:
         return _Arrivals(released, visible_at * layout.clock_ns, visible_at, reads)
     # Visible as soon as they are whole: by the wall clock, which in lockstep orders them but says nothing of evenness.
-    stamps, is_lockstep = recording.signal(box.name, "stamp_ns"), recording.rack_config.clock.mode == "lockstep"
+    stamps = recording.signal(box.name, "stamp_ns")
+    is_lockstep = recording.rack_config.clock.mode == "lockstep"
     at_ns = released * layout.clock_ns if is_lockstep else np.rint(stamps * recording.rack_config.clock.speed)
     own = f"{recording.layout.task(reader).board}.plan" == box.name
     cycles = np.maximum(np.searchsorted(rows["tick"], reads, side="right") - 1, 0)

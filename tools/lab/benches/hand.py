@@ -77,15 +77,19 @@ def shift_mm(recording: Recording) -> tuple[float, float] | None:
 
     None if it is not held in all that time.
     """
-    config, clock_s = recording.rack_config, recording.layout.clock_ns * 1e-9
-    pulls, ending = config.scene.push, next(name for name, board in config.board.items() if board.ends_run)
-    begin, end = min(pull.at for pull in pulls), max(pull.at + pull.seconds for pull in pulls) + SETTLED_S
+    config = recording.rack_config
+    clock_s = recording.layout.clock_ns * 1e-9
+    pulls = config.scene.push
+    ending = next(name for name, board in config.board.items() if board.ends_run)
+    begin = min(pull.at for pull in pulls)
+    end = max(pull.at + pull.seconds for pull in pulls) + SETTLED_S
     held = recording.signal(f"{ending}.status", "kind") == GraspKind.HOLD
     times = recording.signal(f"{ending}.status", "tick") * clock_s
     if not held[(times >= begin) & (times <= end)].all() or times[-1] < end:
         return None
     scene = next(box.name for box in recording.layout.mailboxes if box.message == "scene")
-    times, row = recording.signal(scene, "tick") * clock_s, config.scene.objects.index(pulls[0].body)
+    times = recording.signal(scene, "tick") * clock_s
+    row = config.scene.objects.index(pulls[0].body)
     place = recording.signal(scene, "position")[:, row]
     before = place[times < begin][-1]
     away = 1e3 * np.sqrt(((place[(times >= begin) & (times <= end)] - before) ** 2).sum(axis=1))
@@ -97,7 +101,8 @@ def _costs_ms(recording: Recording) -> tuple[float, float, float]:
 
     They are ms in a second of simulated time.
     """
-    found, layout = cycles_of(recording), recording.layout
+    found = cycles_of(recording)
+    layout = recording.layout
     exchanged = sum(float(cycles.communication_ns.sum()) for cycles in found.values())
     processed = sum(float(cycles.process_ns.sum()) for cycles in found.values())
     service_ns = {box.name: box.interrupt.service_ns for box in layout.mailboxes if box.interrupt is not None}

@@ -18,7 +18,8 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.comparison import Sample
 
-DETECTED, SAFE = "detected", "brakes engaged"
+DETECTED = "detected"
+SAFE = "brakes engaged"
 SETTLE_S = 1.0
 """Time between kills, after which the arm moves again."""
 PHASES_S = 0.1
@@ -35,7 +36,8 @@ class Killing:
     """
 
     def __init__(self, name: str, kills: int, progress: Progress) -> None:
-        self._kills, self._progress = kills, progress
+        self._kills = kills
+        self._progress = progress
         config = load(name, [f"name=bench-kill-{os.getpid()}", "supervision.restarts=10000"])
         servo = min(config.board, key=config.every)
         above = config.board[servo].above
@@ -82,7 +84,8 @@ class Killing:
         """Kill a board and wait until it is back; return the times of the reactions, s."""
         seen.clear()
         block = rack.segment.block(board)
-        killed_ns, offset_ns = time.monotonic_ns(), time.time_ns() - time.monotonic_ns()
+        killed_ns = time.monotonic_ns()
+        offset_ns = time.time_ns() - time.monotonic_ns()
         tick = rack.segment.words[System.TICK]
         os.kill(block[Block.PID], signal.SIGKILL)
 
@@ -93,7 +96,8 @@ class Killing:
             return bool(first("died") and first("brakes_closed")) and block[Block.STATE] == TaskState.RUNNING
 
         _watch(rack, REACT_S, is_over)
-        died, braked = first("died"), first("brakes_closed")
+        died = first("died")
+        braked = first("brakes_closed")
         if died is None or braked is None:
             raise Failure(f"'{board}' was killed: no reaction within {REACT_S:g} s")
         return {

@@ -31,7 +31,8 @@ DEATHS = 4
 """Cables pulled, and processes killed, of one contestant in one round, at most."""
 LAUNCH_S = 0.7
 """About how long the two processes of a machine take to start."""
-DISTURBED_HZ, ENDLESS = 10.0, 1_000_000
+DISTURBED_HZ = 10.0
+ENDLESS = 1_000_000
 """Rate of the exchange meanwhile, and a number of cycles that nobody waits for."""
 WITHOUT_LIVELINESS = ("UDP",)
 PACKAGES = ((TLS, "cryptography"), (TLS, "zenoh"), (TCP, "zenoh"), ("cyclonedds", "cyclonedds"))
@@ -106,12 +107,15 @@ class LanBench:
     def _exchange(self, group: Group) -> None:
         """Measure ages, and bytes on the wire."""
         steady = self._steady.setdefault(group.who, Steadiness())
-        start_s, idle_from = time.monotonic(), _wire_bytes(group.lab)
+        start_s = time.monotonic()
+        idle_from = _wire_bytes(group.lab)
         group.idle(IDLE_S)
         idle = (_wire_bytes(group.lab) - idle_from) / (time.monotonic() - start_s)
         self._note(Point("on the wire", group.racks, 0.0, group.who, "kB/s"), [idle * 1e-3])
         for rate_hz in self._runs.rates_hz:
-            before, before_s, cycles = _wire_bytes(group.lab), time.monotonic(), self._cycles(rate_hz)
+            before = _wire_bytes(group.lab)
+            before_s = time.monotonic()
+            cycles = self._cycles(rate_hz)
             found = group.run(rate_hz, cycles)
             # A window is idle before its first cycle and after its last one.
             sent = _wire_bytes(group.lab) - before - idle * (time.monotonic() - before_s)

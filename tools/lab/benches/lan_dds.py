@@ -73,7 +73,9 @@ class _Events(Listener):
 
     def __init__(self, other: int, notice: Notice, take: Take | None) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self._other, self._notice, self._take = other, notice, take
+        self._other = other
+        self._notice = notice
+        self._take = take
         self._was_there = False
 
     def on_data_available(self, reader: DataReader[Any]) -> None:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 COORDINATOR = 0
-ORDER_BYTES, STATUS_BYTES = 1024, 256
+ORDER_BYTES = 1024
+STATUS_BYTES = 256
 PORT = 7447
 LEASE_MS = 200
 UNREAD = 32

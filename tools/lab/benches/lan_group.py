@@ -32,7 +32,9 @@ class Group:
     """
 
     def __init__(self, lab: Lab, who: str, echoes: bool, priority: int) -> None:
-        self.lab, self.who, self.racks = lab, who, len(lab) - 1
+        self.lab = lab
+        self.who = who
+        self.racks = len(lab) - 1
         addresses = tuple(lab.address(machine) for machine in range(len(lab)))
         self._folder = TemporaryDirectory(prefix="rack-bench-")
         certificates = self._certificates(addresses) if who == TLS else ""
@@ -151,7 +153,8 @@ class _Member:
 
     def _documents(self, bound_s: float) -> Iterator[dict[str, Any]]:
         assert self.process.stdout is not None
-        out, deadline = self.process.stdout.fileno(), time.monotonic() + bound_s
+        out = self.process.stdout.fileno()
+        deadline = time.monotonic() + bound_s
         while True:
             line, newline, rest = self._unread.partition(b"\n")
             if newline:

@@ -20,7 +20,8 @@ from typing import Any
 from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.tools.lab.benches.lan_ends import COORDINATOR, ORDER_BYTES, STATUS_BYTES, End, LanPlace
 
-TLS, TCP = "rack, TLS", "rack, TCP"
+TLS = "rack, TLS"
+TCP = "rack, TCP"
 ENDS = {
     TLS: "rack.tools.lab.benches.lan_link:RackEnd",
     TCP: "rack.tools.lab.benches.lan_link:RackEnd",
@@ -74,7 +75,8 @@ class Machine:
     """The process of one machine."""
 
     def __init__(self, task: LanTask) -> None:
-        self._place, self._echoes = task.place, task.echoes
+        self._place = task.place
+        self._echoes = task.echoes
         self._seen: set[int] = set()
         self._all_there, self._answered = threading.Event(), threading.Event()
         self._awaited = 0

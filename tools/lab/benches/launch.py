@@ -26,8 +26,10 @@ BOUND_S = 60.0
 """Longest time that a command may take."""
 RUN_S = 0.25
 """Simulated time of a run of which only the beginning counts."""
-LAUNCH, INTERPRETER = "launch", "python, numpy"
-ROUND_S, KILL_S = 8.0, 2.5
+LAUNCH = "launch"
+INTERPRETER = "python, numpy"
+ROUND_S = 8.0
+KILL_S = 2.5
 """Expected time of a round of launches and commands, and of a kill."""
 
 Key = tuple[str, str]

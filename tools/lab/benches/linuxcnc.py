@@ -25,10 +25,12 @@ from rack.tools.lab.benches.comparison import Absent, absent_program
 from rack.tools.lab.benches.cyclictest import WakeGrid
 
 LINUXCNC = "LinuxCNC thread"
-PACKAGE, PROGRAM = "linuxcnc-uspace", "halrun"
+PACKAGE = "linuxcnc-uspace"
+PROGRAM = "halrun"
 THREAD = "rtapi_app:T#0"
 """Name that LinuxCNC gives to its first realtime thread."""
-START_S, END_S = 10.0, 5.0
+START_S = 10.0
+END_S = 5.0
 SETUP = """\
 loadrt threads name1=grid period1={period_ns} fp1=0
 loadrt timedelta count=1
@@ -79,7 +81,8 @@ def lateness_us(intervals_ns: np.ndarray, period_ns: int) -> np.ndarray:
 @contextmanager
 def _hal(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """Give a LinuxCNC that takes HAL commands on stdin; nothing of it is left when the context ends."""
-    pipe, environment = subprocess.PIPE, _environment(folder)
+    pipe = subprocess.PIPE
+    environment = _environment(folder)
     hal = subprocess.Popen(
         [PROGRAM], cwd=folder, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True
     )
@@ -90,7 +93,8 @@ def _hal(folder: Path) -> Iterator[subprocess.Popen[str]]:
             os.killpg(hal.pid, signal.SIGKILL)
             hal.wait()
             # Its realtime process is a daemon: it outlives its command line, and keeps the pipes open.
-            end, none = [PROGRAM, "-U"], subprocess.DEVNULL
+            end = [PROGRAM, "-U"]
+            none = subprocess.DEVNULL
             subprocess.run(end, cwd=folder, env=environment, stdout=none, stderr=none, timeout=END_S, check=False)
         for stream in (hal.stdin, hal.stdout, hal.stderr):
             if stream is not None:

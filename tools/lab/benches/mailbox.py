@@ -106,7 +106,9 @@ class Exchange:
     """One message after another through a transport. Raises `Failure` if a reader receives another message."""
 
     def __init__(self, name: str, transport: Transport, lengths: dict[str, int]) -> None:
-        self._name, self._transport, self._tick = name, transport, 0
+        self._name = name
+        self._transport = transport
+        self._tick = 0
         message, _, _ = transport
         for name, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
             setattr(message, name, np.linspace(-9.0, 9.0, lengths[length]))
@@ -161,7 +163,8 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
 
 
 def _reading(reader: Reader) -> Callable[[int], Message]:
-    read, delay = reader.read, reader.spec.delay
+    read = reader.read
+    delay = reader.spec.delay
 
     def take(tick: int) -> Message:
         return read(tick + delay).value

@@ -190,7 +190,8 @@ def _remove(names: Sequence[str]) -> None:
 def _end(names: Sequence[str]) -> None:
     """End the processes in namespaces: those that started others first, which end these in order."""
     for how, patience_s in ENDING:
-        deadline, struck = time.monotonic() + patience_s, set[int]()
+        deadline = time.monotonic() + patience_s
+        struck = set[int]()
         while (inside := _inside(names)) and time.monotonic() < deadline:
             roots = {pid for pid, parent in inside.items() if how is signal.SIGKILL or parent not in inside}
             for pid in roots - struck:
@@ -202,7 +203,8 @@ def _end(names: Sequence[str]) -> None:
 
 def _inside(names: Sequence[str]) -> dict[int, int]:
     """Return the processes in namespaces, each with its parent."""
-    spaces, found = set(), {}
+    spaces = set()
+    found = {}
     for name in names:
         try:
             spaces.add((NAMESPACES / name).stat().st_ino)

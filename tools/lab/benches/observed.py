@@ -92,7 +92,8 @@ class Observed:
 
         Its record may be written after the last reading.
         """
-        rows, last = self.traces[task], self.outcome.ticks - 1
+        rows = self.traces[task]
+        last = self.outcome.ticks - 1
         spec = self.layout.task(task)
         due = max(0, -(-(last - spec.phase) // spec.every)) - self.lost[task]
         in_time = np.count_nonzero((rows["tick"] < last) & ~is_missed(rows))
@@ -111,7 +112,8 @@ def observe(
     `deeds` are in the order of their ticks. `share` is as in `Rack`, which raises if another rack holds a core.
     """
     with Rack(config, share=share) as rack:
-        segment, ahead = rack.segment, list(deeds)
+        segment = rack.segment
+        ahead = list(deeds)
         tasks = [task.name for task in segment.layout.tasks]
         rings: dict[str, Ring] = {name: trace_ring(segment, name) for name in tasks}
         rings |= {name: MailboxRing(segment, name) for name in mailboxes}
@@ -130,7 +132,8 @@ def observe(
         rows = {name: np.concatenate([block.rows for block in blocks]) for name, blocks in drained.items()}
         lost = {name: sum(block.lost for block in drained[name]) for name in tasks}
         layout = segment.layout
-    traces, messages = {name: rows[name] for name in tasks}, {name: rows[name] for name in mailboxes}
+    traces = {name: rows[name] for name in tasks}
+    messages = {name: rows[name] for name in mailboxes}
     return Observed(traces, lost, messages, layout, rack.outcome)
 
 

@@ -127,7 +127,8 @@ def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]
 
 def _level(board: str, layout: Layout, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> LevelFigures:
     tasks = {task.name: task for task in layout.tasks}
-    planner, plan = tasks.get(f"{board}.planner"), f"{board}.plan"
+    planner = tasks.get(f"{board}.planner")
+    plan = f"{board}.plan"
     ages = [_ages_ms(board, plan, layout, run) for run in runs if plan in run.mailboxes]
     return LevelFigures(
         level=board,
@@ -138,7 +139,8 @@ def _level(board: str, layout: Layout, responses: Mapping[str, int | None], runs
 
 
 def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarray:
-    made, visible_at = run.signal(plan, "tick"), run.signal(plan, "visible_at")
+    made = run.signal(plan, "tick")
+    visible_at = run.signal(plan, "visible_at")
     return plan_ages(run.cycles[board]["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
 
 

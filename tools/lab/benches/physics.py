@@ -56,7 +56,8 @@ class Replay:
         assert config.robot is not None, "the rack has an arm"
         cell = build_cell(config.robot, config.scene, config.clock_ns)
         first, last = _stretch(recording)
-        status, state = f"{SERVO}.status", f"{SERVO}.state"
+        status = f"{SERVO}.status"
+        state = f"{SERVO}.state"
         ticks = recording.signal(status, "tick")
         given = (ticks >= first) & (ticks < last)
         controls = np.zeros((last - first, cell.model.nu))
@@ -72,7 +73,8 @@ class Replay:
 
         Raises `Failure` if the whole stretch is replayed and does not end as recorded.
         """
-        model, data = self.cell.model, mujoco.MjData(self.cell.model)
+        model = self.cell.model
+        data = mujoco.MjData(self.cell.model)
         mujoco.mj_setState(model, data, self.start, STATE)
         found: list[float] = []
         with _scheduled(pace):
@@ -109,9 +111,12 @@ def replay(folder: Path, pace: ReplayPace, ticks: int) -> list[float]:
 def _stretch(recording: Recording) -> tuple[int, int]:
     """Return first and last tick of the longest stretch without brakes; states are recorded at both."""
     status = f"{SERVO}.status"
-    ticks, braked = recording.signal(status, "tick"), recording.signal(status, "braked")
+    ticks = recording.signal(status, "tick")
+    braked = recording.signal(status, "braked")
     known = set(recording.signal(f"{SERVO}.state", "tick").tolist())
-    best, begun, ended = (0, 0), -1, -1
+    best = (0, 0)
+    begun = -1
+    ended = -1
     for tick, is_braked in zip(ticks.tolist(), braked.tolist(), strict=True):
         if is_braked or (begun >= 0 and tick != ended + 1 and tick != begun):
             begun = -1

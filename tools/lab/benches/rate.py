@@ -39,7 +39,8 @@ RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
 STEP_MS = 0.5
 """Longest time step of the simulated arm, that of the bundled racks."""
 LAUNCH_S = 3.0
-RACK, PEER = "#4477aa", "#222222"
+RACK = "#4477aa"
+PEER = "#222222"
 Late = np.ndarray | None
 
 
@@ -178,7 +179,8 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     config = load(name, [f"name=bench-{os.getpid()}"])
     racks = {rate_hz: at_rate(config, rate_hz) for rate_hz in sorted(rates_hz)}
     board = next(name for name in config.board if config.every(name) == 1)
-    core, absent = obtained_core(config.board[board].core), absent_cyclictest()
+    core = obtained_core(config.board[board].core)
+    absent = absent_cyclictest()
     each_s = runs.rounds * (2 * runs.seconds + LAUNCH_S)
     progress.total(len(racks) * each_s)
     figures = []

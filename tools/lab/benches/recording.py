@@ -73,7 +73,8 @@ def measure(name: str) -> list[RecordingCost]:
                 with _recorder(rack, phase, Path(folder) / f"{phase}-{turn}") as pid:
                     _watch(rack, SETTLE_S)
                     _drained(rings)
-                    used_ns, began_ns = _processor_ns(pid), time.monotonic_ns()
+                    used_ns = _processor_ns(pid)
+                    began_ns = time.monotonic_ns()
                     readings = [_reading(rack, rings) for _ in range(round(PHASE_S))]
                     share = 100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
                     found[phase].append(_Sample(readings, share))
@@ -101,7 +102,8 @@ def _recorder(rack: Rack, phase: str, folder: Path) -> Iterator[int | None]:
         yield None
         return
     folder.mkdir()
-    recorder, port = RecorderProcess(), free_port() if phase == PHASES[2] else None
+    recorder = RecorderProcess()
+    port = free_port() if phase == PHASES[2] else None
     window = None
     try:
         if not recorder.attach(rack.config.name, folder, port):

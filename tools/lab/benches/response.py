@@ -105,7 +105,10 @@ class ResponseRuns:
     """Runs racks of one config until enough responses are measured. Raises `Failure` if none can be."""
 
     def __init__(self, name: str, mode: str, seed: int, progress: Progress) -> None:
-        self._name, self._mode, self._seed, self._progress = name, mode, seed, progress
+        self._name = name
+        self._mode = mode
+        self._seed = seed
+        self._progress = progress
         self._config = load(name, [f"name=response-{os.getpid()}", f"clock.mode={mode}"])
         layout = wire(self._config)
         self._paths = command_paths(rack_timing(self._config, layout), layout)
@@ -177,7 +180,8 @@ def draw(paths: Mapping[str, CommandPath], clock_ns: int, random: Random, most: 
     tick, end, pause = (round(seconds * 1e9 / clock_ns) for seconds in (LEAD_S, RUN_S, PAUSE_S))
     while True:
         for level in random.sample(list(paths), len(paths)):
-            at, longest = tick + random.randint(1, pause), paths[level].longest
+            at = tick + random.randint(1, pause)
+            longest = paths[level].longest
             again = at + longest + random.randint(1, pause)
             if again + longest >= end or len(drawn) + 2 > most:
                 return drawn

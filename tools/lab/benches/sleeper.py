@@ -43,7 +43,9 @@ def _sleep(parent: int, grid: WakeGrid, late_ns: Any) -> None:
     pin(grid.cores[0])
     set_priority(grid.priority)
     lock_memory()
-    period, monotonic_ns, sleep = grid.period_ns, time.monotonic_ns, time.sleep
+    period = grid.period_ns
+    monotonic_ns = time.monotonic_ns
+    sleep = time.sleep
     epoch = monotonic_ns() + HEAD_START_NS
     at = 0
     while at < grid.wakes:

@@ -29,8 +29,10 @@ from rack.tools.console.answer import Failure
 PAPER_US = 100.0
 """Task switch on NIST's boards (NISTIR 90-4251, section 4)."""
 WAKES = 1000
-PERIOD_S, HEAD_START_S = 0.002, 0.0005
-EXECUTOR, PLANNER = 80, 1
+PERIOD_S = 0.002
+HEAD_START_S = 0.0005
+EXECUTOR = 80
+PLANNER = 1
 """SCHED_FIFO priorities: no task under ordinary scheduling runs between the two."""
 PATIENCE_NS = 20_000_000
 READY_S = 20.0
@@ -101,7 +103,8 @@ def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _execute(wake: str, shared: _Shared) -> None:
     """Wake up and wait again: an executor with nothing to do."""
-    semaphore, awake = _begin(wake, shared, 0, EXECUTOR), shared.awake
+    semaphore = _begin(wake, shared, 0, EXECUTOR)
+    awake = shared.awake
     for at in range(WAKES):
         semaphore.acquire()
         awake[2 * at] = monotonic_ns()
@@ -110,11 +113,15 @@ def _execute(wake: str, shared: _Shared) -> None:
 
 def _plan(work: str, shared: _Shared) -> None:
     """Compute when there is work, until the executor has interrupted; keep the longest gap."""
-    semaphore, gaps, awake = _begin(work, shared, 1, PLANNER), shared.gaps, shared.awake
+    semaphore = _begin(work, shared, 1, PLANNER)
+    gaps = shared.gaps
+    awake = shared.awake
     for at in range(WAKES):
         semaphore.acquire()
         begin = last = monotonic_ns()
-        longest, over, seen = 0, 2 * at + 1, 0
+        longest = 0
+        over = 2 * at + 1
+        seen = 0
         while not seen and last - begin < PATIENCE_NS:
             # Read before the clock: wherever in this loop the executor interrupts, the next clock value shows it.
             seen = awake[over]
@@ -183,6 +190,7 @@ def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
     found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
     if not found.any():
         raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
-    into, back = (awake - gaps)[found, 0] * 1e-3, (gaps - awake)[found, 1] * 1e-3
+    into = (awake - gaps)[found, 0] * 1e-3
+    back = (gaps - awake)[found, 1] * 1e-3
     in_us, out_us, switch_us = (distribution(times) or {} for times in (into, back, (into + back) / 2))
     return SwitchCost(core, int(found.sum()), in_us, out_us, switch_us)

@@ -50,7 +50,8 @@ class Peer(NamedTuple):
 @contextmanager
 def raw_copy(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Copy bytes into shared memory and out again: no serial, no check, no readers in step with the writer."""
-    shared, message = mmap.mmap(-1, dtype.itemsize), Message(dtype)
+    shared = mmap.mmap(-1, dtype.itemsize)
+    message = Message(dtype)
     with memoryview(shared) as view:
 
         def send(tick: int) -> None:
@@ -70,7 +71,8 @@ def iceoryx2_publish_subscribe(dtype: np.dtype, readers: int) -> Iterator[Transp
         payload = _structure(dtype)
         name = iceoryx2.ServiceName.new(KEY)
         service = node.service_builder(name).publish_subscribe(payload).max_subscribers(readers).create()
-        publisher, own = service.publisher_builder().create(), payload.from_buffer(message.raw)
+        publisher = service.publisher_builder().create()
+        own = payload.from_buffer(message.raw)
         subscribers = [service.subscriber_builder().create() for _ in range(readers)]
         # The first message connects them, by name.
         publisher.send_copy(own)
@@ -80,7 +82,8 @@ def iceoryx2_publish_subscribe(dtype: np.dtype, readers: int) -> Iterator[Transp
     def taker(subscriber: Any) -> Callable[[int], Message]:
         received = Message(dtype)
         place = ctypes.addressof(ctypes.c_char.from_buffer(received.raw))
-        size, receive = dtype.itemsize, subscriber.receive
+        size = dtype.itemsize
+        receive = subscriber.receive
 
         def take(tick: int) -> Message:
             ctypes.memmove(place, receive().payload_ptr, size)
@@ -96,10 +99,12 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Update an entry of an iceoryx2 blackboard; every reader copies its newest value."""
     message = Message(dtype)
     with _iceoryx2_names() as (iceoryx2, node):
-        payload, key = _structure(dtype), ctypes.c_uint64(0)
+        payload = _structure(dtype)
+        key = ctypes.c_uint64(0)
         creator = node.service_builder(iceoryx2.ServiceName.new(KEY)).blackboard_creator(ctypes.c_uint64)
         service = creator.add(key, payload()).max_readers(readers).create()
-        writer, own = service.writer_builder().create(), payload.from_buffer(message.raw)
+        writer = service.writer_builder().create()
+        own = payload.from_buffer(message.raw)
         entry = writer.entry(key, payload)
         entries = [service.reader_builder().create().entry(key, payload) for _ in range(readers)]
 
@@ -118,7 +123,8 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 @contextmanager
 def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Send bytes through a pipe to every reader."""
-    message, pipes = Message(dtype), [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
+    message = Message(dtype)
+    pipes = [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
 
     def send(tick: int) -> None:
         for _, entrance in pipes:
@@ -173,7 +179,8 @@ def zenoh_sessions(dtype: np.dtype, readers: int) -> Iterator[Transport]:
             place = f"unixsock-stream/{folder}/zenoh"
             session = stack.enter_context(_zenoh(listen=place, connect=""))
             others = [stack.enter_context(_zenoh(listen="", connect=place)) for _ in range(readers)]
-        publisher, subscribers = _publisher(session), _subscribers(others)
+        publisher = _publisher(session)
+        subscribers = _subscribers(others)
         _await(session, others)
         yield _zenoh_transport(publisher, dtype, subscribers)
 

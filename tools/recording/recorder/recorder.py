@@ -89,7 +89,8 @@ class SafeSink:
 
     def _hand_over(self) -> None:
         """Make the calls that waited for the sink; there are none to make of one that has failed."""
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         for call in waiting:
             if (sink := self._sink) is not None:
                 self._guarded(partial(call, sink))
@@ -117,8 +118,10 @@ class Recorder:
         self, segment: Segment, folder: Path, view: Sink | None = None, refresh: Callable[[], object] | None = None
     ) -> None:
         layout = segment.layout
-        self._view, self._refresh = view, refresh
-        self._segment, self._words = segment, segment.words
+        self._view = view
+        self._refresh = refresh
+        self._segment = segment
+        self._words = segment.words
         # The spool first: it fails where another recorder is running, and leaves that one's files alone.
         self._spool = Spool(folder, layout, segment.launch)
         self._files = RunFiles(folder, layout, segment.launch)

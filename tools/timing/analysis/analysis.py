@@ -76,13 +76,15 @@ class Analysis:
         cls, recording: Recording, percentile: float = WORST, progress: Callable[[float], None] = lambda part: None
     ) -> Analysis:
         """Analyze a recorded run; `progress` takes the part done. Raises `Failure` for an empty or old trace."""
-        config, layout = recording.rack_config, recording.layout
+        config = recording.rack_config
+        layout = recording.layout
         cycles = cycles_of(recording)
         if not cycles:
             raise Failure(f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2)
         progress(0.4)
         predicted = rack_timing(config, layout)
-        loads, response = core_loads(recording, cycles, predicted), system_response(recording)
+        loads = core_loads(recording, cycles, predicted)
+        response = system_response(recording)
 
         def measured(percent: float) -> RackTiming:
             return rack_timing(config, layout, without_interrupts(predicted, budgets_of(cycles, percent)))
@@ -142,10 +144,13 @@ def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[Eq
     for found, way in product((response, *response["others"]), ("command", "status")):
         if (times := found[way]["measured_ms"]) is None:
             continue
-        bound, limit = found["bound_eq_3_2_ms"] * wall_ns, "n R_max"
+        bound = found["bound_eq_3_2_ms"] * wall_ns
+        limit = "n R_max"
         if rack.response_goal_ns is not None:
-            bound, limit = rack.response_goal_ns / rack.speed, "timing.response_ms"
-        longest_ns, bound_ns = times["max"] * wall_ns, found[way]["bound_ms"] * wall_ns
+            bound = rack.response_goal_ns / rack.speed
+            limit = "timing.response_ms"
+        longest_ns = times["max"] * wall_ns
+        bound_ns = found[way]["bound_ms"] * wall_ns
         meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
         yield EquationVerdict.of("3.2", found["subject"], Relation(longest_ns, "<=", bound), meaning)
         meaning = f"R_s of a {way} <= sum of R_i and of the waits for the grid"

@@ -88,7 +88,8 @@ def breaches(found: Mapping[str, Cycles], rack: RackTiming) -> list[Breach]:
 
 def _breaches_of(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Breach]:
     cycles = found[name]
-    count, rules = len(cycles.rows), rules_for(name, found, rack)
+    count = len(cycles.rows)
+    rules = rules_for(name, found, rack)
     if not rules:
         return
     fails = np.array([~np.broadcast_to(rule.relation.holds, count) for rule in rules])
@@ -134,7 +135,8 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
     """Return the use of the core in the cycles of a task at the places `at`, shape (n,)."""
     cycles = found[name]
     rows = cycles.rows[at]
-    starts, ends = _due_ns(cycles, rack)[at], rows["end_ns"]
+    starts = _due_ns(cycles, rack)[at]
+    ends = rows["end_ns"]
     others = {other: rival for other, rival in found.items() if other != name and rival.core == cycles.core}
     # By their priorities, these can have had the core while this task wanted it.
     rivals = {o: Occupation.of(rival.rows) for o, rival in others.items() if rival.priority >= cycles.priority}
@@ -146,7 +148,8 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
     # A release may come while the cycle before it is still running.
     begins = np.maximum(starts, rows["start_ns"] - cycles.overhead_ns)
     kept[BEFORE] = before = Occupation.of(cycles.rows).within(starts, begins)
-    lasted, own = ends - starts, cycles.used_ns[at]
+    lasted = ends - starts
+    own = cycles.used_ns[at]
     # Ordinary scheduling divides a core among all that want it: others had no more than the rest.
     left = np.clip(lasted - own, 0, None)
     nobody = np.clip(left - together - before, 0, None)

@@ -26,7 +26,8 @@ UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "pla
 
 def document(analysis: Analysis) -> Document:
     """Return everything as plain data; infinite numbers are null."""
-    recording, config = analysis.recording, analysis.config
+    recording = analysis.recording
+    config = analysis.config
     return {
         "rack": config.name,
         "folder": str(recording.folder),
@@ -87,8 +88,10 @@ def _breach(breach: Breach, clock_ns: int) -> Document:
 
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:
     """Return the times of the judged cycles of one task, ms; lateness and response are None in lockstep."""
-    judged, is_lockstep = cycles.is_judged, rack.is_lockstep
-    rows, gaps = cycles.rows[judged], gaps_ns(cycles.rows[judged])
+    judged = cycles.is_judged
+    is_lockstep = rack.is_lockstep
+    rows = cycles.rows[judged]
+    gaps = gaps_ns(cycles.rows[judged])
     missed, skipped = counts(rows)
     return {
         "role": cycles.task.role,
@@ -145,7 +148,8 @@ def _clauses(analysis: Analysis, timing: LevelTiming) -> Iterator[str]:
 
 
 def _planner(timing: LevelTiming, switch_ns: int) -> str:
-    planning_ns, permitted = timing.planning_ns or 0, timing.within_cycles
+    planning_ns = timing.planning_ns or 0
+    permitted = timing.within_cycles
     if timing.coupling == "loose":
         needed: int | None = max(1, ceil(planning_ns / timing.cycle_ns))
         place = "on its own processor"

@@ -70,8 +70,10 @@ def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str
 
 def report_of(recording: Recording) -> Report:
     """Return the report of a recorded run as plain data."""
-    config, layout = recording.rack_config, recording.layout
-    ended, found = recording.ended, misses(recording)
+    config = recording.rack_config
+    layout = recording.layout
+    ended = recording.ended
+    found = misses(recording)
     last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
     report = _head(config, ended, last + 1)
     if not ended:
@@ -122,7 +124,8 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
 
 def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
     """Return the part that needs no recording; `ticks` is the length of a run whose end is not known."""
-    outcome, counters = ended.get("outcome", {}), ended.get("tasks", {}).values()
+    outcome = ended.get("outcome", {})
+    counters = ended.get("tasks", {}).values()
     return {
         "rack": config.name,
         "folder": None,
@@ -154,7 +157,8 @@ def _compared(recording: Recording, other: Recording, found: list[Report]) -> Re
 
 def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
     is_lockstep = config.clock.mode == "lockstep"
-    layout, cycles = recording.layout, recording.trace(task.name)
+    layout = recording.layout
+    cycles = recording.trace(task.name)
     entry: Report = {
         **_about(task, layout),
         **recording.ended.get("tasks", {}).get(task.name, {}),
@@ -162,7 +166,8 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
     }
     plan = f"{task.board}.plan"
     if task.role == "executor" and plan in recording.mailboxes:
-        made, visible_at = recording.signal(plan, "tick"), recording.signal(plan, "visible_at")
+        made = recording.signal(plan, "tick")
+        visible_at = recording.signal(plan, "visible_at")
         entry["plan_age_ms"] = distribution(plan_ages(cycles["tick"], made, visible_at) * (layout.clock_ns * 1e-6))
     return entry
 
@@ -203,7 +208,8 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
 
 def _entries(recording: Recording) -> list[Report]:
     """Return the entries of all bus adapters: their counts at the end, and the ages of what passed, ms."""
-    found, tick_ms = [], recording.layout.clock_ns * 1e-6
+    found = []
+    tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
             ages = recording.signal(mailbox, f"{entry}.age")
@@ -239,10 +245,12 @@ def _drops(recording: Recording, row: int) -> Iterator[Report]:
     mailbox = _mailbox_of(recording, SCENE.name)
     if mailbox is None:
         return
-    ticks, place = recording.signal(mailbox, "tick"), recording.signal(mailbox, "position")[:, row]
+    ticks = recording.signal(mailbox, "tick")
+    place = recording.signal(mailbox, "position")[:, row]
     # What moves and turns with the tool keeps its distance from it.
     away = np.linalg.norm(place - recording.signal(mailbox, "tool_position"), axis=1)
-    height, least = place[:, 2], FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
+    height = place[:, 2]
+    least = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
     falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(away))) > least)
     first = falling[np.diff(falling, prepend=-BOUNCE - 1) > BOUNCE]
     last = falling[np.diff(falling, append=len(ticks) + BOUNCE) > BOUNCE] + 1
@@ -283,7 +291,8 @@ def _hand(recording: Recording, config: RackConfig) -> Report | None:
     mailbox = _mailbox_of(recording, HAND_STATUS)
     if mailbox is None or config.robot is None or config.robot.hand is None:
         return None
-    tension, force = recording.signal(mailbox, "tension"), recording.signal(mailbox, "force")
+    tension = recording.signal(mailbox, "tension")
+    force = recording.signal(mailbox, "force")
     error = tension - recording.signal(mailbox, "wanted")
     most = np.linalg.norm(force, axis=2).max(axis=0)
     fingers = [finger.name for finger in config.robot.hand.finger]
@@ -300,7 +309,8 @@ def _hand(recording: Recording, config: RackConfig) -> Report | None:
 
 def _force(recording: Recording) -> Report | None:
     """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N, or None."""
-    wrench, status = _mailbox_of(recording, WRENCH), _mailbox_of(recording, FORCE_STATUS)
+    wrench = _mailbox_of(recording, WRENCH)
+    status = _mailbox_of(recording, FORCE_STATUS)
     if wrench is None:
         return None
     halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)

@@ -145,7 +145,8 @@ def _state_tables(levels: dict[str, list[Report]]) -> Iterator[str | Grid]:
     yield from ("", "## State tables", "")
     rows = []
     for level, fired in levels.items():
-        most, last = max(fired, key=lambda row: row["cycles"]), fired[-1]
+        most = max(fired, key=lambda row: row["cycles"])
+        last = fired[-1]
         tables = ", then ".join(dict.fromkeys(row["table"] for row in fired))
         count = [str(len(fired)), str(sum(row["cycles"] for row in fired))]
         ends = [f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, last)]
@@ -159,7 +160,9 @@ def _first(rows: Sequence[Any], which: str) -> str:
 
 def _machine(report: Report) -> Iterator[str]:
     """Yield what the machine did to its cores: when they were away, by whom if that is known; changes of frequency."""
-    steal, stalls, frequency = report["steal"], report["stalls"], report["frequency_mhz"] or {}
+    steal = report["steal"]
+    stalls = report["stalls"]
+    frequency = report["frequency_mhz"] or {}
     lost = f"of {stalls['lost']} lost cycles were due meanwhile"
     if steal["ms"]:
         cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
@@ -190,7 +193,9 @@ def _against(against: Report | None) -> Iterator[str]:
 
 
 def _faults(report: Report) -> Iterator[str | Grid]:
-    faults, unexplained, restarts = report["faults"], report["unexplained"], report["restarts"]
+    faults = report["faults"]
+    unexplained = report["unexplained"]
+    restarts = report["restarts"]
     if faults:
         yield from ("", f"## Faults: {len(faults)}", "")
         yield Grid(FAULTS, [_fault_row(fault) for fault in faults])
@@ -303,7 +308,8 @@ def _queues(queues: Sequence[Report]) -> Iterator[str]:
 
 def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
     for board in boards:
-        lost, latency = f", {board['lost']} lost" if board["lost"] else "", board["latency_us"]
+        lost = f", {board['lost']} lost" if board["lost"] else ""
+        latency = board["latency_us"]
         took = (
             f"; {latency['p50']:g} us from sending to the end of service, at most {latency['max']:g}" if latency else ""
         )

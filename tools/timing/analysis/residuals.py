@@ -21,8 +21,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN, ROW_IN, EDGES_IN = 9.0, 0.95, 1.6
-CYCLES, MEASURED, PREDICTED, END = "#88ccee", "#222222", "#117733", "#cc3311"
+WIDTH_IN = 9.0
+ROW_IN = 0.95
+EDGES_IN = 1.6
+CYCLES = "#88ccee"
+MEASURED = "#222222"
+PREDICTED = "#117733"
+END = "#cc3311"
 """Colours distinct to the colour-blind too (Paul Tol)."""
 BINS = 160
 MS = 1e-6
@@ -74,7 +79,8 @@ def _legend(figure: Figure, analysis: Analysis) -> None:
 
 def _span(analysis: Analysis, levels: list[str]) -> tuple[float, float]:
     parts = [analysis.cycles[name].used_ns / analysis.measured.levels[name].cycle_ns for name in levels]
-    least, most = min(float(each.min()) for each in parts), max(float(each.max()) for each in parts)
+    least = min(float(each.min()) for each in parts)
+    most = max(float(each.max()) for each in parts)
     return max(least, 1e-6) / 1.5, max(most, 1.0) * 1.5
 
 

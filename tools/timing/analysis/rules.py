@@ -45,8 +45,10 @@ def rules_for(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> list[
 
 def _executor_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Rule]:
     cycles = found[name]
-    board, period_ns = cycles.task.board, cycle_ns(rack, cycles.task)
-    execution, communication = cycles.process_ns, cycles.communication_ns
+    board = cycles.task.board
+    period_ns = cycle_ns(rack, cycles.task)
+    execution = cycles.process_ns
+    communication = cycles.communication_ns
     yield Rule("3.1", _put(fits_cycle, execution, communication, period_ns))
     yield Rule("3.4", _put(executes_in_time, execution, round(rack.longest_cycles[board] * rack.tick_ns)))
     yield Rule("3.6", _put(residual_is_left, period_ns - execution - communication))
@@ -62,7 +64,8 @@ def _executor_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) ->
 
 def _planner_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Rule]:
     cycles = found[name]
-    task, executor = cycles.task, found.get(cycles.task.board)
+    task = cycles.task
+    executor = found.get(cycles.task.board)
     if rack.boards[task.board].coupling != "tight":
         yield Rule(LOOSE_PLAN, _put(plan_fits_loose, cycles.used_ns, task.within_cycles, cycle_ns(rack, task)))
     elif executor is not None:

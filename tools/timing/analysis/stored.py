@@ -25,7 +25,8 @@ def stored_report(folder: Path) -> tuple[dict[str, Any], str] | None:
         newest_ns = max((folder / name).stat().st_mtime_ns for name in RECORDED)
         if (folder / SPOOL).exists() or made_ns <= max(newest_ns, *_changed_ns()):
             return None
-        data, text = (json.loads((folder / FILES[0]).read_bytes()), (folder / FILES[1]).read_text(encoding="utf-8"))
+        data = json.loads((folder / FILES[0]).read_bytes())
+        text = (folder / FILES[1]).read_text(encoding="utf-8")
     except (OSError, ValueError):
         return None
     # A comparison with another run is no report of this one, and the folder may have been moved.

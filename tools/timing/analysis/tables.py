@@ -55,7 +55,8 @@ def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
 
 
 def _head(analysis: Analysis) -> Iterator[str]:
-    config, pairs = analysis.config, [pair for pair in analysis.pairs if pair.measured is not None]
+    config = analysis.config
+    pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.fails]
     yield f"{config.name}: {len(pairs) - len(failing)} of {len(pairs)} equations held in {analysis.recording.folder}"
     if failing:
@@ -96,7 +97,9 @@ def _level_row(name: str, side: str, timing: LevelTiming) -> list[str]:
 
 def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
     found = task_document(cycles, analysis.predicted)
-    late, response, gap = found["lateness_ms"], found["response_ms"], found["largest_gap_ms"]
+    late = found["lateness_ms"]
+    response = found["response_ms"]
+    gap = found["largest_gap_ms"]
     return [
         name,
         *(str(found[key]) for key in ("cycles", "missed", "skipped")),
@@ -109,7 +112,8 @@ def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
 
 
 def _pair_row(pair: Pair) -> list[str]:
-    predicted, measured = pair.predicted, pair.measured
+    predicted = pair.predicted
+    measured = pair.measured
     verdict = measured or predicted
     return [
         pair.equation,
@@ -134,7 +138,8 @@ def _relation(relation: EquationVerdict | Broken) -> str:
 
 
 def _broken_cycles(analysis: Analysis) -> Iterator[str]:
-    judged, tick_s = analysis.judged_breaches, analysis.recording.layout.clock_ns * 1e-9
+    judged = analysis.judged_breaches
+    tick_s = analysis.recording.layout.clock_ns * 1e-9
     others = len(analysis.breaches) - len(judged)
     yield ""
     if not judged:

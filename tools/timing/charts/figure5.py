@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDTH = 84
-SHORTEST_S, LONGEST_S = 3e-5, 1e3
+SHORTEST_S = 3e-5
+LONGEST_S = 1e3
 """Range of the axis."""
 TICKS = {1e-4: "0.1 ms", 1e-3: "1 ms", 1e-2: "10 ms", 1e-1: "100 ms", 1.0: "1 s", 10.0: "10 s", 60.0: "1 min"}
 """Labels of the axis, s."""
@@ -67,7 +68,8 @@ def placed(config: RackConfig) -> list[Placed]:
     cycles = {name: config.every(name) * tick_s for name in config.board}
     found = []
     for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1]):
-        region, coupling = region_of(cycle_s), config.board[name].coupling
+        region = region_of(cycle_s)
+        coupling = config.board[name].coupling
         found.append(Placed(name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}"))
     return found
 
@@ -115,7 +117,8 @@ def duration(cycle_s: float) -> str:
 
 def save(config: RackConfig, stem: Path) -> list[Path]:
     """Draw the figure with the levels of a rack into `stem`.png and .svg; return their paths."""
-    levels, paths = together(placed(config)), paths_of(stem)
+    levels = together(placed(config))
+    paths = paths_of(stem)
     with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
         axes = figure.subplots()
         _draw_regions(axes)

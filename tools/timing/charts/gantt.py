@@ -87,7 +87,8 @@ def gantt_of(
 
     `process_ns` are times of X in a schedule, cycle by cycle, by board. `progress` takes the part of a run read so far.
     """
-    name, run = subject.config.name, subject.run
+    name = subject.config.name
+    run = subject.run
     schedule = Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
     if run is not None and not run.is_lockstep:
         task = options.task(run.tasks)

@@ -63,7 +63,8 @@ def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
 
 def _shares(span: Span, start_ns: int, column_ns: int) -> Iterator[tuple[int, int]]:
     """Yield each column that a span reaches, with the time it takes of it."""
-    first, last = (span.start_ns - start_ns) // column_ns, (span.end_ns - start_ns - 1) // column_ns
+    first = (span.start_ns - start_ns) // column_ns
+    last = (span.end_ns - start_ns - 1) // column_ns
     for at in range(first, last + 1):
         begin = start_ns + at * column_ns
         yield at, min(span.end_ns, begin + column_ns) - max(span.start_ns, begin)

@@ -78,7 +78,8 @@ class TracedRun:
     @cached_property
     def end_ns(self) -> int:
         """The end of the last cycle traced."""
-        traces, layout = self.recording.cycles.items(), self.recording.layout
+        traces = self.recording.cycles.items()
+        layout = self.recording.layout
         lasts = [int(rows["tick"][-1]) + layout.task(task).every for task, rows in traces if len(rows)]
         return max(lasts, default=0) * self._tick_ns
 
@@ -131,7 +132,8 @@ class _Traced:
 
     def jobs(self) -> Iterator[Job]:
         """Yield its jobs; a release that an executor skipped is a job that was never done."""
-        every, period = self.task.every_ns, self.task.period_ns
+        every = self.task.every_ns
+        period = self.task.period_ns
         left_out = skipped(self.rows) * (self.task.role == "executor")
         for release, count, end in zip(self._releases(), left_out.tolist(), self._at("end_ns"), strict=True):
             for missing in range(count, 0, -1):

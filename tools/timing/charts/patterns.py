@@ -151,7 +151,8 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
 def _by_cycle(spans: Sequence[Span], lane: Lane) -> dict[int, list[Span]]:
     """Return the spans of each cycle of a lane, with those that extend into it."""
     found: dict[int, list[Span]] = defaultdict(list)
-    first, cycle_ns = lane.phase_ns, lane.cycle_ns
+    first = lane.phase_ns
+    cycle_ns = lane.cycle_ns
     for span in spans:
         for cycle in range((span.start_ns - first) // cycle_ns, (span.end_ns - 1 - first) // cycle_ns + 1):
             found[cycle].append(span)
@@ -175,7 +176,8 @@ def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -
     stretches: list[tuple[Unit | None, int]] = []
     busy_until = within[0]
     for span in sorted(spans, key=lambda span: span.start_ns):
-        start, end = max(span.start_ns, within[0]), min(span.end_ns, within[1])
+        start = max(span.start_ns, within[0])
+        end = min(span.end_ns, within[1])
         if start - busy_until > detail.gap_ns:
             stretches.append((None, start - busy_until))
         if span.task in lane.tasks:

@@ -38,8 +38,13 @@ NAMES = {
     Unit.UPDATE: "U  update of the plan",
 }
 EDGE = 0.2
-LATE, GRID, FLOOR, FRAME = "#CC3311", "#555555", "#F3F3F3", "#999999"
-WIDTH_IN, LANE_IN, BAR = 10.0, 0.55, 0.66
+LATE = "#CC3311"
+GRID = "#555555"
+FLOOR = "#F3F3F3"
+FRAME = "#999999"
+WIDTH_IN = 10.0
+LANE_IN = 0.55
+BAR = 0.66
 LABELS = 16
 """Most numbers along the axis."""
 LETTER = 0.012
@@ -49,7 +54,8 @@ LETTER = 0.012
 def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return their paths."""
     lanes = [len(panel.lanes) for panel in panels]
-    height, paths = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2, paths_of(stem)
+    height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
+    paths = paths_of(stem)
     with picture(paths, WIDTH_IN, height, layout="constrained") as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=lanes)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
@@ -64,7 +70,8 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
 
 def _draw(axes: Axes, panel: Panel) -> None:
     """Draw one panel: the first lane on top."""
-    chart, count = panel.chart, len(panel.lanes)
+    chart = panel.chart
+    count = len(panel.lanes)
     for row, lane in enumerate(panel.lanes):
         _draw_lane(axes, panel, lane, count - 1 - row)
     if panel.frames:
@@ -85,8 +92,10 @@ def _draw(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
-    chart, low = panel.chart, at - BAR / 2
-    start, end = chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS
+    chart = panel.chart
+    low = at - BAR / 2
+    start = chart.start_ns / NS_PER_MS
+    end = chart.end_ns / NS_PER_MS
     axes.broken_barh([(start, end - start)], (low, BAR), facecolors=FLOOR)
     own = [span for span in chart.spans if span.task in lane.tasks]
     for unit in Unit:

@@ -65,7 +65,9 @@ class _System:
     """One rack, checked."""
 
     def __init__(self, name: str, runs: Runs, is_compared: bool) -> None:
-        self._name, self._runs, self._is_compared = name, runs, is_compared
+        self._name = name
+        self._runs = runs
+        self._is_compared = is_compared
         own = f"systems-{os.getpid()}"
         self._lockstep = load(name, [f"name={own}", "clock.mode=lockstep", "clock.speed=1.0"])
         self._config = load(name, [f"name={own}", "clock.mode=realtime", "clock.speed=1.0"])
@@ -96,7 +98,8 @@ class _System:
         progress.begin(f"{self._name}: killing each board")
         kills = kill_each(self._lockstep, self._layout, self._runs.share)
         progress.end(parts["killing each board"], kills.failure or kills.verdict)
-        poses, unmoved = None, ""
+        poses = None
+        unmoved = ""
         if self._poses is not None:
             progress.begin(f"{self._name}: three poses")
             try:
@@ -141,7 +144,8 @@ class _System:
 
     def _figures(self, run: RunResult, recording: Recording, late: float | None) -> RealTimeFigures:
         counts = [cycles_in(run, self._layout, name) for name in self._fastest]
-        cycles, response = cycles_of(recording), system_response(recording)
+        cycles = cycles_of(recording)
+        response = system_response(recording)
         return RealTimeFigures(
             missed=missed_share(counts),
             late=late,

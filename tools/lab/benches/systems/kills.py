@@ -16,7 +16,8 @@ from rack.boards.faults.kind import DIED
 from rack.tools.faults.ending import Strike, strikes
 from rack.tools.faults.evidence import is_about
 
-FIRST_S, BETWEEN_S = 1.0, 1.25
+FIRST_S = 1.0
+BETWEEN_S = 1.25
 """Simulated time of the first kill, and between two: a lost board is back after half a second."""
 LOOK_S = 0.05
 
@@ -71,7 +72,8 @@ def kill_each(config: RackConfig, layout: Layout, share: bool) -> KilledBoards:
             continue
         assert rack.outcome is not None, "the run is over"
         struck = [strike for strike in strikes(rack.segment, (), ()) if strike.kind == "kill" and strike.tick >= 0]
-        outcome, lasted_ns = rack.outcome, time.monotonic_ns() - began_ns
+        outcome = rack.outcome
+        lasted_ns = time.monotonic_ns() - began_ns
     return KilledBoards(
         detections=tuple(_detection(strike, seen, between) for strike in struck),
         tick_ms=config.clock_ns * 1e-6,

@@ -144,7 +144,8 @@ class PosesBench:
     def _figures(self, moved: _Moved, hold: Stop | None, emergency: Stop) -> PosesRun:
         moving = np.abs(moved.target_velocity).max(axis=1) > 0.0
         error = moved.position[moving] - moved.target[moving]
-        begins, rests = int(moved.tick[moving][0]), moved.rests_at()
+        begins = int(moved.tick[moving][0])
+        rests = moved.rests_at()
         second = self._layout.clock_ns * 1e-9
         still = moved.position[moved.speed <= REST_RAD_S]
         near = [np.abs(still - pose).max(axis=1).min() < NEAR_RAD for pose in three_poses()]

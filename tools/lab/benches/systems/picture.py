@@ -14,11 +14,17 @@ if TYPE_CHECKING:
     from rack.tools.lab.benches.systems.figures import SystemFigures
     from rack.tools.lab.benches.systems.motion import PosesRun
 
-BOUND, GRID, PEER = "#bbccdd", "#88aacc", "#222222"
-DOWN, UP, OPERATOR = "#4477aa", "#ee6677", "#ccbb44"
+BOUND = "#bbccdd"
+GRID = "#88aacc"
+PEER = "#222222"
+DOWN = "#4477aa"
+UP = "#ee6677"
+OPERATOR = "#ccbb44"
 LOWER = 0.14
 """Part of a row between marks of two kinds, and its middle."""
-WIDTH_IN, ROW_IN, FRAME_IN = 13.0, 0.34, 1.1
+WIDTH_IN = 13.0
+ROW_IN = 0.34
+FRAME_IN = 1.1
 WIDE = 300.0
 """Ratio of the ends of a logarithmic axis from which it shows powers of ten only."""
 
@@ -52,7 +58,8 @@ def plot(figures: Sequence[SystemFigures], folder: Path) -> list[Path]:
 
 def _responses(axes: Axes, figures: Sequence[SystemFigures]) -> None:
     """Draw the bounds of the response as bars, what was measured as marks."""
-    rows, ran = range(len(figures)), [one.realtime for one in figures]
+    rows = range(len(figures))
+    ran = [one.realtime for one in figures]
     axes.barh(rows, [one.predicted.bound_ms for one in figures], 0.6, color=BOUND, label="bound, eq. 3.2")
     axes.barh(rows, [one.command_bound_ms or 0.0 for one in ran], 0.3, color=GRID, label="on the grid, down")
     down = [None if one.command_ms is None else one.command_ms["max"] for one in ran]

@@ -35,7 +35,8 @@ class SystemPrediction:
 
 def prediction(config: RackConfig, timing: RackTiming, layout: Layout) -> SystemPrediction:
     """Return what a config promises."""
-    forecast, hierarchy = Forecast.of(timing), timing.hierarchy
+    forecast = Forecast.of(timing)
+    hierarchy = timing.hierarchy
     slots = {task.slot for task in layout.tasks}
     started = [host for host in config.host.values() if not host.external]
     rates = (1e9 / (every * timing.clock_ns) for every in hierarchy.cycles)

@@ -44,7 +44,8 @@ class PlanLatency:
 
 def cycles_in(run: RunResult, layout: Layout, board: str) -> CycleCount:
     """Count the cycles of a board in a run: those missed or skipped, and those due."""
-    counted, due = run.tasks[board], -(-run.outcome.ticks // layout.task(board).every)
+    counted = run.tasks[board]
+    due = -(-run.outcome.ticks // layout.task(board).every)
     return CycleCount(min(due, counted["missed"] + counted["skipped"]), due)
 
 
@@ -53,7 +54,8 @@ def bus_traffic(counts: Mapping[str, Mapping[str, int]], ticks: int, layout: Lay
     lasted_s = ticks * layout.clock_ns * 1e-9
     found: dict[str, BusTraffic] = {}
     for task in layout.tasks:
-        counted, before = counts[task.name], found.get(task.board, BusTraffic(0.0, 0.0))
+        counted = counts[task.name]
+        before = found.get(task.board, BusTraffic(0.0, 0.0))
         found[task.board] = BusTraffic(
             before.accesses + (counted["reads"] + counted["writes"]) / lasted_s,
             before.bytes + (counted["read_bytes"] + counted["write_bytes"]) / lasted_s,
@@ -82,7 +84,8 @@ def _of_planner(recording: Recording, planner: TaskSpec, cycles: Cycles | None) 
     box = f"{planner.board}.plan"
     if cycles is None or box not in recording.mailboxes:
         return None
-    made, visible_at = recording.signal(box, "tick"), recording.signal(box, "visible_at")
+    made = recording.signal(box, "tick")
+    visible_at = recording.signal(box, "visible_at")
     # A queue's plan is several messages: the release that made them counts once.
     made, first = np.unique(made, return_index=True)
     latency_ms = distribution((visible_at[first] - made) * recording.layout.clock_ns * 1e-6)
@@ -92,7 +95,8 @@ def _of_planner(recording: Recording, planner: TaskSpec, cycles: Cycles | None) 
 
 def _of_hosts(recording: Recording) -> Iterator[PlanLatency]:
     """Yield the time that orders of host boards took through a bridge: in its ring, then until levels see them."""
-    layout, tick_ms = recording.layout, recording.layout.clock_ns * 1e-6
+    layout = recording.layout
+    tick_ms = recording.layout.clock_ns * 1e-6
     hosts = {host.name for host in layout.hosts}
     for status, entry, source in entries_of(layout, recording.config):
         bridge = status.partition(".")[0]

@@ -100,7 +100,8 @@ def _answered(found: Systems, width: int | None) -> Iterator[str]:
     head += ["command age", "status age"]
     rows = []
     for one in found.figures:
-        said, ran = one.predicted, one.realtime
+        said = one.predicted
+        ran = one.realtime
         promised = (said.longest_cycle_ms, said.bound_ms, said.sum_ms, ran.command_bound_ms, said.status_ms)
         *cycles, down, up = ("-" if time is None or not said.levels else f"{time:g}" for time in promised)
         measured = (down, _span(ran.command_ms), up, _span(ran.status_ms))
@@ -115,7 +116,8 @@ def _stopped(found: Systems, width: int | None) -> Iterator[str]:
     head = ["rack", "hold at", "torque", "longest", "in motion at", "speed, rad/s", "rest", "emergency stop, rest"]
     rows = []
     for one in found.figures:
-        hold, run = one.realtime.hold, one.poses
+        hold = one.realtime.hold
+        run = one.poses
         row = [one.rack, *["-"] * 3]
         if hold is not None:
             took = hold.fate if hold.measured_ms is None else decimal(hold.measured_ms, 1)
@@ -167,7 +169,8 @@ def _late(found: Systems, width: int | None) -> Iterator[str]:
     head = ["rack", "fastest, Hz", "missed", "cyclictest", "beyond"]
     rows = []
     for one in found.figures:
-        ran, rates = one.realtime, one.predicted.rates_hz
+        ran = one.realtime
+        rates = one.predicted.rates_hz
         late = None if ran.late is None else 100 * ran.late
         shares = (decimal(part, 2) for part in (100 * ran.missed, late, 100 * ran.beyond))
         rows.append([one.rack, f"{max(rates):.4g}" if rates else "-", *shares])
@@ -225,7 +228,8 @@ def _notes(found: Systems) -> Iterator[str]:
     if found.absent is not None:
         yield f"{found.absent.line}; every miss counts against the rack"
     for one in found.figures:
-        commanded, hold = one.realtime.commanded, one.realtime.hold
+        commanded = one.realtime.commanded
+        hold = one.realtime.hold
         if commanded not in ("", *one.predicted.levels[:1]):
             queued = "the wait in the queue above it does not count as response"
             yield f"{one.rack}: down is measured from {commanded}: {queued}"

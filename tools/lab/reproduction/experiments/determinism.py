@@ -43,7 +43,8 @@ def _recorded(workshop: Workshop, label: str, mode: str) -> Recording:
 
 def _outcome(recording: Recording, reference: Recording | None) -> Document:
     """Return how a run ended, its first missed deadline, and where it diverges from the reference."""
-    ended, config = recording.ended, recording.rack_config
+    ended = recording.ended
+    config = recording.rack_config
     found = misses(recording)
     difference = None if reference is None else first_difference(recording, reference)
     return {

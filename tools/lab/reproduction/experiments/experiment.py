@@ -33,7 +33,9 @@ from rack.tools.lab.benches.cyclictest import permits_fifo
 from rack.tools.lab.benches.observed import record
 from rack.tools.recording.recording import Recording
 
-KEPT, RUNS, PICTURES = "parts", "runs", "pictures"
+KEPT = "parts"
+RUNS = "runs"
+PICTURES = "pictures"
 """In the folder: results of experiments, recordings of their runs, pictures."""
 PROGRAM = Path(__file__).resolve().parents[4]
 FLOORS = ("backplane", "levels", "boards", "tools", "configs")
@@ -52,7 +54,8 @@ class Workshop:
     """Where experiments work: the folder of the page. `share`: run on cores that another rack holds."""
 
     def __init__(self, folder: Path, share: bool) -> None:
-        self.folder, self.share = folder, share
+        self.folder = folder
+        self.share = share
 
     @property
     def rack(self) -> str:
@@ -135,11 +138,14 @@ def kept(experiment: Experiment, folder: Path) -> Kept | None:
 
 def made(experiment: Experiment, workshop: Workshop) -> Kept:
     """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
-    started, depends, lacking = time.monotonic(), experiment.depends(), ""
+    started = time.monotonic()
+    depends = experiment.depends()
+    lacking = ""
     try:
         found = experiment.make(workshop)
     except Lacking as reason:
-        found, lacking = {}, str(reason)
+        found = {}
+        lacking = str(reason)
     if INTERRUPT.number:
         # A signal ends a run in order, but before its time.
         INTERRUPT.end()

@@ -20,7 +20,8 @@ SECONDS = 3.0
 ATTEMPTS = 3
 """Most runs of a figure, until the cycles of its executor are in time."""
 LAUNCH_S = 2.5
-LEVEL, PLANNER = "level", "level.planner"
+LEVEL = "level"
+PLANNER = "level.planner"
 """Tasks of these racks."""
 COMMON = 4
 """Patterns of a lane that are kept, the most frequent ones."""
@@ -145,7 +146,8 @@ def planning(name: str, process_ms: float) -> Planning:
     level = rack.level(LEVEL)
     panel = Schedule(config, layout, {}).panel(0, level.cycle_ns)
     once_ns = level.cycle_ns if level.coupling == "loose" else level.residual_ns
-    each_ns, plan_ns = once_ns - level.update_ns, level.plan_ns or 0
+    each_ns = once_ns - level.update_ns
+    plan_ns = level.plan_ns or 0
     patterns = panel.patterns[LEVEL]
     return Planning(
         process_ms=process_ms,

@@ -20,7 +20,9 @@ LEVELS = 5
 """Levels of the pipeline: "it would take 5 control cycles"."""
 RATE_HZ = 400
 PIPELINE_S = 2.0
-COMMANDS, TWINS, SEED = 16, 1, 1
+COMMANDS = 16
+TWINS = 1
+SEED = 1
 PARTITION_S = 4.0
 LAUNCH_S = 3.0
 NAME = "nasrem"

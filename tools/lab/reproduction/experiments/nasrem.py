@@ -18,7 +18,8 @@ from rack.tools.timing.analysis.document import task_document
 
 NAME = "nasrem"
 LASTS_S = 34.0
-US, MS = 1e-3, 1e-6
+US = 1e-3
+MS = 1e-6
 PHASES = ("exchange", "read", "process", "write")
 """The stamped parts of an executor's cycle: C, R, X, W."""
 

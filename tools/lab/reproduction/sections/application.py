@@ -92,9 +92,11 @@ def _levels(workshop: Workshop) -> Side:
 
 
 def _levels_tested(findings: Findings) -> Assessment:
-    found, config = findings[NASREM.name], load(NAME)
+    found = findings[NASREM.name]
+    config = load(NAME)
     lasted_s = found["outcome"]["ticks"] * config.clock_ns * 1e-9
-    rows, off = [], []
+    rows = []
+    off = []
     for name, task in found["tasks"].items():
         if task["role"] != "executor":
             continue
@@ -160,7 +162,8 @@ def _switch_tested(findings: Findings) -> Assessment:
     side = Side.of(
         Columns(("us", "least", "median", "99th percentile", "longest"), rows, f"Of {found['wakes']} switches.")
     )
-    median, assumed = found["switch_us"]["p50"], 1e3 * load(NAME).timing.context_switch_ms
+    median = found["switch_us"]["p50"]
+    assumed = 1e3 * load(NAME).timing.context_switch_ms
     why = (
         f"NIST's 68020 boards cannot be measured any more. On this machine a switch takes {median:.0f} us, "
         f"{PAPER_US / median:.1f} times less than theirs; the 99th percentile, {found['switch_us']['p99']:.0f} us, "
@@ -184,7 +187,8 @@ def _figure5_tested(findings: Findings) -> Assessment:
     """Compare partitions: do slow levels do with multitasking, and do fast ones need more?"""
     found = findings[PARTITION.name]["partitions"]
     slow = {one.level for one in figure5.placed(load(NAME)) if figure5.region_of(one.cycle_s).name == "multitasking"}
-    rows, missed = [], {kind: [0, 0] for kind in ("slow", "fast", "apart")}
+    rows = []
+    missed = {kind: [0, 0] for kind in ("slow", "fast", "apart")}
     for partition in found:
         is_tight = partition["partition"].startswith("tight")
         for level in partition["levels"]:
@@ -221,7 +225,9 @@ def _figure5_tested(findings: Findings) -> Assessment:
 
 
 def _partition_row(partition: str, level: Document) -> tuple[str, ...]:
-    executor, planner, age = level["executor"], level["planner"], level["plan_age_ms"]
+    executor = level["executor"]
+    planner = level["planner"]
+    age = level["plan_age_ms"]
     fits = [task["fits"] for task in (executor, planner) if task is not None and task["fits"] is not None]
     return (
         partition,

@@ -98,7 +98,8 @@ def _compared(findings: Findings) -> Assessment:
 
 
 def _measured_row(one: SystemFigures) -> tuple[str, ...]:
-    ran, hold = one.realtime, one.realtime.hold
+    ran = one.realtime
+    hold = one.realtime.hold
     ticks = sorted(kill.neighbour for kill in one.kills.detections if kill.neighbour is not None)
     held = (
         "-"
@@ -115,7 +116,8 @@ def _longest(times: Distribution | None) -> str:
 
 def _is_beyond(one: SystemFigures) -> bool:
     """Return whether a response of the run was longer than predicted."""
-    ran, said = one.realtime, one.predicted
+    ran = one.realtime
+    said = one.predicted
     pairs = ((ran.command_ms, said.command_ms), (ran.status_ms, said.status_ms))
     return any(times is not None and times["max"] > bound + 1e-6 for times, bound in pairs) or bool(
         ran.hold and ran.hold.beyond

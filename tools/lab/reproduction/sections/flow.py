@@ -9,7 +9,11 @@ from html import escape
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.levels.timing.rack import RackTiming
 
-LEFT, WIDE, HIGH, GAP, TOP = 300, 420, 92, 84, 40
+LEFT = 300
+WIDE = 420
+HIGH = 92
+GAP = 84
+TOP = 40
 """Place and size of a level, and the distance to the next one."""
 SIDE = 250
 """Width of the boards next to the hierarchy."""
@@ -54,7 +58,8 @@ def flow_svg(rack: RackTiming, layout: Layout) -> str:
 
 def _levels(rack: RackTiming, layout: Layout, levels: Sequence[str]) -> Iterator[str]:
     for at, name in enumerate(levels):
-        board, y = rack.boards[name], TOP + at * (HIGH + GAP)
+        board = rack.boards[name]
+        y = TOP + at * (HIGH + GAP)
         rate = 1e9 / (board.every * rack.clock_ns)
         yield f'<rect class="box" x="{LEFT}" y="{y}" width="{WIDE}" height="{HIGH}" rx="6"/>'
         yield _text(LEFT + 12, y + 20, f"{name}, {rate:g} Hz", "name")
@@ -74,7 +79,8 @@ def _levels(rack: RackTiming, layout: Layout, levels: Sequence[str]) -> Iterator
 
 def _arrows(flow: Flow, y: int) -> Iterator[str]:
     """Yield the arrows from one level to the next, at the lower edge `y` of the upper one."""
-    down, up = LEFT + 250, LEFT + 382
+    down = LEFT + 250
+    up = LEFT + 382
     yield _line(down, y, down, y + GAP, "line", "d")
     yield _line(up, y + GAP, up, y, "line up", "u")
     for x, boxes, anchor in ((down - 10, flow.down, "end"), (up + 10, flow.up, "start")):

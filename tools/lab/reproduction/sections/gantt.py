@@ -22,7 +22,9 @@ from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listi
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 from rack.tools.timing.charts.letters import lines
 
-LEAST_X, MOST_X, NEWER_X = 1.0, 3.0, 4.0
+LEAST_X = 1.0
+MOST_X = 3.0
+NEWER_X = 4.0
 """The paper's X, ms: "will range from 1 to 3 ms", and the newer version's."""
 STEP_X = 0.5
 LEAST_P = 3.0
@@ -36,20 +38,21 @@ MOSTLY = 0.5
 """Part of the cycles, or plans, late from which on a run is said to fail: the figures fail in all, or in none."""
 PAPER_X = [LEAST_X + STEP_X * k for k in range(round((MOST_X - LEAST_X) / STEP_X) + 1)]
 
-FIG2, FIG3, FIG4 = FigureRack("fig2", 2), FigureRack("fig3", 3), FigureRack("fig4", 2)
+FIG2 = FigureRack("fig2", 2)
+FIG3 = FigureRack("fig3", 3)
+FIG4 = FigureRack("fig4", 2)
 OVERLOAD = FigureRack("fig4-overload", 3)
-SHORT_2, LONG_2, SHORT_3 = (
-    FigureRack("fig2", 2, LEAST_X),
-    FigureRack("fig2", 3, MOST_X),
-    FigureRack("fig3", 3, LEAST_X),
-)
+SHORT_2 = FigureRack("fig2", 2, LEAST_X)
+LONG_2 = FigureRack("fig2", 3, MOST_X)
+SHORT_3 = FigureRack("fig3", 3, LEAST_X)
 
 
 def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:
     """Return a figure as the paper draws it, as a picture and as letters."""
     from rack.tools.timing.charts.picture import save
 
-    panel, config = figure.panel(), figure.loaded()
+    panel = figure.panel()
+    config = figure.loaded()
     paths = save([panel], f"{figure.label}: the schedule of its budget", workshop.picture(figure.label))
     caption = f"The schedule computed from the budget of {code(figure.label)}, drawn as in the paper."
     letters = "\n".join(lines(panel, column_ns(config, figure.window_ns(config))))
@@ -181,9 +184,13 @@ def _sweep_side(workshop: Workshop) -> Side:
     """Compute both readings of the pattern for every X, and the largest X that each permits."""
     rows = sweep(FIG2.config, PAPER_X)
     config = FIG2.loaded()
-    cycle_ms, budget = config.every(LEVEL) * config.clock_ns * MS, budget_of(config)
-    fixed_ms, work_ms = budget.read_ms + budget.write_ms, budget.plan_ms + budget.update_ms
-    worst, less, slow = rows[-1], [one for one in rows if one.each_ms < LEAST_P], [one for one in rows if _is_slow(one)]
+    cycle_ms = config.every(LEVEL) * config.clock_ns * MS
+    budget = budget_of(config)
+    fixed_ms = budget.read_ms + budget.write_ms
+    work_ms = budget.plan_ms + budget.update_ms
+    worst = rows[-1]
+    less = [one for one in rows if one.each_ms < LEAST_P]
+    slow = [one for one in rows if _is_slow(one)]
     most_each = cycle_ms - fixed_ms - budget.update_ms - LEAST_P
     most_once = cycle_ms - fixed_ms - work_ms / worst.permitted
     literal = (
@@ -245,7 +252,8 @@ def _fig3_side(workshop: Workshop) -> Side:
 
 
 def _fig3_tested(findings: Findings) -> Assessment:
-    own, short = _judged(FIG3, False, findings), findings[SHORT_3.label]
+    own = _judged(FIG3, False, findings)
+    short = findings[SHORT_3.label]
     works = [one for one in sweep(FIG3.config, PAPER_X) if not _is_slow(one)]
     measured = Side.of(*own.measured.items, *ran(SHORT_3, short).items)
     if own.ruling is Ruling.FAILS or not works:

@@ -59,7 +59,8 @@ def _flow_tested(findings: Findings) -> Assessment:
     config = load(NAME)
     levels = rack_timing(config, wire(config)).hierarchy.chains[0]
     boxes = {box["mailbox"]: box for box in found["mailboxes"]}
-    rows, short = [], []
+    rows = []
+    short = []
     for upper, lower in pairwise(levels):
         flow = between(wire(config), upper, lower)
         for way, found_boxes in (("down", flow.down), ("up", flow.up)):
@@ -131,7 +132,8 @@ def _loop_tested(findings: Findings) -> Assessment:
 
 
 def _both(workshop: Workshop) -> Side:
-    config, apart = FIG2.loaded(), FIG4.loaded()
+    config = FIG2.loaded()
+    apart = FIG4.loaded()
     plan = (budget_of(config).plan_ms, config.every(LEVEL) * config.clock_ns * 1e-6)
     return Side.of(
         f"In {code(FIG2.config)} a plan takes {plan[0]:g} ms of computing; the executor's cycle is {plan[1]:g} ms, "
@@ -143,14 +145,18 @@ def _both(workshop: Workshop) -> Side:
 
 
 def _both_tested(findings: Findings) -> Assessment:
-    rows, late, due = [], 0, 0
+    rows = []
+    late = 0
+    due = 0
     for figure, coupling in ((FIG2, "tightly"), (FIG4, "loosely")):
         tasks = findings[figure.label]["tasks"]
-        executor, planner = tasks[LEVEL], tasks[PLANNER]
+        executor = tasks[LEVEL]
+        planner = tasks[PLANNER]
         rows.append(
             (code(figure.label), coupling, *(str(n) for n in (planner["jobs"], executor["jobs"], executor["late"])))
         )
-        late, due = late + executor["late"], due + executor["jobs"]
+        late = late + executor["late"]
+        due = due + executor["jobs"]
     side = Side.of(Columns(("rack", "coupled", "plans", "executor's cycles", "of these late"), rows))
     if not late:
         return Assessment(
@@ -174,7 +180,10 @@ def _bounds(workshop: Workshop) -> Side:
 
 
 def _bounds_tested(findings: Findings) -> Assessment:
-    items, late, unexplained, undone = [], 0, 0, []
+    items = []
+    late = 0
+    unexplained = 0
+    undone = []
     for experiment in (KILLS, SENSORS):
         found = findings[experiment.name]
         items += [_losses(found, experiment)]

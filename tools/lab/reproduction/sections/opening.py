@@ -9,7 +9,8 @@ from rack.tools.lab.reproduction.experiments.nasrem import NASREM
 from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Ruling, Side, code, text
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
-REAL, LOCKSTEP = "realtime", "lockstep"
+REAL = "realtime"
+LOCKSTEP = "lockstep"
 
 
 def _determined(workshop: Workshop) -> Side:
@@ -94,7 +95,8 @@ def _costs(workshop: Workshop) -> Side:
 def _costs_tested(findings: Findings) -> Assessment:
     """Compare the processor time of communication with what the less loaded processor takes off the other one."""
     found = findings[NASREM.name]
-    rows, communicates = [], 0.0
+    rows = []
+    communicates = 0.0
     for level, parts in found["phases"].items():
         comm_us = sum(parts[name]["p50"] for name in ("exchange", "read", "write"))
         rate_hz = 1e3 / found["tasks"][level]["slice_ms"]

@@ -17,7 +17,9 @@ from rack.tools.lab.reproduction.sections.equations import (
 from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Plate, Ruling, Side
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings
 
-R_I, R_MAX, R_S = "R<sub>i</sub>", "R<sub>max</sub>", "R<sub>s</sub>"
+R_I = "R<sub>i</sub>"
+R_MAX = "R<sub>max</sub>"
+R_S = "R<sub>s</sub>"
 EXEC, COMM, REST = (f"t<sup>i</sup><sub>{name}</sub>" for name in ("exec", "comm", "residual"))
 SWITCH = "t<sub>cs</sub>"
 HURRIED = Biting("nasrem", ("timing.response_ms=1000",), "a response within 1 s is demanded of the same four levels")
@@ -133,7 +135,8 @@ SMALL = PaperEquation(
 def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
     """Judge eq. 3.3: the sum, and what waiting for the next read adds to it."""
     found = findings[NASREM.name]
-    response, verdicts = found["response"], measured_of(equation.number, found)
+    response = found["response"]
+    verdicts = measured_of(equation.number, found)
     sum_ms = response["sum_eq_3_3_ms"]
     rows = [
         (
@@ -169,7 +172,8 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
 
 
 def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
-    own, found = judged(equation, findings), findings[NASREM.name]
+    own = judged(equation, findings)
+    found = findings[NASREM.name]
     rows = [
         (
             name,
