@@ -1,19 +1,25 @@
-"""The backplane: one shared-memory segment per rack, with its mailboxes, its clock, and the watches on them.
+"""The backplane: one shared-memory segment per rack, with its mailboxes, its clock, and the watches
+on them.
 
-A level's author needs `Field`, `command` and `status` to declare messages, `State` for their statuses, and `Reading`
-with its `Verdict` for input ports. A program that looks into a running rack needs the rest:
+A level's author needs `Field`, `command` and `status` to declare messages, `State` for their
+statuses, and `Reading` with its `Verdict` for input ports. A program that looks into a running rack
+needs the rest:
 
     from rack.backplane import Segment, open_observer
 
     segment = Segment.attach("nasrem")
     print(open_observer(segment, "servo.status").peek().value)
 
-- `Segment` is a rack's memory, `Layout` its mailboxes and tasks as plain data (`MailboxSpec`, `TaskSpec`).
-- `open_writer` and `open_reader` open a mailbox under its protocol; `open_observer` never takes its lock.
-- `SystemClock` reads the clock; `Alarm` lists the kinds of alarms; `Demand` is the demand of safety on the arm.
+- `Segment` is a rack's memory, `Layout` its mailboxes and tasks as plain data (`MailboxSpec`,
+  `TaskSpec`).
+- `open_writer` and `open_reader` open a mailbox under its protocol; `open_observer` never takes its
+  lock.
+- `SystemClock` reads the clock; `Alarm` lists the kinds of alarms; `Demand` is the demand of safety
+  on the arm.
 - `BackplaneError` is the root of all errors of this package.
 
-Names are imported on first use: numpy takes a tenth of a second, which `rack list` and the like need not wait for.
+Names are imported on first use: numpy takes a tenth of a second, which `rack list` and the like
+need not wait for.
 """
 
 from __future__ import annotations
@@ -33,8 +39,26 @@ if TYPE_CHECKING:
     from rack.backplane.watch.alarms import Alarm
     from rack.backplane.words import Demand
 
-__all__ = ["Alarm", "BackplaneError", "Demand", "Field", "Layout", "MailboxSpec", "Message", "MessageType"]
-__all__ += ["Reading", "Segment", "State", "SystemClock", "TaskSpec", "Verdict", "command", "open_observer"]
+__all__ = [
+    "Alarm",
+    "BackplaneError",
+    "Demand",
+    "Field",
+    "Layout",
+    "MailboxSpec",
+    "Message",
+    "MessageType",
+]
+__all__ += [
+    "Reading",
+    "Segment",
+    "State",
+    "SystemClock",
+    "TaskSpec",
+    "Verdict",
+    "command",
+    "open_observer",
+]
 __all__ += ["open_reader", "open_writer", "status"]
 _PLACES = {
     "rack.backplane.clock.system_clock": ("SystemClock",),

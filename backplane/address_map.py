@@ -1,7 +1,8 @@
 """The memory map: the bus address of every board's window, task block and mailbox.
 
-Addresses are byte offsets in the segment. A board's window starts on a page and holds the control blocks, trace rings
-and alarm rings of its tasks, then the mailboxes that it writes. The map follows from the layout alone.
+Addresses are byte offsets in the segment. A board's window starts on a page and holds the control
+blocks, trace rings and alarm rings of its tasks, then the mailboxes that it writes. The map follows
+from the layout alone.
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ BLOCK_SIZE = BLOCK_WORDS * 8
 TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 64
 ALARM_DEPTH = 256
-"""Records in an alarm ring: it is read many times a second, and an alarm is raised once per episode."""
+"""Records in an alarm ring: it is read many times a second, and an alarm is raised once per
+episode."""
 FAULT_ENTRY_SIZE = 256
 FAULT_ENTRIES = 64
 OPERATOR_HEAD_SIZE = LINE
 OPERATOR_ENTRIES = 128
 CLOCK = "clock"
-"""The system controller, in slot 1: its window holds the fault table, the operator table and operators' mailboxes."""
+"""The system controller, in slot 1: its window holds the fault table, the operator table and
+operators' mailboxes."""
 MAILBOX_HEAD_SIZE = 2 * LINE
 SLOT_HEAD_SIZE = 64
 ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
@@ -43,7 +46,8 @@ class Window:
 
 
 class AddressMap:
-    """Addresses of everything on one backplane; `size` is their total in bytes, without the texts."""
+    """Addresses of everything on one backplane; `size` is their total in bytes, without the
+    texts."""
 
     def __init__(self, layout: Layout) -> None:
         self.windows: list[Window] = []
@@ -106,17 +110,22 @@ def mailbox_size(mailbox: MailboxSpec) -> int:
 
 
 def oldest_kept(head: int, depth: int) -> int:
-    """Return the number of the oldest record in a ring that its writer cannot have begun to overwrite.
+    """Return the number of the oldest record in a ring that its writer cannot have begun to
+    overwrite.
 
-    The writer is at most one record ahead of its `head`. A concurrent reader copies first, then compares with the
-    present head: a copy of an older record may be half overwritten, and proves nothing.
+    The writer is at most one record ahead of its `head`. A concurrent reader copies first, then
+    compares with the present head: a copy of an older record may be half overwritten, and proves
+    nothing.
     """
     return head + 2 - depth
 
 
 def operator_entry_size(layout: Layout) -> int:
-    """Return the bytes of one entry of the operator table: its head, and room for the largest of its messages."""
-    return OPERATOR_HEAD_SIZE + _up(max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE)
+    """Return the bytes of one entry of the operator table: its head, and room for the largest of
+    its messages."""
+    return OPERATOR_HEAD_SIZE + _up(
+        max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE
+    )
 
 
 def _up(value: int, step: int) -> int:

@@ -1,7 +1,7 @@
 """An exclusive, non-blocking kernel lock on one byte of a segment.
 
-Each lock has its own file description, so two holders in one process exclude each other too. The kernel releases it
-when the process ends, even if it is killed.
+Each lock has its own file description, so two holders in one process exclude each other too. The
+kernel releases it when the process ends, even if it is killed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import os
 import struct
 
 _FLOCK = struct.Struct("hhqqi4x")
-"""`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description have none)."""
+"""`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description
+have none)."""
 
 
 class ByteLock:
@@ -42,7 +43,8 @@ class ByteLock:
 
 
 def is_locked(fd: int, address: int) -> bool:
-    """Say whether the byte at a bus address of an open segment is locked, without taking the lock."""
+    """Say whether the byte at a bus address of an open segment is locked, without taking the
+    lock."""
     asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK

@@ -1,8 +1,9 @@
-"""The fault table: the faults injected into a rack, in shared memory, in the system controller's window.
+"""The fault table: the faults injected into a rack, in shared memory, in the system controller's
+window.
 
-Any process may add an entry. Only the clock, at the beginning of a tick, decides which faults begin and end: all tasks
-of a tick see the same faults, and a run in lockstep repeats with them. The table holds numbers; `boards` knows the
-meaning of kinds and parameters.
+Any process may add an entry. Only the clock, at the beginning of a tick, decides which faults begin
+and end: all tasks of a tick see the same faults, and a run in lockstep repeats with them. The table
+holds numbers; `boards` knows the meaning of kinds and parameters.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Stage(IntEnum):
 
 
 class Entry(IntEnum):
-    """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor the rest."""
+    """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor the
+    rest."""
 
     STAGE = 0
     KIND = 1  # number of the kind, from its name
@@ -57,7 +59,8 @@ class Entry(IntEnum):
 
 @dataclass(frozen=True)
 class Injection:
-    """One fault as an entry holds it: see `Entry`. `when` is (mailbox, field, value): two indices and a number."""
+    """One fault as an entry holds it: see `Entry`. `when` is (mailbox, field, value): two indices
+    and a number."""
 
     kind: int
     task: int
@@ -90,7 +93,8 @@ class FaultEntry:
         return Stage(self.words[Entry.STAGE])
 
     def acted(self, tick: int, shows: bool = True) -> None:
-        """Note one action of the fault, and the time of the first one; count those that show: they must be found."""
+        """Note one action of the fault, and the time of the first one; count those that show: they
+        must be found."""
         if self.words[Entry.STRUCK_TICK] < 0:
             self.words[Entry.STRUCK_NS] = monotonic_ns()
             self.words[Entry.STRUCK_TICK] = tick
@@ -105,16 +109,20 @@ class FaultTable:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = segment.words
-        self._tasks = {task.name: index for index, task in enumerate(segment.layout.processes)} | {CLOCK: -1}
+        self._tasks = {task.name: index for index, task in enumerate(segment.layout.processes)} | {
+            CLOCK: -1
+        }
         self.entries = [FaultEntry(segment, index) for index in range(FAULT_ENTRIES)]
 
     @property
     def generation(self) -> int:
-        """Rises when a fault begins or ends: a task looks at the table only when this number has changed."""
+        """Rises when a fault begins or ends: a task looks at the table only when this number has
+        changed."""
         return self._words[System.FAULTS]
 
     def add(self, injection: Injection) -> FaultEntry:
-        """Fill a free entry; its fault begins when the clock finds it due. Raises `FaultTableError`."""
+        """Fill a free entry; its fault begins when the clock finds it due. Raises
+        `FaultTableError`."""
         lock = ByteLock(self._segment.fd, self._segment.map.faults)
         try:
             # Bounded by the time in which another process fills an entry.
@@ -122,7 +130,9 @@ class FaultTable:
                 continue
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
             if entry is None:
-                raise FaultTableError(f"the fault table is full: {len(self.entries)} faults were injected in this run")
+                raise FaultTableError(
+                    f"the fault table is full: {len(self.entries)} faults were injected in this run"
+                )
             _fill(entry, injection)
             self._words[System.INJECTED] += 1
         finally:
@@ -131,7 +141,8 @@ class FaultTable:
 
     def disarm(self, entry: FaultEntry) -> None:
         """Keep a waiting fault from beginning; `free` may follow after the next tick."""
-        # In this order: without a condition and with a tick that has passed, it would begin at once.
+        # In this order: without a condition and with a tick that has passed, it would begin at
+        # once.
         entry.words[Entry.FROM] = NEVER
         entry.words[Entry.WHEN_BOX] = -1
 
@@ -145,7 +156,11 @@ class FaultTable:
     def active(self, task: str) -> list[FaultEntry]:
         """Return the active faults of a task; "clock" is the clock."""
         index = self._tasks[task]
-        return [e for e in self.entries if e.words[Entry.STAGE] == Stage.ACTIVE and e.words[Entry.TASK] == index]
+        return [
+            e
+            for e in self.entries
+            if e.words[Entry.STAGE] == Stage.ACTIVE and e.words[Entry.TASK] == index
+        ]
 
     def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
         """Return the entries in one of these stages."""

@@ -1,7 +1,8 @@
 """The layout of a backplane: its mailboxes and tasks, as plain data.
 
-The Rack computes a layout from its config. The segment is laid out from it and carries it as text, so a tool that
-attaches by name knows every mailbox and every task without importing the config's classes.
+The Rack computes a layout from its config. The segment is laid out from it and carries it as text,
+so a tool that attaches by name knows every mailbox and every task without importing the config's
+classes.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class TickGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class ExchangeSpec:
-    """How the executor `task` reads a mailbox, if the config says so: at the ticks `phase`, `phase` + `every`, ...
+    """How the executor `task` reads a mailbox, if the config says so: at the ticks `phase`, `phase`
+    + `every`, ...
 
     `asynchronous`: it gets the newest message as soon as that is whole, whatever the protocol.
     """
@@ -55,11 +57,13 @@ class ExchangeSpec:
 
 @dataclass(frozen=True)
 class InterruptSpec:
-    """How the messages of a mailbox travel under protocol interrupt. Its times are of the rack's own clock.
+    """How the messages of a mailbox travel under protocol interrupt. Its times are of the rack's
+    own clock.
 
-    A message is sent `sent_ns` after the release that writes it; it must be there before the tick `due` after that
-    release. It interrupts the boards in `slots`; at each a handler serves it for `service_ns`, and `depth` messages
-    wait at most. It is written in the cycles released `ahead` ticks before the multiples of the mailbox's period.
+    A message is sent `sent_ns` after the release that writes it; it must be there before the tick
+    `due` after that release. It interrupts the boards in `slots`; at each a handler serves it for
+    `service_ns`, and `depth` messages wait at most. It is written in the cycles released `ahead`
+    ticks before the multiples of the mailbox's period.
     """
 
     sent_ns: int
@@ -72,10 +76,12 @@ class InterruptSpec:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit, meaning.
+    """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit,
+    meaning.
 
-    `fields` holds the fields of a group (a nested message), `values` the names (lower case) and numbers of an enum,
-    `length` the least and the greatest one of a vector, or magnitude of a number.
+    `fields` holds the fields of a group (a nested message), `values` the names (lower case) and
+    numbers of an enum, `length` the least and the greatest one of a vector, or magnitude of a
+    number.
     """
 
     name: str
@@ -93,13 +99,15 @@ class FieldSpec:
 class MailboxSpec:
     """One mailbox: its writer and readers, its message, its protocol.
 
-    `every` is the time from message to message and `delay` the time from release to visibility, both in ticks; messages
-    become visible at multiples of `every`, counted from tick `phase`. `depth` is the number of slots, a power of two.
-    `rests_on` names the mailboxes on whose information its messages rest, all read by its writer; queues, in which
-    messages wait, are not among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
-    `exchanges` are the readers that do not simply read it in every cycle. `max_age`, ticks: of a mailbox written only
-    when there is something new, the age of its information from which readers take the writer for lost; 0: it is
-    written in every period. `interrupt`: of protocol interrupt; `delay` is then the time to the earliest visibility.
+    `every` is the time from message to message and `delay` the time from release to visibility,
+    both in ticks; messages become visible at multiples of `every`, counted from tick `phase`.
+    `depth` is the number of slots, a power of two. `rests_on` names the mailboxes on whose
+    information its messages rest, all read by its writer; queues, in which messages wait, are not
+    among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
+    `exchanges` are the readers that do not simply read it in every cycle. `max_age`, ticks: of a
+    mailbox written only when there is something new, the age of its information from which readers
+    take the writer for lost; 0: it is written in every period. `interrupt`: of protocol interrupt;
+    `delay` is then the time to the earliest visibility.
     """
 
     name: str
@@ -140,10 +148,11 @@ class MailboxSpec:
 class TaskSpec:
     """One schedulable task: the executor of a board or its planner.
 
-    `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in ticks; releases are
-    the ticks `phase`, `phase` + `every`, ... `within_cycles` is the cycles that one plan may take. `priority` is
-    SCHED_FIFO's, 0 for ordinary scheduling. `depth` is the number of records in its trace ring, a power of two. `wake`:
-    how it waits for its next cycle in real time. `is_external`: a host board that the rack does not start.
+    `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in
+    ticks; releases are the ticks `phase`, `phase` + `every`, ... `within_cycles` is the cycles that
+    one plan may take. `priority` is SCHED_FIFO's, 0 for ordinary scheduling. `depth` is the number
+    of records in its trace ring, a power of two. `wake`: how it waits for its next cycle in real
+    time. `is_external`: a host board that the rack does not start.
     """
 
     name: str
@@ -190,7 +199,8 @@ class Layout:
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 
     def pacers(self, host: TaskSpec) -> set[str]:
-        """Return the bus adapters in whose cycles a host board's program runs in lockstep: none of an external one."""
+        """Return the bus adapters in whose cycles a host board's program runs in lockstep: none of
+        an external one."""
         return {
             task.name
             for task in self.tasks
@@ -207,26 +217,35 @@ class Layout:
         return {t.name: t for t in self.processes}[name]
 
     def due(self, task: TaskSpec) -> int:
-        """Return the ticks from a release of a task until the first of its messages must be there."""
-        sent = [m.interrupt.due for m in self.mailboxes if m.writer == task.name and m.interrupt is not None]
+        """Return the ticks from a release of a task until the first of its messages must be
+        there."""
+        sent = [
+            m.interrupt.due
+            for m in self.mailboxes
+            if m.writer == task.name and m.interrupt is not None
+        ]
         return min([task.every, *sent])
 
     def interrupting(self, slot: int) -> list[MailboxSpec]:
-        """Return the mailboxes whose messages interrupt the board in a slot, by the slot of their sender."""
+        """Return the mailboxes whose messages interrupt the board in a slot, by the slot of their
+        sender."""
         found = [m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots]
         return sorted(found, key=lambda mailbox: self.task(mailbox.writer).slot)
 
     def handler(self, slot: int) -> str:
-        """Return the task that serves the interrupts of the board in a slot: its first one. Raises `StopIteration`."""
+        """Return the task that serves the interrupts of the board in a slot: its first one. Raises
+        `StopIteration`."""
         return next(task.name for task in self.tasks if task.slot == slot)
 
     def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
-        """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises `KeyError`."""
+        """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises
+        `KeyError`."""
         slowest = max((e.grid for e in mailbox.exchanges if e.task == reader), default=None)
         return slowest or self.task(reader).grid
 
 
 def depth_for(span_ticks: int, every: int, least: int = 4) -> int:
-    """Return the slots, a power of two, that keep `span_ticks` ticks of a writer of period `every`."""
+    """Return the slots, a power of two, that keep `span_ticks` ticks of a writer of period
+    `every`."""
     wanted = max(least, -(-span_ticks // every) + 3)
     return 1 << (wanted - 1).bit_length()

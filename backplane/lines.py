@@ -1,4 +1,5 @@
-"""The utility lines of the bus as shared words: SYSFAIL, SYSRESET, ACFAIL, and the emergency stop."""
+"""The utility lines of the bus as shared words: SYSFAIL, SYSRESET, ACFAIL, and the emergency
+stop."""
 
 from __future__ import annotations
 
@@ -48,14 +49,17 @@ class UtilityLines:
         """Reasons why the latch must not be reset: asserted utility lines, lost boards."""
         found = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         found += ["ACFAIL"] if self.acfail else []
-        return found + [f"board '{name}' is lost" for name, block in self._blocks.items() if block[Block.LOST]]
+        return found + [
+            f"board '{name}' is lost" for name, block in self._blocks.items() if block[Block.LOST]
+        ]
 
     def latch_emergency_stop(self) -> None:
         """Set the latch: the arm brakes, and stays braked until the latch is reset."""
         self._words[System.EMERGENCY_STOP] = 1
 
     def reset_emergency_stop(self) -> None:
-        """Clear the latch. Raises `EmergencyStopError` with every bad input; the latch then stays set."""
+        """Clear the latch. Raises `EmergencyStopError` with every bad input; the latch then stays
+        set."""
         if bad := self.bad_inputs:
             raise EmergencyStopError(f"the emergency stop stays latched: {', '.join(bad)}")
         self._words[System.EMERGENCY_STOP] = 0

@@ -1,12 +1,15 @@
-"""A real-time process's memory: all there before the first cycle, so that no cycle waits for a page.
+"""A real-time process's memory: all there before the first cycle, so that no cycle waits for a
+page.
 
-A board is forked from the crate and shares its memory. Left alone, the first write to each page copies it, the first
-access to each page of the segment or of a library maps it, and the C library returns freed memory to the kernel only to
-ask for it again: a page fault in every second cycle for the first seconds, and in rare code paths at any later time.
+A board is forked from the crate and shares its memory. Left alone, the first write to each page
+copies it, the first access to each page of the segment or of a library maps it, and the C library
+returns freed memory to the kernel only to ask for it again: a page fault in every second cycle for
+the first seconds, and in rare code paths at any later time.
 
-`mlockall` without MCL_ONFAULT would do it in one call, but it also fills memory that was reserved and never used, twice
-of what a board needs, and later mappings at once. So pages are locked as they are touched, and touched here by kind:
-memory of the process itself where it is in use, files where the crate has used them, the segment whole.
+`mlockall` without MCL_ONFAULT would do it in one call, but it also fills memory that was reserved
+and never used, twice of what a board needs, and later mappings at once. So pages are locked as they
+are touched, and touched here by kind: memory of the process itself where it is in use, files where
+the crate has used them, the segment whole.
 """
 
 from __future__ import annotations
@@ -25,13 +28,17 @@ _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _MCL_ONFAULT = 4
-_POPULATE_READ, _POPULATE_WRITE = 22, 23  # MADV_*, since Linux 5.14; without them pages are touched by the first cycles
+_POPULATE_READ, _POPULATE_WRITE = (
+    22,
+    23,
+)  # MADV_*, since Linux 5.14; without them pages are touched by the first cycles
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
 RESERVE = 4 << 20
 """Bytes of heap kept beyond those in use."""
 GAP = 16
-"""Unused pages between used ones that are touched with them: one call takes as long as some pages."""
+"""Unused pages between used ones that are touched with them: one call takes as long as some
+pages."""
 _USER_END = 1 << 63
 """Addresses from here on are the kernel's, as [vsyscall]."""
 _PRESENT = 63
@@ -50,8 +57,11 @@ _FILES: list[tuple[int, int]] = []
 
 
 def note_used_files() -> None:
-    """Note the pages of files that this process uses, for `touch_memory`: a fork does not inherit their mapping."""
-    _FILES[:] = [stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages]
+    """Note the pages of files that this process uses, for `touch_memory`: a fork does not inherit
+    their mapping."""
+    _FILES[:] = [
+        stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages
+    ]
 
 
 def touch_memory() -> None:
@@ -72,7 +82,8 @@ def touch_memory() -> None:
 
 
 def _mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
-    """Yield span, rights and the stretches in memory of every mapping of this process that it may read."""
+    """Yield span, rights and the stretches in memory of every mapping of this process that it may
+    read."""
     with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
         for line in Path("/proc/self/maps").read_text().splitlines():
             addresses, rights, *_ = line.split(maxsplit=2)

@@ -1,7 +1,7 @@
 """Message types: fixed numpy structured layouts, documented field by field.
 
-A message type is declared once, with symbolic sizes ("joints"), which a rack resolves from its config. The bytes of a
-resolved type travel through a mailbox.
+A message type is declared once, with symbolic sizes ("joints"), which a rack resolves from its
+config. The bytes of a resolved type travel through a mailbox.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ import numpy as np
 from rack.backplane.errors import MailboxError
 
 REASON_BYTES = 120
-NOT_SENT = "its board writes this message in every cycle: declare the port as Output(..., queued=True) to send it"
+NOT_SENT = (
+    "its board writes this message in every cycle: declare the port as Output(..., queued=True) to"
+    " send it"
+)
 
 
 class State(IntEnum):
@@ -36,8 +39,9 @@ class Field:
     """One field of a message: numpy scalar type, shape, unit and meaning.
 
     `shape` mixes integers and symbolic sizes; `kind` is a numpy type string or, for a group of
-    fields, a nested `MessageType`. The unit of a number that stands for a name is its enum. `length`: the least and the
-    greatest one that a vector, along its last axis, or the magnitude of a number may have.
+    fields, a nested `MessageType`. The unit of a number that stands for a name is its enum.
+    `length`: the least and the greatest one that a vector, along its last axis, or the magnitude of
+    a number may have.
     """
 
     name: str
@@ -75,12 +79,15 @@ class MessageType:
         return np.dtype([self._column(f, sizes) for f in self.fields], align=True)
 
     def _column(self, field: Field, sizes: Mapping[str, int]) -> tuple[str, Any, tuple[int, ...]]:
-        kind = field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
+        kind = (
+            field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
+        )
         missing = [s for s in field.shape if isinstance(s, str) and s not in sizes]
         if missing:
             known = ", ".join(sorted(sizes)) or "none"
             raise MailboxError(
-                f"message '{self.name}' field '{field.name}': size '{missing[0]}' is unknown; known sizes: {known}"
+                f"message '{self.name}' field '{field.name}': size '{missing[0]}' is unknown; known"
+                f" sizes: {known}"
             )
         shape = tuple(sizes[s] if isinstance(s, str) else s for s in field.shape)
         return field.name, kind, shape
@@ -92,13 +99,21 @@ def command(name: str, version: int, *fields: Field) -> MessageType:
     return MessageType(name, version, (serial, *fields))
 
 
-def status(name: str, version: int, *fields: Field, errors: str | type[IntEnum] = "1") -> MessageType:
-    """Return a status type: `fields` after echo, state, error code, of the enum `errors` if it is one, and reason."""
+def status(
+    name: str, version: int, *fields: Field, errors: str | type[IntEnum] = "1"
+) -> MessageType:
+    """Return a status type: `fields` after echo, state, error code, of the enum `errors` if it is
+    one, and reason."""
     head = (
         Field("echo", "u4", "1", "serial of the command that this status answers"),
         Field("state", "u1", State, "idle, executing, done, error or holding"),
         Field("error", "u2", errors, "error code of the level; 0: none"),
-        Field("reason", f"S{REASON_BYTES}", "ASCII", "reason for the error or the hold, readable; empty: neither"),
+        Field(
+            "reason",
+            f"S{REASON_BYTES}",
+            "ASCII",
+            "reason for the error or the hold, readable; empty: neither",
+        ),
     )
     return MessageType(name, version, (*head, *fields))
 
@@ -134,10 +149,12 @@ class Message:
         self.raw[:] = other.raw
 
     def send(self, basis: int | None = None) -> bool:
-        """Put a copy into the queue to which an output port leads; return False if the queue is full.
+        """Put a copy into the queue to which an output port leads; return False if the queue is
+        full.
 
-        Of a port that is written on demand: have the board write it in this cycle, resting on information of tick
-        `basis`. Messages of other mailboxes are written in every cycle: there it raises `MailboxError`.
+        Of a port that is written on demand: have the board write it in this cycle, resting on
+        information of tick `basis`. Messages of other mailboxes are written in every cycle: there
+        it raises `MailboxError`.
         """
         raise MailboxError(NOT_SENT)
 
@@ -150,16 +167,21 @@ class Message:
         def __setattr__(self, name: str, value: Any) -> None: ...
 
     def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}")
+        raise AttributeError(
+            f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}"
+        )
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
 
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
-    """Fill the fields of a record; an integer stays at the greatest that its field holds, whoever drives it."""
+    """Fill the fields of a record; an integer stays at the greatest that its field holds, whoever
+    drives it."""
     kinds = (kind for kind, *_ in record.dtype.fields.values())
-    record[...] = tuple(min(count, _greatest(kind)) for count, kind in zip(counts, kinds, strict=True))
+    record[...] = tuple(
+        min(count, _greatest(kind)) for count, kind in zip(counts, kinds, strict=True)
+    )
 
 
 @cache
@@ -199,7 +221,9 @@ def _property(slot: str, dtype: np.dtype) -> property:
     return property(lambda self: view(self).item(), store)
 
 
-def sending(plain: Message, dtype: np.dtype, send: Callable[..., bool], room: Callable[[], int]) -> Message:
+def sending(
+    plain: Message, dtype: np.dtype, send: Callable[..., bool], room: Callable[[], int]
+) -> Message:
     """Return a message on the bytes of `plain` that has these methods `send` and `room`."""
     kind = type("Message", (type(plain),), {"__slots__": ("room", "send")})
     message: Message = object.__new__(kind)

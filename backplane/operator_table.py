@@ -1,11 +1,13 @@
 """The operator table: commands from outside, in shared memory, in the system controller's window.
 
-Any process may add a request, at any time. Only the clock issues it, at the beginning of a tick: it publishes the
-message in the level's mailbox, whose only writer it is. All tasks of a tick therefore see the same commands, and a run
-in lockstep repeats with them. Here a command is only the bytes of a message; `levels` defines its meaning.
+Any process may add a request, at any time. Only the clock issues it, at the beginning of a tick: it
+publishes the message in the level's mailbox, whose only writer it is. All tasks of a tick therefore
+see the same commands, and a run in lockstep repeats with them. Here a command is only the bytes of
+a message; `levels` defines its meaning.
 
-A request belongs to the run, or to a client that waits for it. The latter is withdrawn when the client's process ends,
-even if it is killed: the client holds a kernel lock, which the clock can check in a microsecond.
+A request belongs to the run, or to a client that waits for it. The latter is withdrawn when the
+client's process ends, even if it is killed: the client holds a kernel lock, which the clock can
+check in a microsecond.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 
 _CLAIMS = 1 << 40
-"""Address of the byte that the client of ticket 0 locks: beyond any segment, since a lock needs no memory."""
+"""Address of the byte that the client of ticket 0 locks: beyond any segment, since a lock needs no
+memory."""
 
 
 class RequestStage(IntEnum):
@@ -35,7 +38,8 @@ class RequestStage(IntEnum):
 
 
 class RequestWord(IntEnum):
-    """Words of an entry. The host fills a free one; from then on the clock writes STAGE, SERIAL and GIVEN_TICK."""
+    """Words of an entry. The host fills a free one; from then on the clock writes STAGE, SERIAL and
+    GIVEN_TICK."""
 
     STAGE = 0
     TICKET = 1  # number of the request: it changes when the entry is filled again
@@ -48,7 +52,8 @@ class RequestWord(IntEnum):
 
 @dataclass(frozen=True)
 class Request:
-    """A command to issue: the index of its mailbox, its message, and its tick (-1: as soon as possible)."""
+    """A command to issue: the index of its mailbox, its message, and its tick (-1: as soon as
+    possible)."""
 
     mailbox: int
     message: bytes
@@ -76,7 +81,8 @@ class RequestEntry:
 
 
 class RequestClaim(NamedTuple):
-    """A request that its client has added. While it waits, its `lock` shows that the client lives."""
+    """A request that its client has added. While it waits, its `lock` shows that the client
+    lives."""
 
     entry: RequestEntry
     ticket: int
@@ -96,7 +102,8 @@ class OperatorTable:
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
     def add(self, request: Request) -> RequestEntry:
-        """Fill a free entry, or that of the command issued longest ago; the clock issues it when it is due.
+        """Fill a free entry, or that of the command issued longest ago; the clock issues it when it
+        is due.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
@@ -106,7 +113,8 @@ class OperatorTable:
 
     @contextmanager
     def claim(self, request: Request) -> Iterator[RequestEntry]:
-        """Add a request as its client, and withdraw it at the end of the `with` block unless it has been issued.
+        """Add a request as its client, and withdraw it at the end of the `with` block unless it has
+        been issued.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
@@ -124,7 +132,8 @@ class OperatorTable:
         return claim
 
     def try_claim(self, request: Request, has_client: bool = True) -> RequestClaim | None:
-        """Add a request without waiting; None while another process fills an entry, and might be preempted meanwhile.
+        """Add a request without waiting; None while another process fills an entry, and might be
+        preempted meanwhile.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
@@ -138,7 +147,9 @@ class OperatorTable:
         settled = [entry for entry in self.entries if not self.is_waiting(entry)]
         if not settled:
             why = f"{len(self.entries)} commands wait for their ticks"
-            raise OperatorTableError(f"the operator table is full: {why}; permitted: once one of them is given")
+            raise OperatorTableError(
+                f"the operator table is full: {why}; permitted: once one of them is given"
+            )
         entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
         ticket = self._words[System.REQUESTED] + 1
         lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
@@ -161,7 +172,9 @@ class OperatorTable:
         words = entry.words
         if words[RequestWord.STAGE] != RequestStage.WAITING:
             return False
-        return not words[RequestWord.HAS_CLIENT] or self._segment.is_locked(_CLAIMS + words[RequestWord.TICKET])
+        return not words[RequestWord.HAS_CLIENT] or self._segment.is_locked(
+            _CLAIMS + words[RequestWord.TICKET]
+        )
 
     def waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""

@@ -26,18 +26,21 @@ STOPPED = "Tt"
 
 
 def start_time(pid: int) -> int:
-    """Return the start time of a process, in kernel clock ticks since boot; 0 when there is none or it is a zombie."""
+    """Return the start time of a process, in kernel clock ticks since boot; 0 when there is none or
+    it is a zombie."""
     fields = _stat(pid)
     return int(fields[19]) if fields and fields[0] not in GONE else 0
 
 
 def state_of(pid: int) -> str:
-    """Return the kernel's letter for a process's state: R, S, D, T (stopped), Z (dead, not reaped); X: no process."""
+    """Return the kernel's letter for a process's state: R, S, D, T (stopped), Z (dead, not reaped);
+    X: no process."""
     return (_stat(pid) or "X")[0]
 
 
 def processor_ns(pid: int) -> int:
-    """Return the processor time used by a process so far, in ns, to about 10 ms; 0 when there is none."""
+    """Return the processor time used by a process so far, in ns, to about 10 ms; 0 when there is
+    none."""
     fields = _stat(pid)
     return (int(fields[11]) + int(fields[12])) * (1_000_000_000 // _TICKS_A_SECOND) if fields else 0
 
@@ -52,13 +55,15 @@ def _stat(pid: int) -> list[str]:
 
 
 def is_alive(pid: int, started: int = 0) -> bool:
-    """Say whether a process is alive; with `started`, whether it is still the same process, since pids are reused."""
+    """Say whether a process is alive; with `started`, whether it is still the same process, since
+    pids are reused."""
     found = start_time(pid) if pid > 0 else 0
     return found > 0 and started in (0, found)
 
 
 def readable(fd: int, timeout_s: float) -> bool:
-    """Wait until a descriptor can be read, or the process of a pidfd has ended; False after the timeout.
+    """Wait until a descriptor can be read, or the process of a pidfd has ended; False after the
+    timeout.
 
     Unlike `select` this takes descriptors above 1023.
     """
@@ -68,7 +73,8 @@ def readable(fd: int, timeout_s: float) -> bool:
 
 
 def compute_until(processor_time_ns: int) -> None:
-    """Compute until the calling process has used that much processor time (`process_time_ns`: without preemption)."""
+    """Compute until the calling process has used that much processor time (`process_time_ns`:
+    without preemption)."""
     while process_time_ns() < processor_time_ns:
         pass
 
@@ -88,7 +94,8 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def take_processor(spec: TaskSpec) -> int:
-    """Pin the calling process, take its priority if allowed, lock its memory, stop the garbage collector.
+    """Pin the calling process, take its priority if allowed, lock its memory, stop the garbage
+    collector.
 
     Return the SCHED_FIFO priority obtained; 0: ordinary scheduling.
     """
@@ -105,24 +112,28 @@ def take_processor(spec: TaskSpec) -> int:
 
 @contextmanager
 def cores_kept_awake() -> Iterator[str]:
-    """Keep every core from sleeping while it is idle; yield why the system refuses that, empty if it permits it.
+    """Keep every core from sleeping while it is idle; yield why the system refuses that, empty if
+    it permits it.
 
-    A core that sleeps takes 20 us and more to wake up. But one that is held awake spins: a host that gives a virtual
-    machine a quota of processor time counts that, and takes the core away for ms once the quota is used up. As a rule
-    the system permits it to root only. The request ends with the process, however that ends:
-    https://docs.kernel.org/power/pm_qos_interface.html
+    A core that sleeps takes 20 us and more to wake up. But one that is held awake spins: a host
+    that gives a virtual machine a quota of processor time counts that, and takes the core away for
+    ms once the quota is used up. As a rule the system permits it to root only. The request ends
+    with the process, however that ends: https://docs.kernel.org/power/pm_qos_interface.html
     """
     refusal = ""
     with ExitStack() as stack:
         try:
             stack.enter_context(LATENCY_REQUEST.open("r+b", 0)).write(bytes(4))
         except OSError as error:
-            refusal = f"idle cores sleep, since {LATENCY_REQUEST} cannot be opened: {error.strerror}"
+            refusal = (
+                f"idle cores sleep, since {LATENCY_REQUEST} cannot be opened: {error.strerror}"
+            )
         yield refusal
 
 
 def mapped_and_locked(pid: int) -> tuple[int, int]:
-    """Return the bytes of memory that a process has mapped, and those locked; 0 when there is no process."""
+    """Return the bytes of memory that a process has mapped, and those locked; 0 when there is no
+    process."""
     found: list[str] = []
     with suppress(FileNotFoundError, ProcessLookupError):
         found = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())
@@ -132,11 +143,16 @@ def mapped_and_locked(pid: int) -> tuple[int, int]:
 
 def refusal(error: OSError) -> str:
     """Return why the system refused a process or a file, with the limit that is reached."""
-    limits = {errno.EAGAIN: ("processes", "u", RLIMIT_NPROC), errno.EMFILE: ("open files", "n", RLIMIT_NOFILE)}
+    limits = {
+        errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
+        errno.EMFILE: ("open files", "n", RLIMIT_NOFILE),
+    }
     if error.errno not in limits:
         return str(error)
     what, option, limit = limits[error.errno]
-    return f"{error.strerror}: at most {getrlimit(limit)[0]} {what} are permitted (ulimit -{option})"
+    return (
+        f"{error.strerror}: at most {getrlimit(limit)[0]} {what} are permitted (ulimit -{option})"
+    )
 
 
 def set_priority(priority: int) -> bool:

@@ -11,20 +11,27 @@ from rack.backplane.address_map import oldest_kept
 
 
 class Drained(NamedTuple):
-    """Rows read from a ring, oldest first, and the number of rows overwritten before they were read."""
+    """Rows read from a ring, oldest first, and the number of rows overwritten before they were
+    read."""
 
     rows: np.ndarray
     lost: int
 
 
 class Ring:
-    """A ring of fixed records that another process writes; `head` holds the number of records written.
+    """A ring of fixed records that another process writes; `head` holds the number of records
+    written.
 
-    `oldest` returns the number of the oldest record in `memory`, where that is a mirror without the others.
+    `oldest` returns the number of the oldest record in `memory`, where that is a mirror without the
+    others.
     """
 
     def __init__(
-        self, memory: memoryview, dtype: np.dtype, head: memoryview, oldest: Callable[[], int] = lambda: 0
+        self,
+        memory: memoryview,
+        dtype: np.dtype,
+        head: memoryview,
+        oldest: Callable[[], int] = lambda: 0,
     ) -> None:
         # As plain bytes: copying by field would skip the padding, and checksums would not match.
         self._rows = np.frombuffer(memory, dtype=f"V{dtype.itemsize}")

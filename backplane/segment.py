@@ -1,8 +1,8 @@
 """The backplane's memory: one POSIX shared-memory segment per rack.
 
-The Rack makes and unlinks it. All others attach by the rack's name and find the layout and the resolved config in the
-segment itself. It gets its name only when it is complete: a launcher killed earlier leaves nothing in /dev/shm, and no
-process ever finds half a segment.
+The Rack makes and unlinks it. All others attach by the rack's name and find the layout and the
+resolved config in the segment itself. It gets its name only when it is complete: a launcher killed
+earlier leaves nothing in /dev/shm, and no process ever finds half a segment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ import posix_ipc
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import is_locked
 from rack.backplane.errors import SegmentError
-from rack.backplane.layout import ExchangeSpec, FieldSpec, InterruptSpec, Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import (
+    ExchangeSpec,
+    FieldSpec,
+    InterruptSpec,
+    Layout,
+    MailboxSpec,
+    TaskSpec,
+)
 from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Head, Run, System
 
@@ -40,14 +47,17 @@ class Launch(NamedTuple):
 
     @property
     def wall_offset_ns(self) -> int:
-        """Wall clock less CLOCK_MONOTONIC: one for the whole run, as the wall clock may be set meanwhile."""
+        """Wall clock less CLOCK_MONOTONIC: one for the whole run, as the wall clock may be set
+        meanwhile."""
         return self.created_ns - self.monotonic_ns
 
 
 class Segment:
-    """An attached segment: `layout`, `config` (TOML text), `map`, and its memory as `words` and `bytes`.
+    """An attached segment: `layout`, `config` (TOML text), `map`, and its memory as `words` and
+    `bytes`.
 
-    A mirror of one on another machine has no file, thus no `fd`: it learns who is alive there by other ways.
+    A mirror of one on another machine has no file, thus no `fd`: it learns who is alive there by
+    other ways.
     """
 
     is_mirror = False
@@ -86,7 +96,10 @@ class Segment:
         except OSError as error:
             os.close(fd)
             if isinstance(error, FileExistsError):
-                why = "already has a segment: it is running, or was killed; see 'rack list', 'rack clean'"
+                why = (
+                    "already has a segment: it is running, or was killed; see 'rack list', 'rack"
+                    " clean'"
+                )
                 raise SegmentError(f"rack '{layout.rack}' {why}") from None
             raise no_room(layout.rack, f"{size} bytes of shared memory", error) from None
         return segment
@@ -95,7 +108,12 @@ class Segment:
         folder = os.open(SHM_FOLDER, os.O_PATH)
         try:
             # With a folder's descriptor the link leads to the path's target, not to the path.
-            os.link(f"/proc/self/fd/{self.fd}", shm_path(self.rack).name, src_dir_fd=folder, dst_dir_fd=folder)
+            os.link(
+                f"/proc/self/fd/{self.fd}",
+                shm_path(self.rack).name,
+                src_dir_fd=folder,
+                dst_dir_fd=folder,
+            )
         finally:
             os.close(folder)
 
@@ -114,7 +132,10 @@ class Segment:
         self.words[Head.SIZE] = len(self.bytes)
         self.words[Head.LAUNCHER_PID] = os.getpid()
         self.words[Head.LAUNCHER_START] = start_time(os.getpid())
-        self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS] = time.time_ns(), time.monotonic_ns()
+        self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS] = (
+            time.time_ns(),
+            time.monotonic_ns(),
+        )
         # Last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
 
@@ -134,7 +155,8 @@ class Segment:
 
     @classmethod
     def open(cls, rack: str) -> Self:
-        """Open a rack's segment of any version: the launcher is read from its head, the layout is not read.
+        """Open a rack's segment of any version: the launcher is read from its head, the layout is
+        not read.
 
         Raises `SegmentError` when there is none, or it is another user's, or not a segment.
         """
@@ -143,8 +165,14 @@ class Segment:
         try:
             shm = posix_ipc.SharedMemory(_shm_name(rack))
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
-            why = "belongs to another user" if isinstance(error, posix_ipc.PermissionsError) else "does not exist"
-            raise SegmentError(f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}") from None
+            why = (
+                "belongs to another user"
+                if isinstance(error, posix_ipc.PermissionsError)
+                else "does not exist"
+            )
+            raise SegmentError(
+                f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}"
+            ) from None
         found = os.fstat(shm.fd)
         if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
             os.close(shm.fd)
@@ -156,14 +184,20 @@ class Segment:
         """Read layout and config. Raises `SegmentError` when size or version is wrong."""
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:
             raise SegmentError(
-                f"rack '{self.rack}': layout version {self.words[Head.VERSION]}; this program attaches to {VERSION}"
+                f"rack '{self.rack}': layout version {self.words[Head.VERSION]}; this program"
+                f" attaches to {VERSION}"
             )
         if self.words[Head.SIZE] != len(self.bytes):
-            raise SegmentError(f"rack '{self.rack}': {len(self.bytes)} bytes; its head says {self.words[Head.SIZE]}")
+            raise SegmentError(
+                f"rack '{self.rack}': {len(self.bytes)} bytes; its head says"
+                f" {self.words[Head.SIZE]}"
+            )
         try:
             self.layout = layout_of(json.loads(self._text(Head.LAYOUT_AT)))
         except (TypeError, KeyError, ValueError) as error:
-            raise SegmentError(f"rack '{self.rack}': layout unreadable, from another program: {error}") from None
+            raise SegmentError(
+                f"rack '{self.rack}': layout unreadable, from another program: {error}"
+            ) from None
         self.config = self._text(Head.CONFIG_AT)
         self.map = AddressMap(self.layout)
 
@@ -181,13 +215,16 @@ class Segment:
         return self.words[start : start + max(Block) + 1]
 
     def is_locked(self, address: int) -> bool:
-        """Say whether a process holds the lock on the byte at a bus address: see `rack.backplane.byte_lock`."""
+        """Say whether a process holds the lock on the byte at a bus address: see
+        `rack.backplane.byte_lock`."""
         return is_locked(self.fd, address)
 
     def oldest(self, ring: int) -> int:
-        """Return the number of the oldest record that is here of the ring whose head word is at a bus address; 0: all.
+        """Return the number of the oldest record that is here of the ring whose head word is at a
+        bus address; 0: all.
 
-        A mirror lacks records: those that it did not fetch, or that were overwritten before it could.
+        A mirror lacks records: those that it did not fetch, or that were overwritten before it
+        could.
         """
         return 0
 
@@ -205,7 +242,9 @@ class Segment:
     def launcher_is_alive(self) -> bool:
         """Whether the process that made the segment, of any version, still runs."""
         words = self.words
-        return words[Head.MAGIC] == MAGIC and is_alive(words[Head.LAUNCHER_PID], words[Head.LAUNCHER_START])
+        return words[Head.MAGIC] == MAGIC and is_alive(
+            words[Head.LAUNCHER_PID], words[Head.LAUNCHER_START]
+        )
 
     @property
     def run_is_over(self) -> bool:
@@ -214,7 +253,8 @@ class Segment:
 
     @property
     def has_its_name(self) -> bool:
-        """Whether the rack's name still leads to this segment: another launch may have replaced it."""
+        """Whether the rack's name still leads to this segment: another launch may have replaced
+        it."""
         try:
             named = shm_path(self.rack).stat()
         except FileNotFoundError:
@@ -234,7 +274,8 @@ def racks() -> list[str]:
 
 
 def stranger(rack: str) -> str | None:
-    """Return the kind of a foreign entry under a rack's name, as in "directory"; None for a file, or no entry."""
+    """Return the kind of a foreign entry under a rack's name, as in "directory"; None for a file,
+    or no entry."""
     try:
         mode = shm_path(rack).lstat().st_mode
     except OSError:  # no such file, or an impossible name
@@ -253,14 +294,18 @@ def unlink(rack: str) -> None:
     except posix_ipc.ExistentialError:
         return
     except posix_ipc.PermissionsError:
-        raise SegmentError(f"rack '{rack}' belongs to another user: only that user may remove it") from None
+        raise SegmentError(
+            f"rack '{rack}' belongs to another user: only that user may remove it"
+        ) from None
 
 
 def no_room(rack: str, needed: str, error: OSError) -> SegmentError:
     """Return the error of a rack whose shared memory cannot be obtained."""
     found = os.statvfs(SHM_FOLDER)
     size, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
-    room = f"{SHM_FOLDER} has {size} bytes, {free} of them free; in a container --shm-size enlarges it"
+    room = (
+        f"{SHM_FOLDER} has {size} bytes, {free} of them free; in a container --shm-size enlarges it"
+    )
     return SegmentError(f"rack '{rack}': {needed}: {error.strerror}: {room}")
 
 
@@ -278,7 +323,9 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
     fields = tuple(_field(f) for f in entry["fields"])
     values = tuple((name, number) for name, number in entry["values"])
     length = entry.get("length") and tuple(entry["length"])
-    return FieldSpec(**{**entry, "shape": shape, "fields": fields, "values": values, "length": length})
+    return FieldSpec(
+        **{**entry, "shape": shape, "fields": fields, "values": values, "length": length}
+    )
 
 
 def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:
@@ -293,6 +340,9 @@ def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:
 
 def layout_of(entry: dict[str, Any]) -> Layout:
     """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
-    boxes = [mailbox_of({**m, "fields": tuple(_field(f) for f in m["fields"])}) for m in entry["mailboxes"]]
+    boxes = [
+        mailbox_of({**m, "fields": tuple(_field(f) for f in m["fields"])})
+        for m in entry["mailboxes"]
+    ]
     tasks, hosts = (tuple(TaskSpec(**t) for t in entry[key]) for key in ("tasks", "hosts"))
     return Layout(**{**entry, "tasks": tasks, "hosts": hosts, "mailboxes": tuple(boxes)})

@@ -1,11 +1,12 @@
-"""The named semaphores of a rack: two per task, to wake it and for its reports to lockstep; one per locked mailbox.
+"""The named semaphores of a rack: two per task, to wake it and for its reports to lockstep; one per
+locked mailbox.
 
-The Rack makes them, the crate opens them before it forks the boards, and the names are then removed: the boards keep
-the open semaphores, and no name is left over even if they are killed.
+The Rack makes them, the crate opens them before it forks the boards, and the names are then
+removed: the boards keep the open semaphores, and no name is left over even if they are killed.
 
-`posix_ipc` waits by the wall clock: if that is set back by an hour, a wait of 2 ms takes an hour. The C library can
-wait by CLOCK_MONOTONIC (since glibc 2.30). Alternatives considered: a futex through ctypes, and an eventfd with `poll`;
-both wake up more slowly.
+`posix_ipc` waits by the wall clock: if that is set back by an hour, a wait of 2 ms takes an hour.
+The C library can wait by CLOCK_MONOTONIC (since glibc 2.30). Alternatives considered: a futex
+through ctypes, and an eventfd with `poll`; both wake up more slowly.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no types
     """An open semaphore whose waits do not depend on the wall clock.
 
-    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. A signal may end it
-    early. It is the C library's own; calling it through ctypes takes some microseconds of processor time, so waits that
-    need no exact bound have `await_post`.
+    `wait()` waits until the time set by `bind`, and returns 0 when it has obtained the semaphore. A
+    signal may end it early. It is the C library's own; calling it through ctypes takes some
+    microseconds of processor time, so waits that need no exact bound have `await_post`.
     """
 
     def __init__(self, name: str) -> None:
@@ -45,7 +46,9 @@ class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no 
         address = _sem_open(name.encode(), 0)
         # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
-        self.wait = partial(_sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline))
+        self.wait = partial(
+            _sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline)
+        )
 
     def bind(self, deadline_ns: int) -> None:
         """Let waits end at that time, CLOCK_MONOTONIC."""
@@ -102,10 +105,17 @@ def create(layout: Layout) -> None:
         try:
             posix_ipc.Semaphore(name, posix_ipc.O_CREX, mode=0o600, initial_value=initial).close()
         except posix_ipc.ExistentialError:
-            why = "belongs to another user: only that user may remove it; choose another name for the rack"
-            raise SegmentError(f"rack '{layout.rack}': semaphore {SHM_FOLDER}/sem.{name[1:]} {why}") from None
+            why = (
+                "belongs to another user: only that user may remove it; choose another name for the"
+                " rack"
+            )
+            raise SegmentError(
+                f"rack '{layout.rack}': semaphore {SHM_FOLDER}/sem.{name[1:]} {why}"
+            ) from None
         except OSError as error:
-            raise no_room(layout.rack, f"{len(every)} semaphores of {PAGESIZE} bytes", error) from None
+            raise no_room(
+                layout.rack, f"{len(every)} semaphores of {PAGESIZE} bytes", error
+            ) from None
 
 
 def open_all(layout: Layout) -> None:
@@ -115,7 +125,8 @@ def open_all(layout: Layout) -> None:
 
 
 def unlink(layout: Layout, kept: Sequence[str] = ()) -> None:
-    """Remove the names; processes keep the semaphores that they have open. Those that wake `kept` keep theirs."""
+    """Remove the names; processes keep the semaphores that they have open. Those that wake `kept`
+    keep theirs."""
     wake = [_name(layout.rack, "wake", host) for host in kept]
     for name in names(layout):
         if name not in wake:
@@ -124,7 +135,8 @@ def unlink(layout: Layout, kept: Sequence[str] = ()) -> None:
 
 def unlink_all(rack: str) -> None:
     """Remove every semaphore name of a rack whose layout is not known."""
-    # The C library keeps semaphores in the segments' folder, with its own prefix. A rack's name has no dot.
+    # The C library keeps semaphores in the segments' folder, with its own prefix. A rack's name has
+    # no dot.
     for path in SHM_FOLDER.glob(f"sem.{PREFIX}{rack}.*"):
         _unlink(f"/{path.name.removeprefix('sem.')}")
 
@@ -135,7 +147,8 @@ def wake_semaphore(rack: str, task: str) -> Semaphore:
 
 
 def done_semaphore(rack: str, task: str) -> Semaphore:
-    """Return the open semaphore on which lockstep waits for a task's reports, or for the crate to report its loss."""
+    """Return the open semaphore on which lockstep waits for a task's reports, or for the crate to
+    report its loss."""
     return _opened(_name(rack, "done", task))
 
 

@@ -1,12 +1,13 @@
 """Trace rings: one fixed record for each cycle of a task, written without ever waiting.
 
-One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process part) and t_residual
-(deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and the processor time of the cycle, without
-preemption. A reader that falls behind knows how many records it lost.
+One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process
+part) and t_residual (deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and
+the processor time of the cycle, without preemption. A reader that falls behind knows how many
+records it lost.
 
-A task traces a cycle after its last write. The trace therefore also proves things about messages (`CycleRecord`): one
-that is missing by then was not written, and one that appears later was held back. Age alone proves nothing, since the
-task may have been preempted.
+A task traces a cycle after its last write. The trace therefore also proves things about messages
+(`CycleRecord`): one that is missing by then was not written, and one that appears later was held
+back. Age alone proves nothing, since the task may have been preempted.
 """
 
 from __future__ import annotations
@@ -27,13 +28,20 @@ RECORD = np.dtype(
         ("tick", "i8"),  # release, in ticks
         ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
         ("start_ns", "i8"),
-        ("plan_ns", "i8"),  # an executor has read its plan over the bus (C of fig. 4); start_ns if it has none to read
+        # An executor has read its plan over the bus (C of fig. 4); start_ns if it has none to read.
+        ("plan_ns", "i8"),
         ("read_ns", "i8"),  # command, status and plan read
         ("process_ns", "i8"),  # process done
         ("end_ns", "i8"),  # command and status written
-        ("flags", "i8"),  # Flag in the low 16 bits; above them the number of releases skipped just before
+        (
+            "flags",
+            "i8",
+        ),  # Flag in the low 16 bits; above them the number of releases skipped just before
         ("state", "i8"),  # state of the level
-        ("processor_ns", "i8"),  # processor time of its thread since the last record: this cycle, and waking up for it
+        (
+            "processor_ns",
+            "i8",
+        ),  # processor time of its thread since the last record: this cycle, and waking up for it
         ("closed_ns", "i8"),  # the bookkeeping of the cycle before was done; 0: there was none
     ]
 )
@@ -82,7 +90,12 @@ def trace_ring(segment: Segment, task: str) -> Ring:
     spec = segment.layout.task(task)
     head = segment.block(task)[Block.TRACE_HEAD : Block.TRACE_HEAD + 1]
     memory = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
-    return Ring(memory, RECORD, head, partial(segment.oldest, segment.map.blocks[task] + 8 * Block.TRACE_HEAD))
+    return Ring(
+        memory,
+        RECORD,
+        head,
+        partial(segment.oldest, segment.map.blocks[task] + 8 * Block.TRACE_HEAD),
+    )
 
 
 class CycleRecord:
@@ -104,7 +117,8 @@ class CycleRecord:
         return tick if count and not flags & _BUS_ERROR and self._keeps(count) else -1
 
     def ended_ns(self, tick: int) -> int | None:
-        """Return the end of the cycle released at `tick`, CLOCK_MONOTONIC; None without a record of it."""
+        """Return the end of the cycle released at `tick`, CLOCK_MONOTONIC; None without a record of
+        it."""
         count = self._block[_TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)

@@ -1,7 +1,7 @@
 """The shared words: every number on the backplane outside messages, by name.
 
-Each is an aligned 64-bit integer with one writer, stored and loaded whole through a memoryview cast to 'q'. (`struct`
-packs byte by byte: a reader could see half a number.)
+Each is an aligned 64-bit integer with one writer, stored and loaded whole through a memoryview cast
+to 'q'. (`struct` packs byte by byte: a reader could see half a number.)
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ from enum import IntEnum
 
 
 def switch(tick: int, is_on: bool) -> int:
-    """Return the value of a word that switches on, or off, at `tick`: until then the opposite holds.
+    """Return the value of a word that switches on, or off, at `tick`: until then the opposite
+    holds.
 
-    So readers agree on it by ticks alone, whenever they look. Each switch follows the opposite one; 0: never on.
+    So readers agree on it by ticks alone, whenever they look. Each switch follows the opposite one;
+    0: never on.
     """
     return 2 * tick + is_on
 
@@ -52,7 +54,9 @@ class System(IntEnum):
     FOLLOWER_PID = 40  # of the recorder for which lockstep waits; 0: none
     FOLLOWER_TICK = 41  # everything up to here is recorded
     TICK_NS = 42  # CLOCK_MONOTONIC of the newest tick
-    FAULTS = 43  # rises with every change in the fault table that concerns tasks; written by the clock
+    FAULTS = (
+        43  # rises with every change in the fault table that concerns tasks; written by the clock
+    )
     DEMAND = 44  # Demand of the utility lines on the arm; written by the clock
     CLOCK_PID = 45
     INJECTED = 46  # faults put into the fault table so far
@@ -62,11 +66,15 @@ class System(IntEnum):
     EMERGENCY_STOP = 50
     REQUESTED = 51  # commands put into the operator table so far
     COMMANDED = 52  # serial of the newest command issued; written by the clock
-    HOLD_AT = 53  # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
+    # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
+    HOLD_AT = 53
     HELD = 54  # 1 + tick before which it holds now; 0: it does not. Written by the clock
-    PEER_STOP = 55  # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
+    # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
+    PEER_STOP = 55
     SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
-    FOLLOWER_DRAINED = 57  # the recorder has taken everything up to here, whether or not it is in its files
+    FOLLOWER_DRAINED = (
+        57  # the recorder has taken everything up to here, whether or not it is in its files
+    )
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -79,7 +87,8 @@ class Run(IntEnum):
 
 
 class Demand(IntEnum):
-    """Values of `System.DEMAND`: the demand of the rack's safety on the arm; a greater one is stronger."""
+    """Values of `System.DEMAND`: the demand of the rack's safety on the arm; a greater one is
+    stronger."""
 
     NONE = 0
     STOP = 1  # controlled stop: ramp to rest, then brake
@@ -87,9 +96,11 @@ class Demand(IntEnum):
 
 
 class Block(IntEnum):
-    """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the finder of a loss.
+    """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the
+    finder of a loss.
 
-    A host board has one too. In lockstep its bus adapter releases it: see `rack.boards.host.bus_adapter`.
+    A host board has one too. In lockstep its bus adapter releases it: see
+    `rack.boards.host.bus_adapter`.
     """
 
     RELEASED = 0  # newest release, as a tick; -1: none yet
@@ -111,14 +122,22 @@ class Block(IntEnum):
     TRACE_HEAD = 16  # trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
     PLANS = 18  # plans made
-    LOST = 19  # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
+    LOST = (
+        19  # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
+    )
     LEVEL_SINCE = 20  # tick of the cycle in which the level entered that state
-    AWAITS = 21  # of the network adapter in lockstep: the rack that its cycle awaits; 0: none. See boards.lan.awaited
-    INTERRUPTS = 22  # messages that have interrupted this board and were served, under protocol interrupt
+    # of the network adapter in lockstep: the rack that its cycle awaits; 0: none. See
+    # boards.lan.awaited
+    AWAITS = 21
+    INTERRUPTS = (
+        22  # messages that have interrupted this board and were served, under protocol interrupt
+    )
     INTERRUPTS_LOST = 23  # those lost because too many waited
     INTERRUPTS_WAITING = 24  # the largest number that has waited
     CLOCK_SKIPPED = 25  # ticks skipped by the clock that this task has reported
-    WAITS_UNTIL = 26  # of a host board in lockstep: tick until which its program waits; 0: a message has come
+    WAITS_UNTIL = (
+        26  # of a host board in lockstep: tick until which its program waits; 0: a message has come
+    )
 
 
 class TaskState(IntEnum):
@@ -140,21 +159,31 @@ class Box(IntEnum):
     EPOCH = 1  # counts the writers that have claimed the mailbox
     WRITER_PID = 2
     CLAIM = 3  # no value: the writer holds the kernel's lock on this address
-    OWNER = 4  # the same for the critical section of protocol lock; value: its owner's process id, 0: none
-    CLAIMANT = 5  # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
+    # the same for the critical section of protocol lock; value: its owner's process id, 0: none
+    OWNER = 4
+    # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
+    CLAIMANT = 5
     REFUSED = 6  # of a queue: messages refused because it was full
-    SENT = 7  # of a queue: serial of the newest message of its own writer; HEAD is greater while another has published
-    TAKEN = 8  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
-    VOID = 9  # of what comes from another rack, while that is lost: its writer counts as lost. See `switch`
+    # of a queue: serial of the newest message of its own writer; HEAD is greater while another has
+    # published
+    SENT = 7
+    TAKEN = (
+        8  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
+    )
+    # of what comes from another rack, while that is lost: its writer counts as lost. See `switch`
+    VOID = 9
     KEPT = 10  # the same, for racks that go on: its information does not grow too old. See `switch`
-    POSITION = 11  # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
+    POSITION = (
+        11  # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
+    )
 
 
 class Slot(IntEnum):
     """Words in front of every message in its slot.
 
-    The checksum covers BASIS to the end of the message and, as it is seeded with CHAIN, the checksum of the message
-    before, all earlier messages. It does not cover time stamp and writer, so that equal runs have equal checksums.
+    The checksum covers BASIS to the end of the message and, as it is seeded with CHAIN, the
+    checksum of the message before, all earlier messages. It does not cover time stamp and writer,
+    so that equal runs have equal checksums.
     """
 
     STAMP_NS = 0

@@ -5,13 +5,16 @@
     with Rack.from_file("nasrem") as rack:
         print(rack.run(seconds=10))
 
-- `Rack` launches the boards of a config, supervises them and ends them; `Outcome` says how a run ended.
-- `Event` is one occurrence in a run; `Rack(config, on_event=...)` passes each to your program as it happens.
+- `Rack` launches the boards of a config, supervises them and ends them; `Outcome` says how a run
+  ended.
+- `Event` is one occurrence in a run; `Rack(config, on_event=...)` passes each to your program as it
+  happens.
 - `load` reads a config by name or path, with overrides; `RackConfig` is the result.
-- `BoardError` is the root of all errors: `ConfigError` holds every `Mistake` of a config, `LaunchError` means that a
-  board did not start.
+- `BoardError` is the root of all errors: `ConfigError` holds every `Mistake` of a config,
+  `LaunchError` means that a board did not start.
 
-Names are imported on first use: the crate and its boards import parts of this package and must stay small.
+Names are imported on first use: the crate and its boards import parts of this package and must stay
+small.
 """
 
 from __future__ import annotations
@@ -27,7 +30,17 @@ if TYPE_CHECKING:
     from rack.boards.errors import BoardError, ConfigError, LaunchError, Mistake
     from rack.boards.events import Cause, Event, EventKind, Outcome
 
-__all__ = ["BoardError", "Cause", "ConfigError", "Event", "EventKind", "LaunchError", "Mistake", "Outcome", "Rack"]
+__all__ = [
+    "BoardError",
+    "Cause",
+    "ConfigError",
+    "Event",
+    "EventKind",
+    "LaunchError",
+    "Mistake",
+    "Outcome",
+    "Rack",
+]
 __all__ += ["RackConfig", "load"]
 _PLACES = {
     "rack.boards.config": ("load",),

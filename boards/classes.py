@@ -19,13 +19,20 @@ def extend_path(folders: Sequence[Path]) -> None:
 
 
 def find_class(reference: str, base: type[T]) -> type[T]:
-    """Return the subclass of `base` that "package.module:Class" names. Raises `LookupError` with the reason."""
+    """Return the subclass of `base` that "package.module:Class" names. Raises `LookupError` with
+    the reason."""
     module, name = module_and_name(reference)
     found = getattr(module, name, None)
     if not isinstance(found, type) or not issubclass(found, base):
-        kinds = [n for n, c in inspect.getmembers(module, inspect.isclass) if issubclass(c, base) and c is not base]
+        kinds = [
+            n
+            for n, c in inspect.getmembers(module, inspect.isclass)
+            if issubclass(c, base) and c is not base
+        ]
         what = "has no class" if found is None else f"has no {base.__name__} named"
-        raise LookupError(f"module '{module.__name__}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}")
+        raise LookupError(
+            f"module '{module.__name__}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}"
+        )
     if inspect.isabstract(found):
         missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
         raise LookupError(f"class '{name}' lacks the method '{missing}'")

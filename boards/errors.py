@@ -29,7 +29,8 @@ class LaunchError(BoardError):
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake in a config: its place, the value there (None: none), and the reason or the permitted values."""
+    """One mistake in a config: its place, the value there (None: none), and the reason or the
+    permitted values."""
 
     place: str
     value: Any
@@ -42,7 +43,8 @@ class Mistake:
 
 
 class ConfigError(BoardError):
-    """A config that cannot run. `mistakes` holds every mistake found; the text has one line per mistake."""
+    """A config that cannot run. `mistakes` holds every mistake found; the text has one line per
+    mistake."""
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list({str(mistake): mistake for mistake in mistakes}.values())
@@ -53,7 +55,13 @@ def shown(value: Any) -> str:
     """Return a config value as in TOML, shortened to one line."""
     value = list(value) if isinstance(value, tuple) else value
     try:
-        text = str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
+        text = (
+            str(value).lower()
+            if isinstance(value, bool)
+            else f'"{value}"'
+            if isinstance(value, str)
+            else str(value)
+        )
     except ValueError:  # Python refuses to print integers of thousands of digits
         text = f"an integer of {value.bit_length()} bits"
     return one_line(text, LONGEST_VALUE)

@@ -17,18 +17,32 @@ from rack.levels.goals import ObjectEnd, ends
 if TYPE_CHECKING:
     from rack.levels.tables import GoalConfig
 
-OfRun = Literal["launch", "waiting", "ready", "start", "printed", "died", "done", "stop", "end", "recorder", "command"]
+OfRun = Literal[
+    "launch",
+    "waiting",
+    "ready",
+    "start",
+    "printed",
+    "died",
+    "done",
+    "stop",
+    "end",
+    "recorder",
+    "command",
+]
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 
 
 @dataclass(frozen=True)
 class Event:
-    """An occurrence in a run. `time_ns` is CLOCK_REALTIME; `tick` is the system clock's (-1: before the run).
+    """An occurrence in a run. `time_ns` is CLOCK_REALTIME; `tick` is the system clock's (-1: before
+    the run).
 
-    For programs: `code` is an alarm's name in lower case, "begins" or "ends" for a fault, or an operator's command;
-    `fault` is an entry of the fault table (-1: none); `subject` is the affected mailbox, joint, task or level; `value`
-    is the measured value, or a command's serial; `since` is the tick at which the condition began (-1: unknown).
+    For programs: `code` is an alarm's name in lower case, "begins" or "ends" for a fault, or an
+    operator's command; `fault` is an entry of the fault table (-1: none); `subject` is the affected
+    mailbox, joint, task or level; `value` is the measured value, or a command's serial; `since` is
+    the tick at which the condition began (-1: unknown).
     """
 
     time_ns: int
@@ -45,9 +59,11 @@ class Event:
 
 DEMANDED = "a stop is demanded"
 NO_TORQUE = "no torque"
-"""Reasons for which brakes engage: on a demand, of which other events say why, or because no torque came in time."""
+"""Reasons for which brakes engage: on a demand, of which other events say why, or because no torque
+came in time."""
 HELD_MS = 5e3
-"""Time on end for which an arm may be braked, or a level held, in a run that succeeds, without a cause in sight."""
+"""Time on end for which an arm may be braked, or a level held, in a run that succeeds, without a
+cause in sight."""
 HELD_PART = 0.5
 """Part of a run for which an arm may be braked so, again and again."""
 
@@ -62,12 +78,21 @@ class Braking:
 
 
 def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
-    """Return every time that brakes engaged in a run of `end` ticks, by its events; not those of the start."""
+    """Return every time that brakes engaged in a run of `end` ticks, by its events; not those of
+    the start."""
     changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
-    found = [(one.subject, one.tick - int(one.value), one.tick) for one in changes if one.code == "brakes_opened"]
+    found = [
+        (one.subject, one.tick - int(one.value), one.tick)
+        for one in changes
+        if one.code == "brakes_opened"
+    ]
     if changes and changes[-1].code == "brakes_closed":
         found.append((changes[-1].subject, changes[-1].tick, end))
-    return tuple(Braking(why, since, round((until - since) * tick_ms, 6)) for why, since, until in found if why)
+    return tuple(
+        Braking(why, since, round((until - since) * tick_ms, 6))
+        for why, since, until in found
+        if why
+    )
 
 
 def braked_text(found: Sequence[Braking]) -> str:
@@ -75,21 +100,33 @@ def braked_text(found: Sequence[Braking]) -> str:
     longest = max(found, key=lambda one: one.lasted_ms)
     total_ms = sum(one.lasted_ms for one in found)
     times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
-    reasons = ", ".join(f"{why} ({count})" for why, count in Counter(one.why for one in found).most_common())
+    reasons = ", ".join(
+        f"{why} ({count})" for why, count in Counter(one.why for one in found).most_common()
+    )
     return f"brakes engaged {len(found)} time{'s' * (len(found) > 1)}, {times}: {reasons}"
 
 
-Cause = Literal["task done", "task refused", "task failed", "time over", "stopped", "board lost", "launcher lost"]
-"""A task is refused if it never began, as it has no moves; any other task that ends with an error has failed."""
+Cause = Literal[
+    "task done",
+    "task refused",
+    "task failed",
+    "time over",
+    "stopped",
+    "board lost",
+    "launcher lost",
+]
+"""A task is refused if it never began, as it has no moves; any other task that ends with an error
+has failed."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a run: its cause, its length in ticks, and the digest of everything written until then.
+    """The end of a run: its cause, its length in ticks, and the digest of everything written until
+    then.
 
-    `state` and `reason` are those of the level that ends the run; `faults` are latched faults, lost boards,
-    objects beyond their goals when the task says that it is done, and long holds without a cause in sight. `brakings`
-    are those after the start; `objects`: where each ended.
+    `state` and `reason` are those of the level that ends the run; `faults` are latched faults, lost
+    boards, objects beyond their goals when the task says that it is done, and long holds without a
+    cause in sight. `brakings` are those after the start; `objects`: where each ended.
     """
 
     cause: Cause
@@ -128,7 +165,17 @@ class Journal:
         """Record an event that happens now, or happened at CLOCK_MONOTONIC `at_ns` and `tick`."""
         now_ns = time.time_ns()
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
-        self.keep(Event(stamp_ns, self._tick if tick is None else tick, kind, board, text, code, subject=subject))
+        self.keep(
+            Event(
+                stamp_ns,
+                self._tick if tick is None else tick,
+                kind,
+                board,
+                text,
+                code,
+                subject=subject,
+            )
+        )
 
     def keep(self, event: Event) -> None:
         """Record an event and pass it on."""
@@ -167,22 +214,39 @@ class Ending:
             return "", ""
         status = self._observer.peek().value
         silent_s = self._silence() * self._segment.layout.clock_ns * 1e-9
-        reason = f"'{self._ends_run}' has not been written for {silent_s:g} s" if silent_s else status.reason
+        reason = (
+            f"'{self._ends_run}' has not been written for {silent_s:g} s"
+            if silent_s
+            else status.reason
+        )
         return State(status.state).name.lower(), reason
 
     def latched(self) -> list[str]:
-        """Return a line for every level whose last status reports an error, except the level that ends the run."""
-        errors = [(board, status.reason) for board, status in statuses(self._segment, "error") if status.error]
-        return [f"level '{board}': {reason}" for board, reason in errors if f"{board}.status" != self._ends_run]
+        """Return a line for every level whose last status reports an error, except the level that
+        ends the run."""
+        errors = [
+            (board, status.reason)
+            for board, status in statuses(self._segment, "error")
+            if status.error
+        ]
+        return [
+            f"level '{board}': {reason}"
+            for board, reason in errors
+            if f"{board}.status" != self._ends_run
+        ]
 
-    def held(self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float) -> Iterator[str]:
+    def held(
+        self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float
+    ) -> Iterator[str]:
         """Yield in a line what held a run of `ran_ms` for so long that it is no success.
 
-        Nothing is yielded with a cause in sight: a fault was injected, an operator has commanded, a stop is demanded.
-        Levels of a rack on a network wait for other racks, and show for which.
+        Nothing is yielded with a cause in sight: a fault was injected, an operator has commanded, a
+        stop is demanded. Levels of a rack on a network wait for other racks, and show for which.
         """
         segment = self._segment
-        if segment.words[System.DEMAND] or any(event.kind in ("fault", "command") for event in events):
+        if segment.words[System.DEMAND] or any(
+            event.kind in ("fault", "command") for event in events
+        ):
             return
         never = []
         held = []
@@ -193,7 +257,10 @@ class Ending:
             if not found and getattr(status, "braked", False):
                 never.append(Braking(status.reason or NO_TORQUE, since, lasted_ms))
             if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
-                held.append(f"level '{name}' held for {lasted_ms:g} ms without a cause in sight: {status.reason}")
+                held.append(
+                    f"level '{name}' held for {lasted_ms:g} ms without a cause in sight:"
+                    f" {status.reason}"
+                )
         braked = [one for one in found if one.why != DEMANDED] or never
         times = [one.lasted_ms for one in braked]
         if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
@@ -202,9 +269,13 @@ class Ending:
             yield from held
 
     def ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
-        """Return where objects that have goals ended, as sensed last; none if nothing senses them."""
+        """Return where objects that have goals ended, as sensed last; none if nothing senses
+        them."""
         for box in self._segment.layout.mailboxes:
-            if box.message == "scene" and (scene := open_observer(self._segment, box.name).peek()).is_there:
+            if (
+                box.message == "scene"
+                and (scene := open_observer(self._segment, box.name).peek()).is_there
+            ):
                 return tuple(ends(goals, scene.value.position))
         return ()
 
@@ -222,10 +293,13 @@ class Ending:
         return "task refused" if is_refused else "task failed"
 
     def _silence(self) -> int:
-        """Return the ticks since the last status of the level that ends the run; 0 if permitted, or if it has ended."""
+        """Return the ticks since the last status of the level that ends the run; 0 if permitted, or
+        if it has ended."""
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()
         if reading.value.state in (State.DONE, State.ERROR):
             return 0
-        ticks = self._segment.words[System.TICK] - (self._observer.newest if reading.is_there else 0)
+        ticks = self._segment.words[System.TICK] - (
+            self._observer.newest if reading.is_there else 0
+        )
         return ticks if ticks > self._silent else 0

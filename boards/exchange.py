@@ -1,7 +1,8 @@
-"""The exchange of a board: which message of each port is in use, its age, and when the board took it.
+"""The exchange of a board: which message of each port is in use, its age, and when the board took
+it.
 
-A board whose config has tables `[board.<name>.exchange.<port>]` writes this into its mailbox `<name>.exchange` in every
-cycle, so that ages and arrivals are on record like any other message.
+A board whose config has tables `[board.<name>.exchange.<port>]` writes this into its mailbox
+`<name>.exchange` in every cycle, so that ages and arrivals are on record like any other message.
 """
 
 from __future__ import annotations
@@ -39,9 +40,14 @@ def _labels(reads: Mapping[str, Source]) -> Iterator[str]:
 
 
 def _fields(label: str) -> tuple[Field, Field]:
-    age = "from the release of the message in use to that of this cycle; negative: released later; 0 before the first"
+    age = (
+        "from the release of the message in use to that of this cycle; negative: released later; 0"
+        " before the first"
+    )
     taken = f"release of the cycle that took it; {NEVER} before the first"
-    return Field(f"{label}_{AGE}", "i8", "tick", age), Field(f"{label}_{TAKEN}", "i8", "tick", taken)
+    return Field(f"{label}_{AGE}", "i8", "tick", age), Field(
+        f"{label}_{TAKEN}", "i8", "tick", taken
+    )
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,9 @@ def ages_of(exchange: Message) -> dict[str, PortAge]:
     names = exchange.record.dtype.names or ()
     values = iter(exchange.raw.cast("q"))
     labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
-    found = {label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)}
+    found = {
+        label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)
+    }
     return {label: port for label, port in found.items() if port.taken != NEVER}
 
 
@@ -70,7 +78,8 @@ class Taken(NamedTuple):
 
 
 class ExchangeRecord:
-    """Fills a board's exchange message from its inputs, which come in the order of `exchange_message`."""
+    """Fills a board's exchange message from its inputs, which come in the order of
+    `exchange_message`."""
 
     def __init__(self, inputs: Sequence[Taken], message: Message) -> None:
         self._inputs = tuple(inputs)

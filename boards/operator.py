@@ -31,9 +31,14 @@ def describe(message: Message) -> str:
     if goal == Goal.JOINTS:
         return f"{what} joints {_numbers(message.joints[: message.count])}"
     if goal == Goal.POSE:
-        return f"{what} position {_numbers(message.position)} quaternion {_numbers(message.quaternion)}"
+        return (
+            f"{what} position {_numbers(message.position)} quaternion"
+            f" {_numbers(message.quaternion)}"
+        )
     if goal == Goal.DIRECTION:
-        return f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+        return (
+            f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+        )
     name = f" {message.name}" if message.name else ""
     return what + name + (f" {Goal(goal).name.lower()}" if goal else "")
 

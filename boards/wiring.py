@@ -24,7 +24,8 @@ def mailboxes_of(source: Source) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class BusTimes:
-    """A slower bus: minimum processor time of each kind of access, ns; see `[board.<name>.transfer]`."""
+    """A slower bus: minimum processor time of each kind of access, ns; see
+    `[board.<name>.transfer]`."""
 
     read_ns: int = 0
     write_ns: int = 0
@@ -36,10 +37,11 @@ class BusTimes:
 class TaskWiring:
     """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
 
-    `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update. `guards_clock`: the
-    task is one of the fastest and watches the clock. `sent`: the ports whose messages the level sends itself.
-    `fails_self_test`: a fault in the config. `entries`: for a bus adapter in a replay. `exchange`: the ports that are
-    not simply read in every cycle; it makes the task write its mailbox `<board>.exchange`.
+    `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update.
+    `guards_clock`: the task is one of the fastest and watches the clock. `sent`: the ports whose
+    messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for a bus
+    adapter in a replay. `exchange`: the ports that are not simply read in every cycle; it makes the
+    task write its mailbox `<board>.exchange`.
     """
 
     task: str
@@ -58,7 +60,8 @@ class TaskWiring:
 
 @dataclass(frozen=True)
 class HostWiring:
-    """One host board: its program's class, and the mailbox of each port. External: a prompt runs it, not the rack.
+    """One host board: its program's class, and the mailbox of each port. External: a prompt runs
+    it, not the rack.
 
     `computing`: simulated time for which it computes after each wait, in lockstep, ticks.
     """
@@ -74,12 +77,14 @@ class HostWiring:
 
 @dataclass(frozen=True)
 class ClockWiring:
-    """The clock's board: the course of a run in time. `period_ns` is wall-clock time, including the speed factor.
+    """The clock's board: the course of a run in time. `period_ns` is wall-clock time, including the
+    speed factor.
 
-    All other times are ticks. The run ends at `stop_tick` (0: never), or `linger` after the status mailbox `ends_run`
-    reports done or error, or if its writer, not lost, has written nothing for `silent`. In lockstep the clock is at
-    most `history` ahead of a recorder, and a lost board rejoins `restart_ticks` after its loss. `on_loss`: the demand
-    on the arm while a task is lost. `keeps_awake`: no core sleeps while it is idle.
+    All other times are ticks. The run ends at `stop_tick` (0: never), or `linger` after the status
+    mailbox `ends_run` reports done or error, or if its writer, not lost, has written nothing for
+    `silent`. In lockstep the clock is at most `history` ahead of a recorder, and a lost board
+    rejoins `restart_ticks` after its loss. `on_loss`: the demand on the arm while a task is lost.
+    `keeps_awake`: no core sleeps while it is idle.
     """
 
     lockstep: bool

@@ -1,16 +1,21 @@
-"""Virtual control loops: the public API of a level's author. `rack.levels.level` describes what a level must do.
+"""Virtual control loops: the public API of a level's author. `rack.levels.level` describes what a
+level must do.
 
-- Write a level: `Executor`, `Planner`, with `Input`, `Ports`, `Program`, `Reading`, `Verdict`, `LevelContext`, `Pace`.
-- Declare messages: `MessageType`, `Field`, `command`, `status`, `Message`, `State`; the default levels' messages are in
-  `rack.levels.messages`, and their error codes in `Error`.
-- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`; arm and cell: `RobotConfig`, `SceneConfig`.
-- Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OPERATOR_COMMAND`, `ANSWER`, `RESTS_ON`.
+- Write a level: `Executor`, `Planner`, with `Input`, `Ports`, `Program`, `Reading`, `Verdict`,
+  `LevelContext`, `Pace`.
+- Declare messages: `MessageType`, `Field`, `command`, `status`, `Message`, `State`; the default
+  levels' messages are in `rack.levels.messages`, and their error codes in `Error`.
+- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`; arm and cell: `RobotConfig`,
+  `SceneConfig`.
+- Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OPERATOR_COMMAND`, `ANSWER`,
+  `RESTS_ON`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
 
-Import the rest by module, since MuJoCo takes half a second: `rack.levels.algebra` (arithmetic with the same bits on
-every processor), `rack.levels.robot` (cell, limits, dynamics), `rack.levels.arm` (the arm's interface), and the default
-levels: `servo`, `primitive`, `elemental_move`, `task`, `world`, `figures`.
+Import the rest by module, since MuJoCo takes half a second: `rack.levels.algebra` (arithmetic with
+the same bits on every processor), `rack.levels.robot` (cell, limits, dynamics), `rack.levels.arm`
+(the arm's interface), and the default levels: `servo`, `primitive`, `elemental_move`, `task`,
+`world`, `figures`.
 """
 
 from __future__ import annotations
@@ -38,13 +43,60 @@ if TYPE_CHECKING:
         Verdict,
     )
     from rack.levels.messages import Error
-    from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Commands, Goal, Operation, Orders
+    from rack.levels.operator import (
+        ANSWER,
+        OPERATOR_COMMAND,
+        RESTS_ON,
+        Commands,
+        Goal,
+        Operation,
+        Orders,
+    )
     from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, read_params
 
-__all__ = ["ANSWER", "OPERATOR_COMMAND", "RESTS_ON", "Alarm", "Commands", "Demand", "Error", "Executor", "Fault"]
-__all__ += ["Field", "Finding", "Finite", "Goal", "Input", "LevelContext", "LevelError", "Message", "MessageType"]
-__all__ += ["Operation", "Orders", "Pace", "Planner", "Ports", "Positive", "Program", "ProgramError", "Reading"]
-__all__ += ["Refused", "RobotConfig", "RobotError", "SceneConfig", "State", "Table", "Verdict", "command"]
+__all__ = [
+    "ANSWER",
+    "OPERATOR_COMMAND",
+    "RESTS_ON",
+    "Alarm",
+    "Commands",
+    "Demand",
+    "Error",
+    "Executor",
+    "Fault",
+]
+__all__ += [
+    "Field",
+    "Finding",
+    "Finite",
+    "Goal",
+    "Input",
+    "LevelContext",
+    "LevelError",
+    "Message",
+    "MessageType",
+]
+__all__ += [
+    "Operation",
+    "Orders",
+    "Pace",
+    "Planner",
+    "Ports",
+    "Positive",
+    "Program",
+    "ProgramError",
+    "Reading",
+]
+__all__ += [
+    "Refused",
+    "RobotConfig",
+    "RobotError",
+    "SceneConfig",
+    "State",
+    "Table",
+    "Verdict",
+    "command",
+]
 __all__ += ["read_params", "status"]
 _PLACES = {
     "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
@@ -65,8 +117,23 @@ _PLACES = {
         "Verdict",
     ),
     "rack.levels.messages": ("Error",),
-    "rack.levels.operator": ("ANSWER", "OPERATOR_COMMAND", "RESTS_ON", "Commands", "Goal", "Operation", "Orders"),
-    "rack.levels.tables": ("Finite", "Positive", "RobotConfig", "SceneConfig", "Table", "read_params"),
+    "rack.levels.operator": (
+        "ANSWER",
+        "OPERATOR_COMMAND",
+        "RESTS_ON",
+        "Commands",
+        "Goal",
+        "Operation",
+        "Orders",
+    ),
+    "rack.levels.tables": (
+        "Finite",
+        "Positive",
+        "RobotConfig",
+        "SceneConfig",
+        "Table",
+        "read_params",
+    ),
 }
 
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these

@@ -1,15 +1,18 @@
 """Arithmetic that gives the same bits on every processor.
 
-A lockstep run repeats bit for bit, on another machine too. Numpy does not promise that: its BLAS (`@`, `np.dot`,
-`np.linalg`) sums in an order that depends on the processor's vector unit, and many of its functions (`tanh`, `exp`,
-`arctan2`, `arccos`, `**` with exponents other than 2) have a variant for each. Levels use these instead:
+A lockstep run repeats bit for bit, on another machine too. Numpy does not promise that: its BLAS
+(`@`, `np.dot`, `np.linalg`) sums in an order that depends on the processor's vector unit, and many
+of its functions (`tanh`, `exp`, `arctan2`, `arccos`, `**` with exponents other than 2) have a
+variant for each. Levels use these instead:
 
-- products, solutions and lengths from MuJoCo: compiled once, without choices at run time, and about as fast as BLAS for
-  a few joints;
-- transcendental functions from `math`: the C library's, of which the crate fixes the variant for all boards.
+- products, solutions and lengths from MuJoCo: compiled once, without choices at run time, and about
+  as fast as BLAS for a few joints;
+- transcendental functions from `math`: the C library's, of which the crate fixes the variant for
+  all boards.
 
-Numpy's + - * / and sqrt, element by element, are exact by IEEE 754; its sums, norms over an axis, and sorting of values
-have one order on all x86-64 processors. Alternatives considered: `np.einsum`, fixed too, but twice the time.
+Numpy's + - * / and sqrt, element by element, are exact by IEEE 754; its sums, norms over an axis,
+and sorting of values have one order on all x86-64 processors. Alternatives considered: `np.einsum`,
+fixed too, but twice the time.
 """
 
 from __future__ import annotations
@@ -51,7 +54,8 @@ def gram(matrix: Array) -> Array:
 
 
 def solve(matrix: Array, vector: Array) -> Array:
-    """Return x (n,) with `matrix` x = `vector`; `matrix` (n, n) is symmetric and positive definite, like an inertia."""
+    """Return x (n,) with `matrix` x = `vector`; `matrix` (n, n) is symmetric and positive definite,
+    like an inertia."""
     factor = matrix.copy()
     solution = np.empty(len(vector))
     mujoco.mju_cholFactor(factor, LEAST_PIVOT)
@@ -88,4 +92,6 @@ def norm(vector: ArrayLike) -> float:
 
 def each(function: Callable[[float], float], values: Array) -> Array:
     """Return `function`, one of `math`, of every element of `values`, in its shape."""
-    return np.fromiter(map(function, values.ravel().tolist()), float, values.size).reshape(values.shape)
+    return np.fromiter(map(function, values.ravel().tolist()), float, values.size).reshape(
+        values.shape
+    )

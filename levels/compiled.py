@@ -1,13 +1,13 @@
 """Small fixed-size algebra as machine code: a Python function that numba compiles at its first use.
 
-A few hundred numpy calls on six numbers were most of a servo cycle: each costs a microsecond, whatever it computes.
-A function marked `@compiled` is ordinary numpy code; called directly it runs as such, the reference of its tests.
-Alternatives considered: a C extension (users would need a compiler), `jit` at import (numba takes 0.4 s to import, and
-most commands compute nothing).
+A few hundred numpy calls on six numbers were most of a servo cycle: each costs a microsecond,
+whatever it computes. A function marked `@compiled` is ordinary numpy code; called directly it runs
+as such, the reference of its tests. Alternatives considered: a C extension (users would need a
+compiler), `jit` at import (numba takes 0.4 s to import, and most commands compute nothing).
 
-Without `fastmath` the order of operations is the source's, so the bits do not depend on the processor. Compiled code is
-kept from run to run. numba itself notices a change in the function, not in those that it calls: so the cache of each
-state of the sources has its own folder.
+Without `fastmath` the order of operations is the source's, so the bits do not depend on the
+processor. Compiled code is kept from run to run. numba itself notices a change in the function, not
+in those that it calls: so the cache of each state of the sources has its own folder.
 """
 
 from __future__ import annotations
@@ -32,18 +32,21 @@ _R = TypeVar("_R", covariant=True)
 
 
 class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
-    """Mark a function for compilation. Arguments are numbers, arrays and records; it may call others marked so."""
+    """Mark a function for compilation. Arguments are numbers, arrays and records; it may call
+    others marked so."""
 
     def __init__(self, function: Callable[_P, _R]) -> None:
         self._function = function
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        """Call the function under numpy, and those that it calls: the reference of the compiled one."""
+        """Call the function under numpy, and those that it calls: the reference of the compiled
+        one."""
         return self._function(*args, **kwargs)
 
     def load(self) -> Callable[_P, _R]:
-        """Return the compiled function; it is compiled, or read from the cache, at the first call with its types."""
+        """Return the compiled function; it is compiled, or read from the cache, at the first call
+        with its types."""
         if self._machine is None:
             self._machine = _jit(self._function)
         return self._machine
@@ -57,7 +60,9 @@ def _jit(function: Any) -> Any:
     names = function.__code__.co_names
     known = function.__globals__
     called = {name: known[name].load() for name in names if isinstance(known.get(name), compiled)}
-    bound = FunctionType(function.__code__, known | called, function.__name__, function.__defaults__)
+    bound = FunctionType(
+        function.__code__, known | called, function.__name__, function.__defaults__
+    )
     bound.__module__ = function.__module__
     bound.__qualname__ = function.__qualname__
     function = njit(cache=bool(folder), error_model="numpy")(bound)
@@ -73,7 +78,8 @@ NEWS: list[Callable[[str], object]] = []
 
 
 def _forgive(kept: Any) -> None:
-    """Let a function do without what is kept of it where that is damaged or cannot be written, and say so."""
+    """Let a function do without what is kept of it where that is damaged or cannot be written, and
+    say so."""
     load = kept.load_overload
     save = kept.save_overload
     files = kept._cache_file
@@ -139,7 +145,8 @@ def _say(text: str) -> None:
 
 @cache
 def _use_cache() -> str:
-    """Make numba cache its code in a folder for the present sources; remove the folders of earlier ones.
+    """Make numba cache its code in a folder for the present sources; remove the folders of earlier
+    ones.
 
     Return the folder; an empty text if it cannot be written.
     """
@@ -160,7 +167,10 @@ def _use_cache() -> str:
         with TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        _say(f"{folder}: compiled code cannot be kept, and every launch compiles: {error.strerror}; {CURE}")
+        _say(
+            f"{folder}: compiled code cannot be kept, and every launch compiles: {error.strerror};"
+            f" {CURE}"
+        )
         return ""
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba makes it from its environment
     return str(folder)

@@ -2,10 +2,12 @@
 
 `LevelError` is the root.
 
-- `CannotGoOn`: another rack's adapter has a cycle of another length, in lockstep; its board is not restarted.
+- `CannotGoOn`: another rack's adapter has a cycle of another length, in lockstep; its board is not
+  restarted.
 - `RobotError`: an MJCF file is missing or malformed; the model lacks a joint or a site.
 - `ProgramError`: a task program names an unknown object, verb or place.
-- `Refused`: a command cannot be carried out; a planner turns it into a status with its code and reason.
+- `Refused`: a command cannot be carried out; a planner turns it into a status with its code and
+  reason.
 """
 
 from __future__ import annotations

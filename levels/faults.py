@@ -1,7 +1,8 @@
 """Faults of what a level drives: the steps that spoil its samples, its motors and its commands.
 
-A level lists in `Executor.faults` the classes of steps that it implements. Every kind of fault with a step of such a
-class can then strike it: a new kind needs no change in the level. The steps here are the project's own.
+A level lists in `Executor.faults` the classes of steps that it implements. Every kind of fault with
+a step of such a class can then strike it: a new kind needs no change in the level. The steps here
+are the project's own.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ Sample = Any
 """A `rack.levels.arm.Sensed`: not imported, since that loads MuJoCo."""
 
 APART = np.array([[1e-2], [1e-2]])
-"""Error of a stuck sensor, rad and rad/s, from which it counts as wrong: while a joint creeps, nobody need notice it
-earlier."""
+"""Error of a stuck sensor, rad and rad/s, from which it counts as wrong: while a joint creeps,
+nobody need notice it earlier."""
 
 
 class Fault(NamedTuple):
@@ -41,7 +42,8 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True)
 class ActiveFault:
-    """An injected fault. `place` is its index among those injected; `joints` (joints,) is True where it strikes.
+    """An injected fault. `place` is its index among those injected; `joints` (joints,) is True
+    where it strikes.
 
     `every` is the level's cycle in ticks; `kept` holds the first sample of each fault, by key.
     """
@@ -75,7 +77,8 @@ class ActiveFault:
 
 @dataclass(frozen=True)
 class SensorStep:
-    """Spoils a sample. `act` returns the spoilt sample, and whether that shows; None: it is the truth.
+    """Spoils a sample. `act` returns the spoilt sample, and whether that shows; None: it is the
+    truth.
 
     What shows must be found: the bound counts from there.
     """
@@ -85,21 +88,24 @@ class SensorStep:
 
 @dataclass(frozen=True)
 class MotorStep:
-    """Weakens motors. `part` returns the part of its torque limit that a motor still gives, 0 to 1."""
+    """Weakens motors. `part` returns the part of its torque limit that a motor still gives, 0 to
+    1."""
 
     part: Callable[[ActiveFault], float]
 
 
 @dataclass(frozen=True)
 class CommandStep:
-    """Corrupts the torques commanded. `act` takes torques and limits, N m, and returns torques (joints,)."""
+    """Corrupts the torques commanded. `act` takes torques and limits, N m, and returns torques
+    (joints,)."""
 
     act: Callable[[Array, Array, ActiveFault], Array]
 
 
 @dataclass(frozen=True)
 class TendonStep:
-    """Tears a tendon of a hand, so that it gives no tension: that of `joint` on `side`, 0 flexor, 1 extensor."""
+    """Tears a tendon of a hand, so that it gives no tension: that of `joint` on `side`, 0 flexor, 1
+    extensor."""
 
 
 def position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
@@ -130,7 +136,9 @@ def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | Non
     truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)
     off = np.abs(stuck - truth)
-    return sample._replace(position=stuck[0], velocity=stuck[1]), bool((off > APART).any()) if off.any() else None
+    return sample._replace(position=stuck[0], velocity=stuck[1]), bool(
+        (off > APART).any()
+    ) if off.any() else None
 
 
 def torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:

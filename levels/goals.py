@@ -24,7 +24,10 @@ class ObjectEnd:
     tolerance_mm: float
 
     def __str__(self) -> str:
-        return f"object '{self.object}' ended {self.off_mm:.0f} mm from its goal (tolerance {self.tolerance_mm:g} mm)"
+        return (
+            f"object '{self.object}' ended {self.off_mm:.0f} mm from its goal (tolerance"
+            f" {self.tolerance_mm:g} mm)"
+        )
 
 
 def ends(goals: Mapping[int, GoalConfig], position: Array) -> Iterator[ObjectEnd]:

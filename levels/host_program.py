@@ -1,9 +1,9 @@
-"""A program of the host side: no rate, no deadline, no real-time priority; it may block, import anything, and raise.
+"""A program of the host side: no rate, no deadline, no real-time priority; it may block, import
+anything, and raise.
 
-A host board is a process of its own under ordinary scheduling. The clock does not release it; real time never waits for
-it.
-It reaches the levels only through a bus adapter (`rack.boards.host.bus_adapter`), which exchanges at its own rate.
-The author writes `run`:
+A host board is a process of its own under ordinary scheduling. The clock does not release it; real
+time never waits for it. It reaches the levels only through a bus adapter
+(`rack.boards.host.bus_adapter`), which exchanges at its own rate. The author writes `run`:
 
     class Stroll(HostProgram):
         inputs = {"motion": Input(MOTION_STATUS, "below.motion")}
@@ -14,13 +14,14 @@ The author writes `run`:
             while bus.read("motion").value.done < bus.sent("requests"):
                 bus.wait(1.0)
 
-The program is over when `run` returns. An exception ends the process, which is restarted by the rack's policy with a
-new object; serials of messages go on.
+The program is over when `run` returns. An exception ends the process, which is restarted by the
+rack's policy with a new object; serials of messages go on.
 
-In real time messages enter at ticks that depend on the program's timing; a replay with the recorded entries repeats a
-run. In lockstep the program runs while the rack's time stands still, until it waits in `bus.wait`; its computing takes
-the simulated time `[host.x] computing_ms`. Then a run repeats, if the program depends on its messages, `tick` and
-`time_s` alone. One that blocks elsewhere for 30 s ends the run. For prompts lockstep does not wait.
+In real time messages enter at ticks that depend on the program's timing; a replay with the recorded
+entries repeats a run. In lockstep the program runs while the rack's time stands still, until it
+waits in `bus.wait`; its computing takes the simulated time `[host.x] computing_ms`. Then a run
+repeats, if the program depends on its messages, `tick` and `time_s` alone. One that blocks
+elsewhere for 30 s ends the run. For prompts lockstep does not wait.
 """
 
 from __future__ import annotations
@@ -43,23 +44,26 @@ class Bus(Protocol):
 
     @property
     def time_s(self) -> float:
-        """Time since some moment, s: in lockstep simulated time, in real time that of CLOCK_MONOTONIC."""
+        """Time since some moment, s: in lockstep simulated time, in real time that of
+        CLOCK_MONOTONIC."""
 
     @property
     def is_over(self) -> bool:
         """Whether the run has ended: the program should return."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when the run ends."""
+        """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
+        the run ends."""
 
     def read(self, port: str) -> Reading:
-        """Return the newest message; `earlier` holds the unread ones before it, as far as the mailbox keeps them."""
+        """Return the newest message; `earlier` holds the unread ones before it, as far as the
+        mailbox keeps them."""
 
     def send(self, port: str, **fields: Any) -> bool:
         """Send a message with these fields, all others 0; False when too many wait at the adapter.
 
-        A command without an `id` gets the number of the message, which rises by one with every message sent. Raises
-        `AttributeError` for an unknown field.
+        A command without an `id` gets the number of the message, which rises by one with every
+        message sent. Raises `AttributeError` for an unknown field.
         """
 
     def sent(self, port: str) -> int:
@@ -70,10 +74,12 @@ class Bus(Protocol):
         """Names of the crate's tasks."""
 
     def address(self, name: str) -> int:
-        """Return the bus address of a mailbox, or of the control block of a task. Raises `LookupError`."""
+        """Return the bus address of a mailbox, or of the control block of a task. Raises
+        `LookupError`."""
 
     def words(self, address: int, count: int = 1) -> list[int]:
-        """Return words of 8 bytes of the crate's memory, from a bus address on; `rack check` prints addresses.
+        """Return words of 8 bytes of the crate's memory, from a bus address on; `rack check` prints
+        addresses.
 
         Any word may be read, whoever writes it, without a message; other boards may be writing it,
         in lockstep too. Raises `ValueError` for an address that is no word's, or beyond the memory.
@@ -91,7 +97,8 @@ class HostProgram:
     outputs: ClassVar[Mapping[str, MessageType]] = {}
     """Ports that it writes, each the mailbox `<board>.<port>`, for a bus adapter to read."""
     params: ClassVar[type[Table] | None] = None
-    """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads them by itself."""
+    """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads
+    them by itself."""
     program: ClassVar[type[Program] | None] = None
     """Keys of `[task]`, checked before the launch; None: it reads no such program."""
 

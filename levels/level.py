@@ -1,62 +1,75 @@
-"""A level: an executor every cycle and a planner in the background (fig. 1), and the duties of its author.
+"""A level: an executor every cycle and a planner in the background (fig. 1), and the duties of its
+author.
 
-The author writes `process` and `plan`. Pinning, timing, tracing, mailboxes and injected faults belong to the board that
-runs the level. The other duties, each with its reason:
+The author writes `process` and `plan`. Pinning, timing, tracing, mailboxes and injected faults
+belong to the board that runs the level. The other duties, each with its reason:
 
 Every level
 - `process` takes bounded time: it never waits, logs or prints. The cycle has a deadline.
-- An exception ends the board, which is restarted as a new process with a new object. State that must survive this is
-  read back from your own mailboxes (`Input(STATUS, "own.status")`).
-- `tick` may advance by more than `context.every`: cycles are skipped after a miss. Compute elapsed time from it; never
-  read a clock, and take randomness from `context.seed` and `tick`. Otherwise lockstep runs differ.
-- Use `rack.levels.algebra` in place of `@`, `np.linalg`, `exp`, `arctan2` and the like: those differ in the last bit
-  between processors.
-- Every output is written at the end of every cycle, unchanged fields with the values of the cycle before.
-- An output rests on the input of its name (a command on the command above); for another, see `Output.rests_on`.
-- A `Reading` before the first message is all zeros (`is_there` is False); later it repeats the newest (`is_new` is
-  False). `is_lost`: its writer is dead or silent. A level that moves the arm then holds, and reports the reason.
+- An exception ends the board, which is restarted as a new process with a new object. State that
+  must survive this is read back from your own mailboxes (`Input(STATUS, "own.status")`).
+- `tick` may advance by more than `context.every`: cycles are skipped after a miss. Compute elapsed
+  time from it; never read a clock, and take randomness from `context.seed` and `tick`. Otherwise
+  lockstep runs differ.
+- Use `rack.levels.algebra` in place of `@`, `np.linalg`, `exp`, `arctan2` and the like: those
+  differ in the last bit between processors.
+- Every output is written at the end of every cycle, unchanged fields with the values of the cycle
+  before.
+- An output rests on the input of its name (a command on the command above); for another, see
+  `Output.rests_on`.
+- A `Reading` before the first message is all zeros (`is_there` is False); later it repeats the
+  newest (`is_new` is False). `is_lost`: its writer is dead or silent. A level that moves the arm
+  then holds, and reports the reason.
 
 Messages
-- A command (`rack.backplane.message.command`) has an `id` that rises with every new command; 0: no command.
-- A status (`status`), written to the port "status", echoes the command's `id` and shows `state` in every cycle: the
-  board with `ends_run` ends the run by DONE or ERROR; HOLDING (kept from its work) and ERROR need a `reason` of one
-  line, which users see as the cause of a stall. A status whose `error` is not 0 at the end fails the run.
+- A command (`rack.backplane.message.command`) has an `id` that rises with every new command; 0: no
+  command.
+- A status (`status`), written to the port "status", echoes the command's `id` and shows `state` in
+  every cycle: the board with `ends_run` ends the run by DONE or ERROR; HOLDING (kept from its work)
+  and ERROR need a `reason` of one line, which users see as the cause of a stall. A status whose
+  `error` is not 0 at the end fails the run.
 - Messages of which none may be missed, such as requests for motions, go through a queue: declare
-  `Output(REQUEST, queued=True)`, fill `write.port` and call `write.port.send()` for each, several in a cycle if need
-  be. False: the queue is full; try again in a later cycle. Its one reader gets each once and in order, the older
-  unread ones in `Reading.earlier`, at most `room(port)` in a cycle. What a board has taken in the cycle in which it
-  dies is lost with it: the sender notices by the ids that the reader's status echoes.
-- A mailbox of another rack, which `[adapter.lan]` imports, is read as `Input(TYPE, "lan.<port>")`. It is lost when its
-  information is older than `max_age_ms`, and at once when that rack is. Where that is says `lan.peer_<rack>`, a `PEER`.
-- Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see `context.sizes`.
-  Reader and writer of a mailbox must name the same message type and version.
+  `Output(REQUEST, queued=True)`, fill `write.port` and call `write.port.send()` for each, several
+  in a cycle if need be. False: the queue is full; try again in a later cycle. Its one reader gets
+  each once and in order, the older unread ones in `Reading.earlier`, at most `room(port)` in a
+  cycle. What a board has taken in the cycle in which it dies is lost with it: the sender notices by
+  the ids that the reader's status echoes.
+- A mailbox of another rack, which `[adapter.lan]` imports, is read as `Input(TYPE, "lan.<port>")`.
+  It is lost when its information is older than `max_age_ms`, and at once when that rack is. Where
+  that is says `lan.peer_<rack>`, a `PEER`.
+- Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see
+  `context.sizes`. Reader and writer of a mailbox must name the same message type and version.
 
-Operator: a level that takes commands reads `Input(OPERATOR_COMMAND, "own.operator")`, lists them in `commands`, follows
-with `rack.levels.operator.Orders`, has `*ANSWER` in its status (`orders.report`) and `RESTS_ON` in its command
-(`command.operator = orders.rests_on(...)`). A level that takes none passes `operator` on, down and into its status:
-without it the system's response to an operator cannot be measured.
+Operator: a level that takes commands reads `Input(OPERATOR_COMMAND, "own.operator")`, lists them in
+`commands`, follows with `rack.levels.operator.Orders`, has `*ANSWER` in its status
+(`orders.report`) and `RESTS_ON` in its command (`command.operator = orders.rests_on(...)`). A level
+that takes none passes `operator` on, down and into its status: without it the system's response to
+an operator cannot be measured.
 
-Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check` then reports every
-mistake before the launch. Executor and planner of a board share one table. A level that reads a program from `[task]`
-declares `program = MyProgram`, a `Program`, likewise.
+Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check`
+then reports every mistake before the launch. Executor and planner of a board share one table. A
+level that reads a program from `[task]` declares `program = MyProgram`, a `Program`, likewise.
 
 A servo level of your own
-- reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0` until the first set
-  point (while `command.due` is 0), and again when set points stop: the primitive level waits for this, and motion
-  begins at that `target`. Four primitive cycles after set points began, `holding` must be 0; else it starts over.
-- reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the primitive level waits.
-- writes a status in every primitive cycle, with `position` near `target`: the primitive level holds motion when
-  statuses are missing, or when a joint is farther off than its `following`.
-- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm only through it.
-- advances the arm's time, saves its state, and publishes its scene, without which the world model is stale and motion
-  holds: see `rack.levels.arm.arm`.
+- reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0`
+  until the first set point (while `command.due` is 0), and again when set points stop: the
+  primitive level waits for this, and motion begins at that `target`. Four primitive cycles after
+  set points began, `holding` must be 0; else it starts over.
+- reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the
+  primitive level waits.
+- writes a status in every primitive cycle, with `position` near `target`: the primitive level holds
+  motion when statuses are missing, or when a joint is farther off than its `following`.
+- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm
+  only through it.
+- advances the arm's time, saves its state, and publishes its scene, without which the world model
+  is stale and motion holds: see `rack.levels.arm.arm`.
 
 A level without Python of its own for its decisions is a state table in a file: see
 `rack.levels.systems.state_table.level`.
 
-A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 * every`): the first
-brings them to the servo, which interpolates over the second. It reports `done`, `current`, `resting` and `blocked` of
-segments.
+A primitive level of your own writes set points due two of its cycles later (`due = tick + 2 *
+every`): the first brings them to the servo, which interpolates over the second. It reports `done`,
+`current`, `resting` and `blocked` of segments.
 """
 
 from __future__ import annotations
@@ -79,7 +92,17 @@ from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
 from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen
 
-__all__ = ["Demand", "Executor", "Fault", "Finding", "Input", "LevelContext", "Output", "Pace", "Planner"]
+__all__ = [
+    "Demand",
+    "Executor",
+    "Fault",
+    "Finding",
+    "Input",
+    "LevelContext",
+    "Output",
+    "Pace",
+    "Planner",
+]
 __all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
 
 
@@ -88,41 +111,46 @@ class Input(NamedTuple):
 
     type: MessageType
     source: str
-    """A mailbox ("world.model"), or relative to the level: "above.command", "below.status", "own.plan". A config may
-    wire the port elsewhere."""
+    """A mailbox ("world.model"), or relative to the level: "above.command", "below.status",
+    "own.plan". A config may wire the port elsewhere."""
     many: bool = False
-    """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order, in place of one. By
-    mailbox where the config names several of one board."""
+    """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order,
+    in place of one. By mailbox where the config names several of one board."""
     optional: bool = False
     """With `many`: the level also works without any such neighbour."""
 
 
 class Output(NamedTuple):
-    """A port that a level writes; its type alone for one of every cycle that rests on the input of the same name."""
+    """A port that a level writes; its type alone for one of every cycle that rests on the input of
+    the same name."""
 
     type: MessageType
     cycles: int = 1
-    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from the board's phase,
-    so that readers released then find it fresh. If that cycle is missed, the message is missing too."""
+    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from
+    the board's phase, so that readers released then find it fresh. If that cycle is missed, the
+    message is missing too."""
     queued: bool = False
-    """The level sends its messages itself, any number in a cycle: it fills `write.port` and calls `write.port.send()`.
-    False: the queue is full, and the message was not taken; `write.port.room()` says how many more it takes."""
+    """The level sends its messages itself, any number in a cycle: it fills `write.port` and calls
+    `write.port.send()`. False: the queue is full, and the message was not taken;
+    `write.port.room()` says how many more it takes."""
     rests_on: str = ""
-    """The input whose information it passes on; default: the input of the same name, if there is one. Its messages
-    carry the tick of that information, of an input that reads many the oldest, of none their own release. By these
-    ticks the response of the whole hierarchy is measured."""
+    """The input whose information it passes on; default: the input of the same name, if there is
+    one. Its messages carry the tick of that information, of an input that reads many the oldest, of
+    none their own release. By these ticks the response of the whole hierarchy is measured."""
     max_age_s: float = 0.0
-    """Above 0: written only in cycles in which the level calls `write.port.send(basis)`, `basis` being the tick of the
-    information. Readers find the message old in between, and its writer lost when the information is older than this,
-    s of simulated time."""
+    """Above 0: written only in cycles in which the level calls `write.port.send(basis)`, `basis`
+    being the tick of the information. Readers find the message old in between, and its writer lost
+    when the information is older than this, s of simulated time."""
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
-        """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`, writes it."""
+        """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`,
+        writes it."""
         return (tick - phase + every) % (self.cycles * every) == 0
 
 
 class MadePorts(NamedTuple):
-    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some are unknown."""
+    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some
+    are unknown."""
 
     inputs: Mapping[str, Input] = MappingProxyType({})
     outputs: Mapping[str, Output] = MappingProxyType({})
@@ -145,24 +173,34 @@ class Program(Table):
         """Freeze the lists in tables by names of the user's own, too."""
         return frozen(table)
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
-        """Yield key, as in "action[0].object", value and reason of each entry that does not suit arm or scene."""
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield key, as in "action[0].object", value and reason of each entry that does not suit
+        arm or scene."""
         return ()
 
     @classmethod
     def read(cls, table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> Self:
-        """Return the program in the `[task]` table. Raises `ProgramError`, with one line per mistake."""
+        """Return the program in the `[task]` table. Raises `ProgramError`, with one line per
+        mistake."""
         try:
             program = cls.model_validate(table)
         except ValidationError as error:
-            lines = [f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
+            lines = [
+                f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}"
+                for entry in error.errors()
+            ]
             raise ProgramError("\n".join(lines)) from error
-        if misfits := [f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)]:
+        if misfits := [
+            f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)
+        ]:
             raise ProgramError("\n".join(misfits))
         return program
 
     def goals(self) -> Iterable[GoalConfig]:
-        """Yield where the program takes objects, in its order: checked when it says that it is done."""
+        """Yield where the program takes objects, in its order: checked when it says that it is
+        done."""
         return ()
 
 
@@ -174,7 +212,8 @@ class Pace(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A fault that a level has found; its board raises the alarm. See `rack.backplane.watch.alarms.Alarm`."""
+    """A fault that a level has found; its board raises the alarm. See
+    `rack.backplane.watch.alarms.Alarm`."""
 
     alarm: Alarm
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
@@ -214,71 +253,88 @@ class LevelContext:
 class Executor(ABC):
     """The foreground of a level: runs every cycle, at high priority, in bounded time.
 
-    Subclasses declare their ports and write `process`. Output messages keep their values from cycle to
-    cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
+    Subclasses declare their ports and write `process`. Output messages keep their values from cycle
+    to cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, MessageType | Output]] = {}
     faults: ClassVar[tuple[type, ...]] = ()
-    """Classes of steps by which faults can strike what the level drives: see `rack.levels.faults`."""
+    """Classes of steps by which faults can strike what the level drives: see
+    `rack.levels.faults`."""
     commands: ClassVar[Commands] = {}
-    """An operator's commands to the level, with the forms of their goals; for a level that reads "own.operator"."""
+    """An operator's commands to the level, with the forms of their goals; for a level that reads
+    "own.operator"."""
     params: ClassVar[type[Table] | None] = None
-    """Keys of `[board.<name>.params]`, checked before the launch; None: unchecked, the level reads them by itself."""
+    """Keys of `[board.<name>.params]`, checked before the launch; None: unchecked, the level reads
+    them by itself."""
     program: ClassVar[type[Program] | None] = None
-    """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it by itself."""
+    """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it
+    by itself."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
-        # In addition to the ports, these pass between board and level. The board sets `demand` before each `process`,
-        # and reports and clears `findings` and `acted` after it. It calls `inject` when the active faults change.
+        # In addition to the ports, these pass between board and level. The board sets `demand`
+        # before each `process`, and reports and clears `findings` and `acted` after it. It calls
+        # `inject` when the active faults change.
         self.demand = Demand.NONE  # stop that the rack's safety demands of the arm in this cycle
-        self.findings: list[Finding] = []  # faults found in this cycle, once per episode: the board raises alarms
-        # The injected faults that changed anything in this cycle, by index; whether each showed: then it must be found.
+        self.findings: list[
+            Finding
+        ] = []  # faults found in this cycle, once per episode: the board raises alarms
+        # The injected faults that changed anything in this cycle, by index; whether each showed:
+        # then it must be found.
         self.acted: dict[int, bool] = {}
 
     @classmethod
     def preload(cls) -> None:
-        """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
+        """Load what every process of the level needs, such as compiled code. Called once, before
+        the crate forks."""
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return what an operator's settings, and alarms of the level by number, name; `params` may be invalid."""
+        """Return what an operator's settings, and alarms of the level by number, name; `params` may
+        be invalid."""
         return ()
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield key of `[board.<name>]`, value and reason of each disagreement with the neighbours, before the launch.
+        """Yield key of `[board.<name>]`, value and reason of each disagreement with the neighbours,
+        before the launch.
 
         The parameters of all boards concerned are valid, each by itself.
         """
         return ()
 
     @classmethod
-    def wording(cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig) -> Sequence[str]:
-        """Return the names that an operator may give with an operation; see `rack.levels.operator.NAMED`."""
+    def wording(
+        cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig
+    ) -> Sequence[str]:
+        """Return the names that an operator may give with an operation; see
+        `rack.levels.operator.NAMED`."""
         return cls.names(params)
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
-        """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that classes declare."""
+        """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that
+        classes declare."""
         return MadePorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""
 
     def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
+        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the
+        launch fails."""
 
     @abstractmethod
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
 
     def room(self, port: str) -> int:
-        """Return how many messages to take from each queue that `port` reads, asked before each read. Default: all."""
+        """Return how many messages to take from each queue that `port` reads, asked before each
+        read. Default: all."""
         return ALL
 
     def close(self) -> None:
@@ -288,8 +344,8 @@ class Executor(ABC):
 class Planner(ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
-    It runs in a separate process and shares nothing with the executor but mailboxes. Its one
-    output is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
+    It runs in a separate process and shares nothing with the executor but mailboxes. Its one output
+    is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {}
@@ -304,17 +360,21 @@ class Planner(ABC):
 
     @classmethod
     def preload(cls) -> None:
-        """Load what every process of the level needs, such as compiled code. Called once, before the crate forks."""
+        """Load what every process of the level needs, such as compiled code. Called once, before
+        the crate forks."""
 
     def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the launch fails."""
+        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the
+        launch fails."""
 
     def room(self, port: str) -> int:
-        """Return how many messages to take from each queue that `port` reads, asked before each read. Default: all."""
+        """Return how many messages to take from each queue that `port` reads, asked before each
+        read. Default: all."""
         return ALL
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Return, in well under a cycle, whether a plan is wanted now. Default: a command is new."""
+        """Return, in well under a cycle, whether a plan is wanted now. Default: a command is
+        new."""
         return bool(read.command.is_new)
 
     @abstractmethod

@@ -1,7 +1,8 @@
 """The messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
-Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (MuJoCo's integration state).
-Quaternions are w, x, y, z. Poses are in the world frame. Simulated time is tick times the clock's period.
+Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (MuJoCo's
+integration state). Quaternions are w, x, y, z. Poses are in the world frame. Simulated time is tick
+times the clock's period.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from rack.backplane.words import Demand
 from rack.levels.operator import ANSWER, RESTS_ON
 
 WINDOW = 8
-"""Elemental moves in one task command: the level below never waits for a cycle of the task level."""
+"""Elemental moves in one task command: the level below never waits for a cycle of the task
+level."""
 SEGMENTS = 2
 """Segments in one move command."""
 WAYPOINTS = 24
@@ -21,7 +23,8 @@ WAYPOINTS = 24
 MOVES = 96
 """Most elemental moves of one task program."""
 SECTIONS_A_LINE = 8
-"""Sections of constant jerk for one line of a path and the corner after it: seven change speed, one keeps it."""
+"""Sections of constant jerk for one line of a path and the corner after it: seven change speed, one
+keeps it."""
 SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
 """Most sections of constant jerk of one trajectory."""
 
@@ -82,8 +85,19 @@ ELEMENTAL_MOVE = MessageType(
         Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
         Field("position", "f8", "m", "tool position at the end", (3,)),
         Field("quaternion", "f8", "1", "tool orientation at the end", (4,)),
-        Field("joints", "f8", "rad", "where MOVE_JOINTS ends; with `posture`, near the end", ("joints",)),
-        Field("posture", "u1", "1", "1: of the configurations at the pose, the one nearest to `joints` is wanted"),
+        Field(
+            "joints",
+            "f8",
+            "rad",
+            "where MOVE_JOINTS ends; with `posture`, near the end",
+            ("joints",),
+        ),
+        Field(
+            "posture",
+            "u1",
+            "1",
+            "1: of the configurations at the pose, the one nearest to `joints` is wanted",
+        ),
         Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
     ),
 )
@@ -122,7 +136,9 @@ TASK_STATUS = status(
     Field("detour", "u4", "1", "id of the move that an operator wants instead; 0: none"),
 )
 
-OPERATED = Field("operated", "u1", "1", "1: an operator keeps this level, or one below it, from its own work")
+OPERATED = Field(
+    "operated", "u1", "1", "1: an operator keeps this level, or one below it, from its own work"
+)
 
 MOVE_STATUS = status(
     "move_status",
@@ -135,11 +151,21 @@ MOVE_STATUS = status(
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("planned", "u4", "1", "newest elemental move whose path is ready; 0: none yet"),
     Field("end", "f8", "rad", "joint positions at the end of that path", ("joints",)),
-    Field("replan", "u4", "1", "open request to plan the current move anew from `start`; 0: none is open"),
+    Field(
+        "replan",
+        "u4",
+        "1",
+        "open request to plan the current move anew from `start`; 0: none is open",
+    ),
     Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
     Field("replans", "u4", "1", "plans made anew because something was in the way"),
     OPERATED,
-    Field("resting", "u1", "1", "1: the arm rests, and the level that moves it has the operator's newest command"),
+    Field(
+        "resting",
+        "u1",
+        "1",
+        "1: the arm rests, and the level that moves it has the operator's newest command",
+    ),
 )
 
 MOVE_PLAN = MessageType(
@@ -152,8 +178,16 @@ MOVE_PLAN = MessageType(
         Field("reason", "S120", "ASCII", "the error, readable"),
         Field("kind", "u1", SegmentKind, "path or gripper"),
         Field("count", "u2", "1", "waypoints that follow"),
-        Field("waypoints", "f8", "rad", "collision-free path in joint space", (WAYPOINTS, "joints")),
-        Field("blend", "f8", "rad", "length over which corner k is rounded, before and after it", (WAYPOINTS,)),
+        Field(
+            "waypoints", "f8", "rad", "collision-free path in joint space", (WAYPOINTS, "joints")
+        ),
+        Field(
+            "blend",
+            "f8",
+            "rad",
+            "length over which corner k is rounded, before and after it",
+            (WAYPOINTS,),
+        ),
     ),
 )
 
@@ -165,9 +199,17 @@ SEGMENT = MessageType(
         Field("move", "u4", "1", "elemental move that it serves"),
         Field("kind", "u1", SegmentKind, "path or gripper"),
         Field("object", "i2", "1", "object held, or to be grasped; -1: none"),
-        Field("touch", "u1", "1", "1: the object may touch supports and fingers (approach, depart)"),
+        Field(
+            "touch", "u1", "1", "1: the object may touch supports and fingers (approach, depart)"
+        ),
         Field("count", "u2", "1", "waypoints that follow"),
-        Field("waypoints", "f8", "rad", "path in joint space, from where the motion starts", (WAYPOINTS, "joints")),
+        Field(
+            "waypoints",
+            "f8",
+            "rad",
+            "path in joint space, from where the motion starts",
+            (WAYPOINTS, "joints"),
+        ),
         Field("blend", "f8", "rad", "length over which corner k is rounded", (WAYPOINTS,)),
         Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
         Field("opening", "f8", "m", "gripper joint position to go to, for GRIPPER"),
@@ -198,8 +240,15 @@ PRIMITIVE_STATUS = status(
     Field("opening", "f8", "m", "gripper joint position, measured"),
     Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
     Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
-    Field("ends", "f8", "s", "simulated time at which the segment under way should be done; 0: not known"),
-    Field("wants", "u4", "1", "segment for which the level wants a trajectory of its planner; 0: none"),
+    Field(
+        "ends",
+        "f8",
+        "s",
+        "simulated time at which the segment under way should be done; 0: not known",
+    ),
+    Field(
+        "wants", "u4", "1", "segment for which the level wants a trajectory of its planner; 0: none"
+    ),
     Field("begin", "f8", "rad", "path parameter at which that trajectory is to begin, from rest"),
 )
 
@@ -212,10 +261,19 @@ TRAJECTORY = MessageType(
         Field("reason", "S120", "ASCII", "the error, readable"),
         Field("begin", "f8", "rad", "path parameter at which it begins"),
         Field("duration", "f8", "s", "from rest to rest"),
-        Field("earliest", "f8", "s", "simulated time at which the segment could be done at the earliest"),
+        Field(
+            "earliest",
+            "f8",
+            "s",
+            "simulated time at which the segment could be done at the earliest",
+        ),
         Field("count", "u2", "1", "sections that follow"),
         Field(
-            "sections", "f8", "s, 1, 1/s, 1/s2, 1/s3", "start, s, ds, dds, jerk of the path parameter", (SECTIONS, 5)
+            "sections",
+            "f8",
+            "s, 1, 1/s, 1/s2, 1/s3",
+            "start, s, ds, dds, jerk of the path parameter",
+            (SECTIONS, 5),
         ),
     ),
 )
@@ -227,7 +285,8 @@ JOINT_SET_POINT = command(
     Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point yet, hold"),
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
-    # For a servo level that feeds acceleration forward; the default one derives it from positions and velocities.
+    # For a servo level that feeds acceleration forward; the default one derives it from positions
+    # and velocities.
     Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
     Field("opening", "f8", "m", "gripper joint position to go to"),
     Field("force", "f8", "N", "largest gripper force"),
@@ -238,7 +297,13 @@ SERVO_PLAN = MessageType(
     "servo_plan",
     1,
     (
-        Field("inertia", "f8", "kg m2", "joint-space inertia, the object held included", ("joints", "joints")),
+        Field(
+            "inertia",
+            "f8",
+            "kg m2",
+            "joint-space inertia, the object held included",
+            ("joints", "joints"),
+        ),
         Field("held", "i2", "1", "object included; -1: none"),
         Field("payload_mass", "f8", "kg", "mass in the gripper"),
         Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
@@ -246,21 +311,43 @@ SERVO_PLAN = MessageType(
 )
 
 DRIVEN_ARM = (
-    Field("position", "f8", "rad", "joint positions, measured; estimated for suspect sensors", ("joints",)),
+    Field(
+        "position",
+        "f8",
+        "rad",
+        "joint positions, measured; estimated for suspect sensors",
+        ("joints",),
+    ),
     Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
-    Field("torque", "f8", "N m", "torque given to the arm in this cycle, after the limit gate", ("joints",)),
+    Field(
+        "torque",
+        "f8",
+        "N m",
+        "torque given to the arm in this cycle, after the limit gate",
+        ("joints",),
+    ),
     Field("target", "f8", "rad", "where the joints are wanted in this cycle", ("joints",)),
     Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
     Field("opening", "f8", "m", "gripper joint position, measured"),
     Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
     Field("grip_force", "f8", "N", "force given to the gripper"),
     Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
-    Field("stopped", "u1", "1", "1: set points are not followed: a demand, an operator, a fault, or brakes"),
+    Field(
+        "stopped",
+        "u1",
+        "1",
+        "1: set points are not followed: a demand, an operator, a fault, or brakes",
+    ),
     Field("braked", "u1", "1", "1: the brakes are engaged"),
     Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
     Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
     Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
-    Field("violations", "u4", "1", "substeps in which the arm drove a position, velocity or torque beyond its limit"),
+    Field(
+        "violations",
+        "u4",
+        "1",
+        "substeps in which the arm drove a position, velocity or torque beyond its limit",
+    ),
     Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
 )
 """Fields of the status of a level that drives an arm."""
@@ -280,7 +367,13 @@ ARM_STATE = MessageType(
         Field("waited", "i4", "tick", "ticks since the last command"),
         Field("braked", "u1", "1", "1: the brakes are engaged"),
         Field("rest", "f8", "rad", "where engaged brakes hold the joints", ("joints",)),
-        Field("position", "f8", "rad", "joint positions as the servo level estimates them", ("joints",)),
+        Field(
+            "position",
+            "f8",
+            "rad",
+            "joint positions as the servo level estimates them",
+            ("joints",),
+        ),
         Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
         Field("doubt", "f8", "rad", "largest error of those positions", ("joints",)),
         Field(
@@ -310,7 +403,12 @@ WORLD_MODEL = MessageType(
     "world_model",
     1,
     (
-        Field("revision", "u4", "1", "rises when a body starts to move and when it rests again; 0: nothing sensed"),
+        Field(
+            "revision",
+            "u4",
+            "1",
+            "rises when a body starts to move and when it rests again; 0: nothing sensed",
+        ),
         Field("position", "f8", "m", "body origins", ("bodies", 3)),
         Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
         Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),

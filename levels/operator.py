@@ -1,9 +1,9 @@
 """An operator's commands to any level: operations, messages, and how a level follows them.
 
-An operator may command every level that reads "own.operator" and declares `commands`, in addition to the level above it
-or in its place. The level follows with `Orders` and has `ANSWER` among the fields of its status. `RESTS_ON` is passed
-down with every command, so the lowest status shows on which command its torque is based: the system's response can be
-measured.
+An operator may command every level that reads "own.operator" and declares `commands`, in addition
+to the level above it or in its place. The level follows with `Orders` and has `ANSWER` among the
+fields of its status. `RESTS_ON` is passed down with every command, so the lowest status shows on
+which command its torque is based: the system's response can be measured.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class Operation(IntEnum):
     GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
     MODIFY = 5  # put the control modification `name` in, or take it out
     TABLE = 6  # decide by the state table `name` from now on
-    DO = 7  # do the level's own command `name` in place of those of the level above, and stay until RESUME
+    # do the level's own command `name` in place of those of the level above, and stay until RESUME
+    DO = 7
 
 
 class Goal(IntEnum):
@@ -52,7 +53,8 @@ class Goal(IntEnum):
 
 
 SETTINGS = (Operation.MODIFY, Operation.TABLE)
-"""Operations that are done at once and leave the command in force as it is; each names what it sets."""
+"""Operations that are done at once and leave the command in force as it is; each names what it
+sets."""
 NAMED = (*SETTINGS, Operation.DO)
 """Operations that give a name: see `Executor.wording`."""
 
@@ -76,15 +78,27 @@ OPERATOR_COMMAND = command(
     Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
     Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
     Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
-    Field("name", f"S{NAME_BYTES}", "ASCII", "what a setting sets, or the level's own command to do"),
+    Field(
+        "name", f"S{NAME_BYTES}", "ASCII", "what a setting sets, or the level's own command to do"
+    ),
 )
 
-RESTS_ON = Field("operator", "u4", "1", "newest command of an operator, here or above, that this rests on; 0: none")
+RESTS_ON = Field(
+    "operator",
+    "u4",
+    "1",
+    "newest command of an operator, here or above, that this rests on; 0: none",
+)
 ANSWER = (
     RESTS_ON,
     Field("order", "u4", "1", "newest command that an operator gave to this level; 0: none yet"),
     Field("answer", "u1", Answer, "this level's answer to it"),
-    Field("standing", "u1", Operation, "operator's command in force; 0: none, the level does its own work"),
+    Field(
+        "standing",
+        "u1",
+        Operation,
+        "operator's command in force; 0: none, the level does its own work",
+    ),
     Field("objection", f"S{REASON_BYTES}", "ASCII", "why it was refused, readable"),
 )
 """Fields of a status that answer an operator."""
@@ -106,7 +120,9 @@ BELOW_LOST = "no status from the level below: waiting for its board"
 
 def listed(commands: Commands) -> str:
     """Return a level's commands as text: "hold, resume, goto joints|pose"."""
-    return ", ".join(f"{what.name.lower()} {goal_names(goals)}".rstrip() for what, goals in commands.items())
+    return ", ".join(
+        f"{what.name.lower()} {goal_names(goals)}".rstrip() for what, goals in commands.items()
+    )
 
 
 def goal_names(goals: Sequence[Goal]) -> str:
@@ -126,25 +142,29 @@ def described(what: int, goal: int) -> str:
 class Orders:
     """The operator's commands to one level.
 
-    A refused command leaves the one before it in force, even on a restarted board, which processes all commands again,
-    in order.
+    A refused command leaves the one before it in force, even on a restarted board, which processes
+    all commands again, in order.
     """
 
     def __init__(self, commands: Commands) -> None:
         self._commands = commands
-        self.standing = Operation.NONE  # in force: one of `EFFECTS`; NONE: the level does its own work
+        self.standing = (
+            Operation.NONE
+        )  # in force: one of `EFFECTS`; NONE: the level does its own work
         self.serial = 0  # of the newest command; 0: none yet
         self.basis = 0  # of the newest command that was not refused; 0: none yet
         self.answer = Answer.NONE
         self._objection = ""
         self._before = 0, Operation.NONE
-        self._reported: int | None = None  # newest command rested on, in the last report; None: there is news
+        self._reported: int | None = (
+            None  # newest command rested on, in the last report; None: there is news
+        )
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command other than a setting.
 
-        `judge` is called with each command accepted: there a level may refuse it for its own reasons, and makes a
-        setting.
+        `judge` is called with each command accepted: there a level may refuse it for its own
+        reasons, and makes a setting.
         """
         if not operator.is_new:
             return False
@@ -166,8 +186,13 @@ class Orders:
         self._reported = None
         what = message.what
         goal = message.goal
-        if what not in self._commands or goal not in (self._commands[Operation(what)] or (Goal.NONE,)):
-            self.refuse(f"{described(what, goal)} is not a command of this level; permitted: {listed(self._commands)}")
+        if what not in self._commands or goal not in (
+            self._commands[Operation(what)] or (Goal.NONE,)
+        ):
+            self.refuse(
+                f"{described(what, goal)} is not a command of this level; permitted:"
+                f" {listed(self._commands)}"
+            )
             return False
         self.basis = self.serial
         if what not in SETTINGS:
@@ -207,7 +232,8 @@ class Orders:
         self._reported = None
 
     def rests_on(self, above: int) -> int:
-        """Return the newest command that this cycle rests on; `above` is that of the command from above."""
+        """Return the newest command that this cycle rests on; `above` is that of the command from
+        above."""
         return max(self.basis, above)
 
     def report(self, status: Message, above: int = 0) -> None:
@@ -222,8 +248,11 @@ class Orders:
             self._reported = rests_on
 
 
-def joints_of(message: Message, names: Sequence[str], ranges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joint positions, (joints,), rad, of an `OPERATOR_COMMAND`; `ranges` (joints, 2) are permitted.
+def joints_of(
+    message: Message, names: Sequence[str], ranges: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the joint positions, (joints,), rad, of an `OPERATOR_COMMAND`; `ranges` (joints, 2)
+    are permitted.
 
     Raises `ValueError` with the joint, its value and the range.
     """

@@ -1,7 +1,8 @@
-"""What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter, for levels to read.
+"""What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter,
+for levels to read.
 
-A level that works together with another rack reads it with `Input(PEER, "lan.peer_<rack>")`: whether that rack is
-there, and how its simulated time lies next to ours.
+A level that works together with another rack reads it with `Input(PEER, "lan.peer_<rack>")`:
+whether that rack is there, and how its simulated time lies next to ours.
 """
 
 from __future__ import annotations
@@ -27,14 +28,34 @@ PEER = MessageType(
     1,
     (
         Field("presence", "u1", Presence, "awaited, there or lost"),
-        Field("launch", "i8", "1", "number of the launch that is there, or was last; 0: none, or in lockstep"),
+        Field(
+            "launch",
+            "i8",
+            "1",
+            "number of the launch that is there, or was last; 0: none, or in lockstep",
+        ),
         Field("launches", "u4", "1", "its launches seen so far: a number above 1 means restarts"),
         Field("losses", "u4", "1", "how often it was lost"),
         Field("since", "i8", "tick", "since when it is there, or lost"),
         Field("offset", "f8", "s", "its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"),
-        Field("uncertainty", "f8", "s", "largest error of the offset; -1: not measured yet; 0 in lockstep"),
-        Field("round_trip", "f8", "s", "shortest recent round trip; -1: not measured yet; 0 in lockstep"),
-        Field("steps", "u4", "1", "how often its clock or ours was found to have stepped, as when a machine sleeps"),
+        Field(
+            "uncertainty",
+            "f8",
+            "s",
+            "largest error of the offset; -1: not measured yet; 0 in lockstep",
+        ),
+        Field(
+            "round_trip",
+            "f8",
+            "s",
+            "shortest recent round trip; -1: not measured yet; 0 in lockstep",
+        ),
+        Field(
+            "steps",
+            "u4",
+            "1",
+            "how often its clock or ours was found to have stepped, as when a machine sleeps",
+        ),
         Field("ahead", "f8", "s", "its simulated time less that of this rack, at the same instant"),
         Field("speed", "f8", "1", "its simulated seconds in a real one"),
     ),

@@ -1,4 +1,5 @@
-"""What a config names as "package.module:Name", imported; also by the names that earlier versions had for it."""
+"""What a config names as "package.module:Name", imported; also by the names that earlier versions
+had for it."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from types import ModuleType
 
 SLOW_S = 2.0
 IMPORT_S = 60.0
-"""Time after which a user hears that a module is still being imported, and after which the process is ended."""
+"""Time after which a user hears that a module is still being imported, and after which the process
+is ended."""
 
 MOVED = {
     "rack.boards.adapters": "rack.boards.host",
@@ -30,7 +32,8 @@ MOVED = {
     "rack.levels.state_table": "rack.levels.systems.state_table",
     "rack.levels.trajectory": "rack.levels.systems.trajectory",
 }
-"""Packages, modules and classes that have moved: the configs of users and of saved runs name their old places."""
+"""Packages, modules and classes that have moved: the configs of users and of saved runs name their
+old places."""
 
 
 def current(reference: str) -> str:
@@ -43,19 +46,24 @@ def current(reference: str) -> str:
 
 
 def module_and_name(reference: str) -> tuple[ModuleType, str]:
-    """Return the module that "package.module:Name" names, imported, and the name in it. Raises `LookupError`."""
+    """Return the module that "package.module:Name" names, imported, and the name in it. Raises
+    `LookupError`."""
     module, _, name = current(reference).partition(":")
     is_ours = module in sys.modules or module.startswith("rack.")
     try:
         with nullcontext() if is_ours else _watched(module):
             return importlib.import_module(module), name
-    except (Exception, SystemExit) as error:  # a user's module may raise anything while it is imported
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # a user's module may raise anything while it is imported
         raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
 
 
 @contextmanager
 def _watched(module: str) -> Iterator[None]:
-    """Let a process watch the import of a user's module: one that ends this process, or loops, could not be named."""
+    """Let a process watch the import of a user's module: one that ends this process, or loops,
+    could not be named."""
     asked, told = os.pipe()
     watcher = os.fork()
     if watcher == 0:

@@ -1,6 +1,7 @@
 """Config tables that levels read: `[robot]`, `[scene]`, and the base of `[board.<name>.params]`.
 
-An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` builds the cell from both.
+An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` builds the cell from
+both.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from rack.levels.errors import LevelError
 from rack.levels.references import module_and_name
 
-# No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them stay finite.
-# pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
+# No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them
+# stay finite. pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
 Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -26,7 +27,8 @@ LAST_TICK = 10**15
 
 
 class Table(BaseModel):
-    """Base of every config table: unknown keys are errors, values are frozen, `true` does not pass for 1."""
+    """Base of every config table: unknown keys are errors, values are frozen, `true` does not pass
+    for 1."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -34,7 +36,11 @@ class Table(BaseModel):
     @classmethod
     def _with_tuples(cls, table: Any) -> Any:
         """Turn TOML's lists into tuples, which are frozen."""
-        return {key: _tuple(value) for key, value in table.items()} if isinstance(table, dict) else table
+        return (
+            {key: _tuple(value) for key, value in table.items()}
+            if isinstance(table, dict)
+            else table
+        )
 
 
 def frozen(value: Any) -> Any:
@@ -60,11 +66,14 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         valid = ", ".join(kind.model_fields)
-        raise LevelError(f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}") from error
+        raise LevelError(
+            f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}"
+        ) from error
 
 
 def named_class(reference: str, base: type[T]) -> type[T]:
-    """Return the class that "package.module:Class" names. Raises `ValueError`: it is missing, or no whole `base`."""
+    """Return the class that "package.module:Class" names. Raises `ValueError`: it is missing, or no
+    whole `base`."""
     try:
         module, name = module_and_name(reference)
     except LookupError as error:
@@ -75,12 +84,15 @@ def named_class(reference: str, base: type[T]) -> type[T]:
     if not (isinstance(found, type) and issubclass(found, base)):
         raise ValueError(f"'{name}' is not a subclass of {base.__module__}.{base.__name__}")
     if inspect.isabstract(found):
-        raise ValueError(f"class '{name}' lacks: {', '.join(sorted(getattr(found, '__abstractmethods__', ())))}")
+        raise ValueError(
+            f"class '{name}' lacks: {', '.join(sorted(getattr(found, '__abstractmethods__', ())))}"
+        )
     return found
 
 
 class SensorConfig(Table):
-    """Resolution and noise of the joints' encoders: one value for all joints, or a list with one per joint; 0: exact.
+    """Resolution and noise of the joints' encoders: one value for all joints, or a list with one
+    per joint; 0: exact.
 
     Velocities have ten times as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
     """
@@ -106,13 +118,22 @@ class GripperConfig(Table):
 
 
 class WristConfig(Table):
-    """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on contact."""
+    """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on
+    contact."""
 
     force: str = Field(description="MJCF force sensor; its cutoff is its range, N")
-    torque: str = Field(description="MJCF torque sensor at the same site; its cutoff is its range, N m")
-    most_force: Positive = Field(description="force of a contact at which the arm stops, N; within the range")
-    most_torque: Positive = Field(description="torque of a contact at which the arm stops, N m; within the range")
-    noise: NotNegative = Field(0.0, description="standard deviation of a force as sensed, N; of a torque a tenth, N m")
+    torque: str = Field(
+        description="MJCF torque sensor at the same site; its cutoff is its range, N m"
+    )
+    most_force: Positive = Field(
+        description="force of a contact at which the arm stops, N; within the range"
+    )
+    most_torque: Positive = Field(
+        description="torque of a contact at which the arm stops, N m; within the range"
+    )
+    noise: NotNegative = Field(
+        0.0, description="standard deviation of a force as sensed, N; of a torque a tenth, N m"
+    )
 
 
 class FingerConfig(Table):
@@ -120,33 +141,53 @@ class FingerConfig(Table):
 
     name: str = Field(description="name of the finger")
     tip: str = Field(description="MJCF site at its tip")
-    joints: tuple[str, ...] = Field(min_length=1, description="its joints, base to tip; of robot.joints")
+    joints: tuple[str, ...] = Field(
+        min_length=1, description="its joints, base to tip; of robot.joints"
+    )
 
 
 class HandConfig(Table):
-    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One value per joint."""
+    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One
+    value per joint."""
 
     finger: tuple[FingerConfig, ...] = Field(min_length=1, description="the fingers")
     flexors: tuple[str, ...] = Field(
         description="MJCF actuators on the tendons that turn a joint in positive direction"
     )
-    extensors: tuple[str, ...] = Field(description="MJCF actuators on the tendons that turn it back")
+    extensors: tuple[str, ...] = Field(
+        description="MJCF actuators on the tendons that turn it back"
+    )
     least: Positive = Field(description="tension below which a tendon is slack, N")
-    rest: Positive = Field(description="mean tension of a pair at rest, N; it stiffens nothing in a linear tendon")
+    rest: Positive = Field(
+        description="mean tension of a pair at rest, N; it stiffens nothing in a linear tendon"
+    )
     closed: NotNegative = Field(
-        0.0, description="stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its tension"
+        0.0,
+        description=(
+            "stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its"
+            " tension"
+        ),
     )
 
 
 class RobotConfig(Table):
-    """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per joint."""
+    """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per
+    joint."""
 
-    model: Path = Field(strict=False, description="MJCF file of the arm and its cell; relative to the config")
-    joints: tuple[str, ...] = Field(min_length=1, max_length=16, description="MJCF joints of the arm, base to tool")
-    tool: str = Field(description="MJCF site whose pose is the tool's; for a model without one, its last body")
+    model: Path = Field(
+        strict=False, description="MJCF file of the arm and its cell; relative to the config"
+    )
+    joints: tuple[str, ...] = Field(
+        min_length=1, max_length=16, description="MJCF joints of the arm, base to tool"
+    )
+    tool: str = Field(
+        description="MJCF site whose pose is the tool's; for a model without one, its last body"
+    )
     home: tuple[Finite, ...] = Field(description="joint positions at the start, rad")
     velocity: tuple[Positive, ...] = Field(description="velocity limits, rad/s")
-    acceleration: tuple[Positive, ...] = Field(description="acceleration limits of planned motion, rad/s2")
+    acceleration: tuple[Positive, ...] = Field(
+        description="acceleration limits of planned motion, rad/s2"
+    )
     jerk: tuple[Positive, ...] = Field(description="jerk limits of planned motion, rad/s3")
     torque: tuple[Positive, ...] | None = Field(
         None, description="torque limits, N m; default: the model's actuator limits"
@@ -155,14 +196,21 @@ class RobotConfig(Table):
         None, description="position limits, rad; default: the model's joint ranges"
     )
     gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
-    sensors: SensorConfig = Field(SensorConfig(), description="resolution and noise of the joints' encoders")
+    sensors: SensorConfig = Field(
+        SensorConfig(), description="resolution and noise of the joints' encoders"
+    )
     wrist: WristConfig | None = Field(None, description="force/torque sensor, if the arm has one")
-    hand: HandConfig | None = Field(None, description="tendons and fingers, for a hand in place of an arm")
+    hand: HandConfig | None = Field(
+        None, description="tendons and fingers, for a hand in place of an arm"
+    )
     patience_ms: Positive | None = Field(
         None,
         le=100.0,
-        description="time without a new torque for which motors keep the last one, ms; then the brakes engage; rounded "
-        "down to whole torque cycles, at least one; default: by what the arm does in it, see `rack check --verbose`",
+        description=(
+            "time without a new torque for which motors keep the last one, ms; then the brakes"
+            " engage; rounded down to whole torque cycles, at least one; default: by what the arm"
+            " does in it, see `rack check --verbose`"
+        ),
     )
     substeps: int = Field(5, ge=1, le=50, description="MuJoCo steps in one servo cycle")
     min_armature: Finite = Field(
@@ -174,7 +222,9 @@ class MotionConfig(Table):
     """A move of an obstacle, a mocap body, which the simulated cell makes at a fixed time."""
 
     body: str = Field(description="obstacle that moves")
-    at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s")
+    at: float = Field(
+        ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s"
+    )
     to: Vector = Field(description="where its origin goes, m")
     speed: Positive = Field(0.25, description="speed along the straight line, m/s")
 
@@ -183,19 +233,27 @@ class PushConfig(Table):
     """`[[scene.push]]`: a force on an object, which the simulated cell exerts at a fixed time."""
 
     body: str = Field(description="object that is pushed")
-    at: float = Field(ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it begins, s")
+    at: float = Field(
+        ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it begins, s"
+    )
     seconds: Positive = Field(description="time for which it lasts, s")
     force: Vector = Field(description="force at the centre of mass, in the world's frame, N")
-    rise: NotNegative = Field(0.0, description="time in which it rises, and in which it falls at its end, s")
+    rise: NotNegative = Field(
+        0.0, description="time in which it rises, and in which it falls at its end, s"
+    )
 
 
 class GoalConfig(Table):
-    """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by itself."""
+    """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by
+    itself."""
 
     object: str = Field(description="object that the task moves, or keeps")
     position: Vector = Field(description="where its origin ends, m")
-    # A gripper centres a part across its pads, not along them: there it stays as far off as it was taken, or slips.
-    tolerance_mm: Positive = Field(10.0, description="distance from there at which the task still counts as done, mm")
+    # A gripper centres a part across its pads, not along them: there it stays as far off as it was
+    # taken, or slips.
+    tolerance_mm: Positive = Field(
+        10.0, description="distance from there at which the task still counts as done, mm"
+    )
 
 
 class SceneConfig(Table):
@@ -206,7 +264,9 @@ class SceneConfig(Table):
     supports: tuple[str, ...] = Field(
         (), description="geoms on which objects may stand, and a tool on a wrist sensor may press"
     )
-    clearance: Positive = Field(0.015, description="distance that planned motion keeps from everything, m")
+    clearance: Positive = Field(
+        0.015, description="distance that planned motion keeps from everything, m"
+    )
     motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
     push: tuple[PushConfig, ...] = Field((), description="forces on objects, by time")
     goal: tuple[GoalConfig, ...] = Field((), description="where objects end, if the task is done")

@@ -1,4 +1,5 @@
-"""The world model: global memory of objects and obstacles, updated from sensing, read by every planner."""
+"""The world model: global memory of objects and obstacles, updated from sensing, read by every
+planner."""
 
 from __future__ import annotations
 
@@ -19,17 +20,22 @@ from rack.levels.tables import Positive, Table, read_params
 class WorldParams(Table):
     """When a body counts as moving."""
 
-    moved: Positive = Field(0.002, description="distance from where it rested at which a body moves, m")
-    turned: Positive = Field(0.02, description="angle from how it rested at which a body moves, rad")
+    moved: Positive = Field(
+        0.002, description="distance from where it rested at which a body moves, m"
+    )
+    turned: Positive = Field(
+        0.02, description="angle from how it rested at which a body moves, rad"
+    )
     slow: Positive = Field(0.005, description="speed below which a moving body may be resting, m/s")
     resting: Positive = Field(0.2, description="time of being slow after which it rests, s")
 
 
 class WorldModel(Executor):
-    """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body starts or stops moving.
+    """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body
+    starts or stops moving.
 
-    The revision is the tick after the last such change, so it also rises across a restart of this board. Until it
-    receives a scene, a restarted board publishes its last model, with its age.
+    The revision is the tick after the last such change, so it also rises across a restart of this
+    board. Until it receives a scene, a restarted board publishes its last model, with its age.
     """
 
     inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
@@ -40,11 +46,16 @@ class WorldModel(Executor):
         super().__init__(context)
         self._params = read_params(WorldParams, context.params)
         bodies = context.sizes["bodies"]
-        self._last, self._rest = np.zeros((2, bodies, 7))  # poses in the last scene, and in which bodies rested: m, 1
+        self._last, self._rest = np.zeros(
+            (2, bodies, 7)
+        )  # poses in the last scene, and in which bodies rested: m, 1
         self._moving = np.zeros(bodies, dtype=bool)
         self._slow_s = np.zeros(bodies)
         self._find = find_motion.load()
-        self._seen_tick, self._interval = -1, 0  # tick of the last scene, and ticks since the one before it
+        self._seen_tick, self._interval = (
+            -1,
+            0,
+        )  # tick of the last scene, and ticks since the one before it
         self._started = False
 
     @classmethod
@@ -54,7 +65,14 @@ class WorldModel(Executor):
         rules = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
         vectors = np.zeros((1, 3))
         find_motion.load()(
-            vectors, np.zeros((1, 4)), poses, poses, np.zeros(1, dtype=bool), np.zeros(1), vectors, rules
+            vectors,
+            np.zeros((1, 4)),
+            poses,
+            poses,
+            np.zeros(1, dtype=bool),
+            np.zeros(1),
+            vectors,
+            rules,
         )
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
@@ -100,13 +118,18 @@ def find_motion(
     rules: tuple[float, float, float, float, float, float],
 ) -> bool:
     """Follow the bodies from scene to scene; return whether one starts or stops moving."""
-    moved, turned, slow, slow_turn, resting, elapsed_s = rules  # m, rad, m/s, rad/s, s, s: see `WorldParams`
+    moved, turned, slow, slow_turn, resting, elapsed_s = (
+        rules  # m, rad, m/s, rad/s, s, s: see `WorldParams`
+    )
     changed = False
     for body in range(len(position)):
         speed = distance(position[body], last[body]) / elapsed_s
         is_slow = speed < slow and turn(quaternion[body], last[body]) < slow_turn * elapsed_s
         slow_s[body] = slow_s[body] + elapsed_s if is_slow else 0.0
-        away = distance(position[body], rest[body]) > moved or turn(quaternion[body], rest[body]) > turned
+        away = (
+            distance(position[body], rest[body]) > moved
+            or turn(quaternion[body], rest[body]) > turned
+        )
         if moving[body] and slow_s[body] >= resting:
             rest[body, :3], rest[body, 3:] = position[body], quaternion[body]
             moving[body], changed = False, True
@@ -130,6 +153,12 @@ def distance(position: Array, pose: Array) -> float:
 
 @compiled
 def turn(quaternion: Array, pose: Array) -> float:
-    """Return the angle, rad, between a quaternion (4,) and that of a pose (7,); q and -q are the same orientation."""
-    product = quaternion[0] * pose[3] + quaternion[1] * pose[4] + quaternion[2] * pose[5] + quaternion[3] * pose[6]
+    """Return the angle, rad, between a quaternion (4,) and that of a pose (7,); q and -q are the
+    same orientation."""
+    product = (
+        quaternion[0] * pose[3]
+        + quaternion[1] * pose[4]
+        + quaternion[2] * pose[5]
+        + quaternion[3] * pose[6]
+    )
     return 2.0 * math.acos(min(abs(product), 1.0))

@@ -46,10 +46,12 @@ _NO_TURN = pytest.StashKey[str]()
 
 
 def pytest_configure() -> None:
-    """Give commands that tests start their signals back: under nohup, or in a script's background, some are ignored."""
+    """Give commands that tests start their signals back: under nohup, or in a script's background,
+    some are ignored."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_IGN:
-            # Handled, and not the default: the session itself outlives them still. Programs do not inherit a handler.
+            # Handled, and not the default: the session itself outlives them still. Programs do not
+            # inherit a handler.
             signal.signal(number, lambda number, frame: None)
 
 
@@ -57,7 +59,8 @@ def pytest_configure() -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Take turns with tests that need the machine to themselves.
 
-    Out here, and not in a fixture: the time-out of a test begins within, so it does not count the wait.
+    Out here, and not in a fixture: the time-out of a test begins within, so it does not count the
+    wait.
     """
     with ExitStack() as stack:
         try:

@@ -1,4 +1,5 @@
-"""A writing task and a reading task at the two ends of one mailbox, cycled by a test, tick by tick."""
+"""A writing task and a reading task at the two ends of one mailbox, cycled by a test, tick by
+tick."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ from tests.backplane.bus import NAME, layout, mailbox, task
 
 
 class Seen(NamedTuple):
-    """What a read gave: its tick, the release tick that the message holds, -1 for none, and what was said of it."""
+    """What a read gave: its tick, the release tick that the message holds, -1 for none, and what
+    was said of it."""
 
     tick: int
     released: int
@@ -68,7 +70,10 @@ class ReadingTask:
     def __init__(self, segment: Segment) -> None:
         self.every = segment.layout.task("reader").every
         self.ports = InputPorts(
-            segment, {"point": NAME}, AlarmWriter(segment, "reader"), inbox=open_inbox(segment, "reader")
+            segment,
+            {"point": NAME},
+            AlarmWriter(segment, "reader"),
+            inbox=open_inbox(segment, "reader"),
         )
         self.seen: list[Seen] = []
 
@@ -84,7 +89,8 @@ class ReadingTask:
 
 
 class Link:
-    """Both tasks. When both are due the reader comes first, or the writer, as their processors have it."""
+    """Both tasks. When both are due the reader comes first, or the writer, as their processors have
+    it."""
 
     def __init__(self, segment: Segment, reader_first: bool = False) -> None:
         self.segment = segment
@@ -112,7 +118,9 @@ class Link:
         """Write with one more fault from now on."""
         defaults = [p.default or 0.0 for p in KINDS[kind].parameters]
         given = (*parameters, *defaults[len(parameters) :])
-        entry = FaultTable(self.segment).add(Injection(KINDS[kind].number, 0, mailbox, seed=seed, parameters=given))
+        entry = FaultTable(self.segment).add(
+            Injection(KINDS[kind].number, 0, mailbox, seed=seed, parameters=given)
+        )
         self.active.append((kind, entry))
         self.writer.ports.apply(self.active)
         return entry
@@ -123,7 +131,8 @@ class Link:
         self.writer.ports.apply([])
 
     def written(self) -> list[tuple[int, int, int]]:
-        """Return release tick, serial and first visible tick of every message in a slot, oldest first."""
+        """Return release tick, serial and first visible tick of every message in a slot, oldest
+        first."""
         rows = MailboxRing(self.segment, NAME).drain().rows
         return [(int(row["tick"]), int(row["serial"]), int(row["visible_at"])) for row in rows]
 
@@ -143,7 +152,8 @@ MakeLink = Callable[..., Link]
 
 @contextmanager
 def links(rack: str) -> Iterator[MakeLink]:
-    """Make the links of a test, then remove them; a link's writer writes in every n-th of its cycles."""
+    """Make the links of a test, then remove them; a link's writer writes in every n-th of its
+    cycles."""
     made: list[Link] = []
 
     def make(

@@ -1,7 +1,8 @@
 """The machine that tests run on: what it permits, and whose turn it is.
 
-Tests run two at a time. One that judges what real-time processes do on their cores needs the machine to itself: it is
-marked `alone`, waits until every other test is done, and no other begins before it has ended.
+Tests run two at a time. One that judges what real-time processes do on their cores needs the
+machine to itself: it is marked `alone`, waits until every other test is done, and no other begins
+before it has ended.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import pytest
 from rack.tools.lab.benches.network import Lab
 
 WAIT_S = 600.0
-"""Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the test's own time."""
+"""Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the
+test's own time."""
 _FOLDER = Path(tempfile.gettempdir())
 
 
@@ -40,9 +42,13 @@ needs_lab = pytest.mark.skipif(bool(Lab.is_possible()), reason=Lab.is_possible()
 
 @contextmanager
 def turn(alone: bool) -> Iterator[None]:
-    """Have one's turn on the machine, alone or beside others. Raises `TimeoutError` when it does not come."""
+    """Have one's turn on the machine, alone or beside others. Raises `TimeoutError` when it does
+    not come."""
     # Who waits to be alone keeps the gate: nobody new comes in before it.
-    with _locked("gate", fcntl.LOCK_EX) as gate, _locked("machine", fcntl.LOCK_EX if alone else fcntl.LOCK_SH):
+    with (
+        _locked("gate", fcntl.LOCK_EX) as gate,
+        _locked("machine", fcntl.LOCK_EX if alone else fcntl.LOCK_SH),
+    ):
         fcntl.flock(gate, fcntl.LOCK_UN)
         yield
 

@@ -1,7 +1,9 @@
-"""Does the campaign notice when a detector is gone? `python -m tests.mutants`: a step of its own in CI.
+"""Does the campaign notice when a detector is gone? `python -m tests.mutants`: a step of its own in
+CI.
 
-Each mutant is a copy of the tree with one detector switched off. A small campaign in lockstep on it must fail, and name
-the kind of fault that nobody finds any more; without any mutation the same campaign must pass.
+Each mutant is a copy of the tree with one detector switched off. A small campaign in lockstep on it
+must fail, and name the kind of fault that nobody finds any more; without any mutation the same
+campaign must pass.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ BOUND_S = 300
 
 @dataclass(frozen=True)
 class Mutant:
-    """One detector switched off: `patches` are file, old text, new text. `kind` is what the campaign must name."""
+    """One detector switched off: `patches` are file, old text, new text. `kind` is what the
+    campaign must name."""
 
     detector: str
     kind: str
@@ -46,7 +49,13 @@ MUTANTS = (
     Mutant(
         "sensor monitor",
         "sensor-bias",
-        (first("levels/servo/sensor_monitor.py", "def _ring(self, finding: Finding) -> None:", "return"),),
+        (
+            first(
+                "levels/servo/sensor_monitor.py",
+                "def _ring(self, finding: Finding) -> None:",
+                "return",
+            ),
+        ),
     ),
     Mutant(
         "motor monitor",
@@ -89,15 +98,29 @@ MUTANTS = (
     Mutant(
         "watchdog",
         "hang",
-        (first("backplane/clock/released_task.py", "def _hangs(self, task: ReleasedTask) -> bool:", "return False"),),
+        (
+            first(
+                "backplane/clock/released_task.py",
+                "def _hangs(self, task: ReleasedTask) -> bool:",
+                "return False",
+            ),
+        ),
     ),
     Mutant(
         "limit gate",
         "command-limit",
-        (first("levels/arm/arm.py", "def refused(self, torque: Array) -> Finding | None:", "return None"),),
+        (
+            first(
+                "levels/arm/arm.py",
+                "def refused(self, torque: Array) -> Finding | None:",
+                "return None",
+            ),
+        ),
     ),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
-    Mutant("restart", "kill", (("boards/crate/recovery.py", "if len(recent) >= most:", "if True:"),)),
+    Mutant(
+        "restart", "kill", (("boards/crate/recovery.py", "if len(recent) >= most:", "if True:"),)
+    ),
     Mutant(
         "violation counter",
         "violation counter",
@@ -107,26 +130,45 @@ MUTANTS = (
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))
 
 
-def mutated(folder: Path, patches: Sequence[tuple[str, str, str]], copied: Sequence[str] = COPIED) -> None:
+def mutated(
+    folder: Path, patches: Sequence[tuple[str, str, str]], copied: Sequence[str] = COPIED
+) -> None:
     """Copy the tree and patch it. Raises `LookupError` for a patch that applies no more."""
     for name in copied:
-        shutil.copytree(ROOT / name, folder / "rack" / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / name, folder / "rack" / name, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for file, old, new in patches:
         text = (folder / "rack" / file).read_text()
         if old not in text:
-            raise LookupError(f"{file}: no longer holds {old.strip()!r}; mend the mutant in tests/mutants.py")
+            raise LookupError(
+                f"{file}: no longer holds {old.strip()!r}; mend the mutant in tests/mutants.py"
+            )
         (folder / "rack" / file).write_text(text.replace(old, new))
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return the environment in which a tree in `folder` runs. Code that is compiled for the copy goes with it."""
+    """Return the environment in which a tree in `folder` runs. Code that is compiled for the copy
+    goes with it."""
     return {**os.environ, "PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
 
 
 def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
-    """Run a small campaign in a tree, on one core; return its exit status and what it has printed."""
+    """Run a small campaign in a tree, on one core; return its exit status and what it has
+    printed."""
     command = ["taskset", "-c", str(core), *RACK, "campaign", "nasrem", "--lockstep"]
-    options = ["--injections", "1", "--sizes", "0", "--seed", "1", "--seconds", SECONDS, "--kinds", ",".join(kinds)]
+    options = [
+        "--injections",
+        "1",
+        "--sizes",
+        "0",
+        "--seed",
+        "1",
+        "--seconds",
+        SECONDS,
+        "--kinds",
+        ",".join(kinds),
+    ]
     done = subprocess.run(
         [*command, *options, "--out", str(folder / "campaign")],
         cwd=folder,
@@ -140,7 +182,8 @@ def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
 
 
 def examined(mutant: Mutant | None, core: int) -> str:
-    """Return what is wrong: the campaign did not notice the mutant, or None of it failed; empty when all is well."""
+    """Return what is wrong: the campaign did not notice the mutant, or None of it failed; empty
+    when all is well."""
     kinds = [mutant.kind] if mutant is not None and mutant.kind in KINDS else KINDS
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         try:
@@ -151,7 +194,11 @@ def examined(mutant: Mutant | None, core: int) -> str:
     if mutant is None:
         return "" if status == 0 else f"a campaign without any mutation fails:\n{text}"
     wanted = f"{mutant.kind}: " if mutant.kind not in KINDS else f"{mutant.kind} of "
-    return "" if status == 1 and wanted in text else f"status {status}, and no word of {mutant.kind}:\n{text}"
+    return (
+        ""
+        if status == 1 and wanted in text
+        else f"status {status}, and no word of {mutant.kind}:\n{text}"
+    )
 
 
 def main() -> int:

@@ -1,11 +1,13 @@
-"""Do the tests notice a small mistake? `python -m tests.mutation --seed 7 --count 100`: by hand, it takes an hour.
+"""Do the tests notice a small mistake? `python -m tests.mutation --seed 7 --count 100`: by hand, it
+takes an hour.
 
-Each mutant is a copy of the tree with one random change in one file: a comparison flipped, a statement dropped, a
-number by one, `and` for `or`, a condition negated, a sign. The tests that mirror the file must fail on it. What no test
-is to notice is not changed: annotations, messages, numbers of enumeration members, lengths of time-outs.
+Each mutant is a copy of the tree with one random change in one file: a comparison flipped, a
+statement dropped, a number by one, `and` for `or`, a condition negated, a sign. The tests that
+mirror the file must fail on it. What no test is to notice is not changed: annotations, messages,
+numbers of enumeration members, lengths of time-outs.
 
-A test that fails on the unchanged copy as well kills nothing: it is left out, and the mutant is examined again. Tests
-marked `alone` are left out too: they judge the machine.
+A test that fails on the unchanged copy as well kills nothing: it is left out, and the mutant is
+examined again. Tests marked `alone` are left out too: they judge the machine.
 """
 
 from __future__ import annotations
@@ -50,7 +52,9 @@ FLIPPED |= {
     "+": "-",
     "-": "+",
 }
-OPERATOR = re.compile(r"==|!=|<=|>=|<|>|\bis\s+not\b|\bis\b|\bnot\s+in\b|\bin\b|\band\b|\bor\b|\+|-")
+OPERATOR = re.compile(
+    r"==|!=|<=|>=|<|>|\bis\s+not\b|\bis\b|\bnot\s+in\b|\bin\b|\band\b|\bor\b|\+|-"
+)
 RUNNING: set[int] = set()
 """Sessions of runs."""
 TIME_OUT = re.compile(r"_?(bound|wait|time_?out|patience)\w*", re.IGNORECASE)
@@ -68,7 +72,11 @@ class Mutation:
     def patch(self) -> tuple[str, str, str]:
         """Return the file, its text, and its text with the mutation."""
         text = (ROOT / self.file).read_bytes()
-        return self.file, text.decode(), (text[: self.start] + self.new.encode() + text[self.end :]).decode()
+        return (
+            self.file,
+            text.decode(),
+            (text[: self.start] + self.new.encode() + text[self.end :]).decode(),
+        )
 
     def __str__(self) -> str:
         """Return file, line, and the line before and after."""
@@ -92,7 +100,10 @@ class Mutations:
         """Return the bytes of a node."""
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
-        return self.lines[node.lineno - 1] + node.col_offset, self.lines[node.end_lineno - 1] + node.end_col_offset
+        return (
+            self.lines[node.lineno - 1] + node.col_offset,
+            self.lines[node.end_lineno - 1] + node.end_col_offset,
+        )
 
     def of(self, node: ast.AST) -> Iterator[Mutation]:
         """Yield the mutations of a node and of all below it that may matter."""
@@ -101,16 +112,27 @@ class Mutations:
                 yield from self._operator(left, right)
             case ast.BoolOp(values=values):
                 yield from self._operator(values[0], values[1])
-            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right) if not _is_text(left) | _is_text(right):
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right) if not _is_text(
+                left
+            ) | _is_text(right):
                 yield from self._operator(left, right)
             case ast.UnaryOp(op=ast.Not() | ast.USub() as op):
                 start = self.span(node)[0]
-                yield self._mutation(start, start + len("not" if isinstance(op, ast.Not) else "-"), "")
+                yield self._mutation(
+                    start, start + len("not" if isinstance(op, ast.Not) else "-"), ""
+                )
             case ast.Constant(value=bool() as value):
                 yield self._mutation(*self.span(node), str(not value))
             case ast.Constant(value=int() | float() as value):
                 yield self._mutation(*self.span(node), repr(value + 1))
-            case ast.Expr() | ast.AugAssign() | ast.Raise() | ast.Continue() | ast.Break() | ast.Return(value=None):
+            case (
+                ast.Expr()
+                | ast.AugAssign()
+                | ast.Raise()
+                | ast.Continue()
+                | ast.Break()
+                | ast.Return(value=None)
+            ):
                 yield self._dropped(node)
             case ast.Assign(targets=[ast.Attribute() | ast.Subscript()]):
                 yield self._dropped(node)
@@ -124,7 +146,9 @@ class Mutations:
     def _operator(self, left: ast.expr, right: ast.expr) -> Iterator[Mutation]:
         start, end = self.span(left)[1], self.span(right)[0]
         if found := OPERATOR.search(self.text[start:end].decode()):
-            yield self._mutation(start + found.start(), start + found.end(), FLIPPED[" ".join(found[0].split())])
+            yield self._mutation(
+                start + found.start(), start + found.end(), FLIPPED[" ".join(found[0].split())]
+            )
 
     def _dropped(self, statement: ast.stmt) -> Mutation:
         start, end = self.span(statement)
@@ -136,7 +160,9 @@ class Mutations:
 
 
 def _is_text(node: ast.expr) -> bool:
-    return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+    return isinstance(node, ast.JoinedStr) or (
+        isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
 
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
@@ -152,16 +178,26 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
         case ast.FunctionDef(args=args):
             named = [*args.posonlyargs, *args.args]
             defaults = [*zip(reversed(named), reversed(args.defaults), strict=False)]
-            defaults += [(arg, value) for arg, value in zip(args.kwonlyargs, args.kw_defaults, strict=True) if value]
+            defaults += [
+                (arg, value)
+                for arg, value in zip(args.kwonlyargs, args.kw_defaults, strict=True)
+                if value
+            ]
             yield from (value for arg, value in defaults if not TIME_OUT.fullmatch(arg.arg))
             yield from _statements(node.body)
         case ast.ClassDef(body=body):
-            is_enum = any("Enum" in ast.unparse(base) or "Flag" in ast.unparse(base) for base in node.bases)
-            yield from (item for item in _statements(body) if not (is_enum and isinstance(item, ast.Assign)))
+            is_enum = any(
+                "Enum" in ast.unparse(base) or "Flag" in ast.unparse(base) for base in node.bases
+            )
+            yield from (
+                item for item in _statements(body) if not (is_enum and isinstance(item, ast.Assign))
+            )
         case ast.AnnAssign(target=target, value=value):
             if value and not (isinstance(target, ast.Name) and TIME_OUT.fullmatch(target.id)):
                 yield value
-        case ast.Assign(targets=[ast.Name(id=name)]) if name.startswith("__") or TIME_OUT.fullmatch(name):
+        case ast.Assign(targets=[ast.Name(id=name)]) if name.startswith("__") or TIME_OUT.fullmatch(
+            name
+        ):
             return
         case ast.Module(body=body):
             yield from _statements(body)
@@ -171,7 +207,11 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 def _statements(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
     """Yield the statements that are no docstrings."""
-    yield from (item for item in body if not (isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant)))
+    yield from (
+        item
+        for item in body
+        if not (isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant))
+    )
 
 
 @cache
@@ -187,34 +227,52 @@ def _imports(test: Path) -> frozenset[str]:
 
 
 def _names(file: str) -> set[str]:
-    """Return a module's name, and those of what it defines, as the packages around it may hand them on."""
+    """Return a module's name, and those of what it defines, as the packages around it may hand them
+    on."""
     module = ".".join(("rack", *Path(file).with_suffix("").parts)).removesuffix(".__init__")
-    defined = [item.name for item in ast.parse((ROOT / file).read_text()).body if hasattr(item, "name")]
+    defined = [
+        item.name for item in ast.parse((ROOT / file).read_text()).body if hasattr(item, "name")
+    ]
     above = [module.rsplit(".", level)[0] for level in range(1, module.count("."))]
     return {module} | {f"{package}.{name}" for package in above for name in defined}
 
 
 @cache
 def mirrors(file: str) -> list[str]:
-    """Return the few files of tests nearest to a source: its mirror, then those named after it, then importers of it.
+    """Return the few files of tests nearest to a source: its mirror, then those named after it,
+    then importers of it.
 
     Then those that import its importers: not all that a module does is seen from within it.
     """
     path, names = Path(file), _names(file)
     folder, title = ROOT / "tests" / path.parent, path.stem
-    titles = {f"test_{path.parent.name}_{title}", f"test_{path.parent.name.removesuffix('s')}_{title}"}
-    sources = [source for floor in COPIED for source in (ROOT / floor).rglob("*.py") if names & _imports(source)]
+    titles = {
+        f"test_{path.parent.name}_{title}",
+        f"test_{path.parent.name.removesuffix('s')}_{title}",
+    }
+    sources = [
+        source
+        for floor in COPIED
+        for source in (ROOT / floor).rglob("*.py")
+        if names & _imports(source)
+    ]
     through = {name for source in sources for name in _names(str(source.relative_to(ROOT)))}
 
     def likeness(test: Path) -> int:
-        if test == folder / f"test_{title}.py" or (test.stem in titles and folder.is_relative_to(test.parent)):
+        if test == folder / f"test_{title}.py" or (
+            test.stem in titles and folder.is_relative_to(test.parent)
+        ):
             return 0
         if names & _imports(test):
             return 2 - test.stem.startswith(f"test_{title}")
         return 3 if through & _imports(test) else 4
 
     def distance(test: Path) -> int:
-        return len(test.parts) + len(folder.parts) - 2 * len(Path(os.path.commonpath([test, folder])).parts)
+        return (
+            len(test.parts)
+            + len(folder.parts)
+            - 2 * len(Path(os.path.commonpath([test, folder])).parts)
+        )
 
     ranked = sorted((likeness(test), distance(test), str(test.relative_to(ROOT))) for test in TESTS)
     return [test for _, _, test in ranked[:FEW]]
@@ -230,12 +288,28 @@ class Verdict:
 
 def tested(folder: Path, options: Sequence[str]) -> Verdict:
     """Run tests on the copy in a folder, in a session of their own; nothing of it stays."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", "-m", "not alone"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n0",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not alone",
+    ]
     command += [f"--timeout={TEST_BOUND_S}", f"--basetemp={folder / 'files'}", *options]
     output = folder / "output"
     with output.open("w") as out:
         run = subprocess.Popen(
-            command, cwd=folder / "rack", env=environment(folder), stdout=out, stderr=out, start_new_session=True
+            command,
+            cwd=folder / "rack",
+            env=environment(folder),
+            stdout=out,
+            stderr=out,
+            start_new_session=True,
         )
         RUNNING.add(run.pid)
         try:
@@ -245,7 +319,9 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
         finally:
             _clear(run, folder)
     text = output.read_text(errors="replace")
-    failed = tuple(re.findall(r"^(?:FAILED|ERROR) (\S+\.py(?:::(?:\S|\[.*?\])+)?)", text, re.MULTILINE))
+    failed = tuple(
+        re.findall(r"^(?:FAILED|ERROR) (\S+\.py(?:::(?:\S|\[.*?\])+)?)", text, re.MULTILINE)
+    )
     # 5: all tests that there are were left out.
     if status in (0, 5):
         return Verdict("survived")
@@ -256,7 +332,8 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
 
 
 def _clear(run: subprocess.Popen[bytes], folder: Path) -> None:
-    """End the processes of a run, whatever session they are in, and remove its racks, which are named after it."""
+    """End the processes of a run, whatever session they are in, and remove its racks, which are
+    named after it."""
     RUNNING.discard(run.pid)
     _kill(run.pid)
     run.wait()
@@ -295,7 +372,9 @@ class Bench:
             unknown = sorted(broken - self.sound.keys())
             if unknown:
                 self._copy([])
-                self.sound |= {test: tested(self.folder, [test]).word == "survived" for test in unknown}
+                self.sound |= {
+                    test: tested(self.folder, [test]).word == "survived" for test in unknown
+                }
                 self._copy([mutation.patch()])
             if any(self.sound[test] for test in broken):
                 return verdict.word
@@ -309,17 +388,24 @@ class Bench:
 
 
 def main() -> int:
-    """Examine random mutants and print what became of each; return 1 when fewer than nine in ten were killed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=(__doc__ or "").splitlines()[0])
+    """Examine random mutants and print what became of each; return 1 when fewer than nine in ten
+    were killed."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.mutation", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=ROOMS, metavar="PATH", help="files or folders")
     options = parser.parse_args()
     paths = [ROOT / name for name in options.only]
-    files = sorted({file for path in paths for file in ([path] if path.is_file() else path.rglob("*.py"))})
+    files = sorted(
+        {file for path in paths for file in ([path] if path.is_file() else path.rglob("*.py"))}
+    )
     names = [str(file.relative_to(ROOT)) for file in files]
-    sites = [site for name in names for site in Mutations(name).of(ast.parse((ROOT / name).read_text()))]
+    sites = [
+        site for name in names for site in Mutations(name).of(ast.parse((ROOT / name).read_text()))
+    ]
     chosen = random.Random(options.seed).sample(sites, min(options.count, len(sites)))
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
@@ -334,7 +420,10 @@ def main() -> int:
             finally:
                 benches.put(bench)
             counts[word] += 1
-            print(f"{counts.total():3} {word} ({time.monotonic() - began:.0f} s): {mutation}", flush=True)
+            print(
+                f"{counts.total():3} {word} ({time.monotonic() - began:.0f} s): {mutation}",
+                flush=True,
+            )
 
         with ThreadPoolExecutor(options.jobs) as pool:
             # Started in the background of a shell, it would ignore SIGINT.
@@ -347,7 +436,10 @@ def main() -> int:
                 for session in tuple(RUNNING):
                     _kill(session)
                 raise
-    print(f"seed {options.seed}, of {len(sites)} possible: {', '.join(f'{n} {word}' for word, n in counts.items())}")
+    print(
+        f"seed {options.seed}, of {len(sites)} possible:"
+        f" {', '.join(f'{n} {word}' for word, n in counts.items())}"
+    )
     return 0 if 10 * counts["killed"] >= 9 * len(chosen) else 1
 
 

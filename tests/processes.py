@@ -18,7 +18,8 @@ RACK = (sys.executable, "-m", "rack.tools.cli")
 BOUND_S = 20.0
 """Bound of every wait: reached only when something is broken."""
 FORKS = "ignore:.*multi-threaded, use of fork:DeprecationWarning"
-"""Filter for tests that fork: a worker here touches shared memory alone, none of the parent's threads' locks."""
+"""Filter for tests that fork: a worker here touches shared memory alone, none of the parent's
+threads' locks."""
 
 
 def fork(work: Callable[[], object]) -> int:
@@ -56,7 +57,10 @@ def exit_status(pid: int, bound_s: float = BOUND_S) -> int:
     """Wait for a child's end and return its exit status, negative for a signal."""
     pidfd = os.pidfd_open(pid)
     try:
-        wait_until(lambda: os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None, bound_s)
+        wait_until(
+            lambda: os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None,
+            bound_s,
+        )
     finally:
         os.close(pidfd)
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
@@ -97,7 +101,9 @@ def parent_of(pid: int) -> int:
 def children_of(pid: int) -> list[int]:
     """Return the children of a process; none when it is gone."""
     with suppress(FileNotFoundError, ProcessLookupError):
-        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        return [
+            int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        ]
     return []
 
 
@@ -108,7 +114,8 @@ def descriptors() -> int:
 
 
 def named(start: str) -> list[int]:
-    """Return the processes whose name, as `ps` shows it, begins like that; the kernel keeps 15 characters of it."""
+    """Return the processes whose name, as `ps` shows it, begins like that; the kernel keeps 15
+    characters of it."""
     found = []
     for path in Path("/proc").glob("[0-9]*/comm"):
         with suppress(FileNotFoundError, ProcessLookupError):

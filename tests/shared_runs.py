@@ -1,4 +1,5 @@
-"""Recorded runs that several files of tests read: each is made once in a session, by the worker that needs it first."""
+"""Recorded runs that several files of tests read: each is made once in a session, by the worker
+that needs it first."""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ def nasrem_run(factory: pytest.TempPathFactory) -> Path:
     return _copy(factory, "nasrem", NASREM_S, ("clock.mode=lockstep",))
 
 
-def _copy(factory: pytest.TempPathFactory, name: str, seconds: float, settings: Sequence[str] = ()) -> Path:
+def _copy(
+    factory: pytest.TempPathFactory, name: str, seconds: float, settings: Sequence[str] = ()
+) -> Path:
     """Return a copy of the run `name`: its readers write reports and pictures into the folder."""
     base = factory.getbasetemp()
     # Each worker of pytest-xdist has a folder of its own in the session's.

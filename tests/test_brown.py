@@ -1,4 +1,5 @@
-"""The rack brown, with real processes in lockstep: a law is replaced in motion, the network fails, all repeats."""
+"""The rack brown, with real processes in lockstep: a law is replaced in motion, the network fails,
+all repeats."""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ class Ran(NamedTuple):
 
 
 def ran(script: Path) -> Ran:
-    with Rack(load("brown", [f"name=test-brown-{os.getpid()}", "clock.mode=lockstep"], str(script))) as rack:
+    with Rack(
+        load("brown", [f"name=test-brown-{os.getpid()}", "clock.mode=lockstep"], str(script))
+    ) as rack:
         digest = rack.run(SECONDS).digest
         names = "arm.status", "shoulder.status", "supervisor.status", "supervisor.command"
         return Ran(digest, {name: MailboxRing(rack.segment, name).drain().rows for name in names})
@@ -63,7 +66,9 @@ def test_the_law_is_replaced_on_two_boards_in_motion_without_a_step(run: Ran) ->
     steps = np.abs(np.diff(run.values("arm.status", "torque", 300, 1499), axis=0))
     # From brakes to motion and at the blend, against the second after the switch.
     assert steps[900:].max() < steps[:900].max()
-    assert np.abs(np.diff(run.values("shoulder.status", "torque", 1200, 1201), axis=0)).max() == pytest.approx(0.0)
+    assert np.abs(
+        np.diff(run.values("shoulder.status", "torque", 1200, 1201), axis=0)
+    ).max() == pytest.approx(0.0)
 
 
 def test_a_silent_general_machine_is_bridged_then_the_arm_holds_and_goes_on(run: Ran) -> None:

@@ -38,11 +38,15 @@ def test_both_racks_see_the_same_table_and_part() -> None:
     for data, others in ((puma.start(), k1607.start()), (k1607.start(), puma.start())):
         for name in ("table", "part"):
             np.testing.assert_array_equal(data.geom(name).xpos, others.geom(name).xpos)
-    np.testing.assert_array_equal(puma.model.body_mass[puma.bodies], k1607.model.body_mass[k1607.bodies])
+    np.testing.assert_array_equal(
+        puma.model.body_mass[puma.bodies], k1607.model.body_mass[k1607.bodies]
+    )
     np.testing.assert_array_equal(puma.model.opt.gravity, k1607.model.opt.gravity)
 
 
-@pytest.mark.parametrize(("arm", "column"), [("cell_puma", "k1607_column"), ("cell_k1607", "puma_column")])
+@pytest.mark.parametrize(
+    ("arm", "column"), [("cell_puma", "k1607_column"), ("cell_k1607", "puma_column")]
+)
 def test_each_arm_has_the_column_of_the_other_in_its_way(arm: str, column: str) -> None:
     assert cell(arm).touch[cell(arm).arm_geoms, cell(arm).model.geom(column).id].all()
 
@@ -81,7 +85,9 @@ max_age_ms = 200
 
 def test_a_rack_may_share_with_several_others(tmp_path: Path) -> None:
     (tmp_path / "three.toml").write_text(TWO_SHARED.format(puma=CONFIGS / "cell" / "puma.toml"))
-    servo = next(task for task in resolve(load(tmp_path / "three.toml")).tasks if task.task == "servo")
+    servo = next(
+        task for task in resolve(load(tmp_path / "three.toml")).tasks if task.task == "servo"
+    )
     assert servo.inputs["others"] == {"lan.shared": "lan.shared", "lan.third": "lan.third"}
 
 
@@ -104,7 +110,10 @@ MISTAKES = {
         "the arm shares no objects; permitted: rack.levels.systems.cell.sharing_arm:SharingArm",
     ),
     "from nowhere": ("board.servo.reads.others=lan.shred", '"lan.shred": no task writes it'),
-    "of another type": ("board.servo.reads.others=servo.scene", "carries scene 1; the port needs shared_bodies 1"),
+    "of another type": (
+        "board.servo.reads.others=servo.scene",
+        "carries scene 1; the port needs shared_bodies 1",
+    ),
     "without sharing": (
         "board.servo.executor=rack.levels.servo:ServoExecutor",
         "board.servo.params.shared",
@@ -124,7 +133,12 @@ def test_an_obstacle_cannot_be_shared(tmp_path: Path) -> None:
     text = f'extends = ["{CONFIGS / "cell" / "puma.toml"}", "{robot}"]\ntask = {{}}\n'
     (tmp_path / "post.toml").write_text(text)
     with pytest.raises(ConfigError) as error:
-        resolve(load(tmp_path / "post.toml", ['board.servo.params.shared=["post"]', "task.action=[]", "scene.goal=[]"]))
+        resolve(
+            load(
+                tmp_path / "post.toml",
+                ['board.servo.params.shared=["post"]', "task.action=[]", "scene.goal=[]"],
+            )
+        )
     assert "an obstacle, which moves by itself; objects: block1, block2, peg" in str(error.value)
 
 
@@ -134,7 +148,9 @@ def racks(name: str, folder: Path) -> list[RackConfig]:
     for file in (CONFIGS / "cell").glob("*.toml"):
         text = re.sub(r'"cell(?=["/-])', f'"{name}', file.read_text().replace('"../', '"'))
         (folder / file.name).write_text(re.sub("7447|7448", lambda port: ports[port[0]], text))
-    return [load(folder / f"{rack}.toml", ["clock.mode=lockstep"]) for rack in ("cell", "puma", "k1607")]
+    return [
+        load(folder / f"{rack}.toml", ["clock.mode=lockstep"]) for rack in ("cell", "puma", "k1607")
+    ]
 
 
 @pytest.mark.slow
@@ -145,6 +161,10 @@ def test_the_three_racks_begin_the_program_together(rack_name: str, tmp_path: Pa
     assert (cell["task.status"]["state"], cell["task.status"]["moves"]) == (State.EXECUTING, 2)
     for arm, other in ((puma, k1607), (k1607, puma)):
         assert arm["task.report"]["response"] == Response.DOING
-        assert arm["elemental_move.status"]["progress"] > 0.0, "it is on its way, slowly: it has time"
-        np.testing.assert_array_equal(arm["lan.shared"]["bodies"]["name"], other["servo.shared"]["bodies"]["name"])
+        assert arm["elemental_move.status"]["progress"] > 0.0, (
+            "it is on its way, slowly: it has time"
+        )
+        np.testing.assert_array_equal(
+            arm["lan.shared"]["bodies"]["name"], other["servo.shared"]["bodies"]["name"]
+        )
         assert arm["lan.status"]["import_shared"]["taken"] == 199

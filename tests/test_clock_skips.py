@@ -1,4 +1,5 @@
-"""Ticks that the clock skips in racks where no board runs in every tick: each skip is seen, however short."""
+"""Ticks that the clock skips in racks where no board runs in every tick: each skip is seen, however
+short."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from rack.tools.faults.judge import Circumstances, FaultVerdict, judge
 pytestmark = pytest.mark.slow
 
 FIRST, APART = 101, 41
-"""First fault, and ticks from one to the next: odd, so that the skips begin in every phase of the boards."""
+"""First fault, and ticks from one to the next: odd, so that the skips begin in every phase of the
+boards."""
 LENGTHS = (1, 2, 3, 4) * 4
 AFTER = 60
 """Ticks of the run after the last fault."""
@@ -25,7 +27,8 @@ RACKS = pytest.mark.parametrize("name", ["hic", "condor"])
 
 @dataclass(frozen=True)
 class Skipped:
-    """A run of a clock that skips 1 to 4 ticks, in every phase: faults as judged, and alarms by guarding board."""
+    """A run of a clock that skips 1 to 4 ticks, in every phase: faults as judged, and alarms by
+    guarding board."""
 
     verdict: FaultVerdict
     alarms: dict[str, list[Event]]
@@ -34,7 +37,8 @@ class Skipped:
 
 def disturbed(name: str, rack_name: str, mode: str) -> RackConfig:
     faults = ", ".join(
-        f"{{ kind = 'clock-skip', board = 'clock', tick = {FIRST + APART * place}, ticks = {ticks} }}"
+        f"{{ kind = 'clock-skip', board = 'clock', tick = {FIRST + APART * place}, ticks ="
+        f" {ticks} }}"
         for place, ticks in enumerate(LENGTHS)
     )
     return load(name, [f"name={rack_name}", f"clock.mode={mode}", f"fault=[{faults}]"])
@@ -46,18 +50,25 @@ def ran(config: RackConfig) -> Skipped:
         rack.run((FIRST + APART * len(LENGTHS) + AFTER) * config.clock_ns * 1e-9)
         layout, struck = rack.segment.layout, strikes(rack.segment, (), ())
     misses = [event for event in rack.events if event.kind == "miss"]
-    alarms = {guard: [e for e in misses if (e.board, e.code) == (guard, "clock_skipped")] for guard in guards}
+    alarms = {
+        guard: [e for e in misses if (e.board, e.code) == (guard, "clock_skipped")]
+        for guard in guards
+    }
     circumstances = Circumstances(layout, 0, is_lockstep=config.clock.mode == "lockstep")
     return Skipped(judge(struck, rack.events, circumstances), alarms, misses)
 
 
 @RACKS
 @pytest.mark.timeout(120)
-def test_a_skip_of_any_length_is_seen_once_by_every_guard_and_judged_so(name: str, rack_name: str) -> None:
+def test_a_skip_of_any_length_is_seen_once_by_every_guard_and_judged_so(
+    name: str, rack_name: str
+) -> None:
     found = ran(disturbed(name, rack_name, "lockstep"))
     for alarms in found.alarms.values():
         assert [int(event.value) for event in alarms] == list(LENGTHS)
-        assert [event.since for event in alarms] == [FIRST + APART * place for place in range(len(LENGTHS))]
+        assert [event.since for event in alarms] == [
+            FIRST + APART * place for place in range(len(LENGTHS))
+        ]
     assert len(found.verdict.faults) == len(LENGTHS)
     assert all(fault.seen == "detected" and fault.is_within for fault in found.verdict.faults)
     # Nobody is blamed for a release that the clock gave late, and nothing is left to explain.
@@ -71,7 +82,8 @@ def test_a_skip_of_any_length_is_seen_once_by_every_guard_and_judged_so(name: st
 def test_no_skip_is_missed_in_real_time(name: str, rack_name: str) -> None:
     found = ran(disturbed(name, rack_name, "realtime"))
     for alarms in found.alarms.values():
-        # A machine that is busy makes the clock skip others as well, and late boards see two skips as one.
+        # A machine that is busy makes the clock skip others as well, and late boards see two skips
+        # as one.
         assert sum(int(event.value) for event in alarms) >= sum(LENGTHS)
         assert all(event.tick >= event.since for event in alarms)
     assert all(fault.seen == "detected" for fault in found.verdict.faults)

@@ -1,4 +1,5 @@
-"""The rack condor, with real processes in lockstep: the workstation plans the grasp and draws, the boards grasp."""
+"""The rack condor, with real processes in lockstep: the workstation plans the grasp and draws, the
+boards grasp."""
 
 from __future__ import annotations
 
@@ -35,7 +36,10 @@ def test_an_order_of_the_workstation_comes_to_the_fingers_as_interrupts(tmp_path
         assert status().plan == 1
         rack.stop("seen enough")
         plan = open_observer(rack.segment, "adapter.plan").peek().value
-        tensions = [MailboxRing(rack.segment, f"{finger}.command").drain().rows for finger in ("index", "thumb")]
+        tensions = [
+            MailboxRing(rack.segment, f"{finger}.command").drain().rows
+            for finger in ("index", "thumb")
+        ]
     # Each finger is on its side of the can, and both sensed the hand a tick before they commanded.
     assert (plan.normal[:3] * plan.normal[3]).sum(axis=1).max() < -0.99
     for rows in tensions:

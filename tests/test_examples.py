@@ -18,7 +18,8 @@ FOLDERS = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 RACK_NAME = re.compile(r"""^(\W*name ?= ?["'])([\w-]+)""", re.MULTILINE)
 RECORDED = ("own-arm", "own-level")
-"""Examples whose recording differs from that of every other rack: another arm, and messages of the user's own."""
+"""Examples whose recording differs from that of every other rack: another arm, and messages of the
+user's own."""
 PROGRAMS = {"rack": RACK, "python": (sys.executable,)}
 
 
@@ -39,9 +40,15 @@ def test_example_runs_as_its_readme_says(name: str, tmp_path: Path) -> None:
     for program, *words in found:
         unrecorded = ["--no-record"] if words[0] == "run" and name not in RECORDED else []
         command = [*PROGRAMS[program], *words, *unrecorded]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100, check=False)
-        assert done.returncode == 0, f"{program} {' '.join(words)}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=100, check=False
+        )
+        assert done.returncode == 0, (
+            f"{program} {' '.join(words)}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
+        )
 
 
 def test_the_list_of_examples_is_complete() -> None:
-    assert sorted(set(re.findall(r"\]\(([\w-]+)\)", (EXAMPLES / "README.md").read_text()))) == FOLDERS
+    assert (
+        sorted(set(re.findall(r"\]\(([\w-]+)\)", (EXAMPLES / "README.md").read_text()))) == FOLDERS
+    )

@@ -12,7 +12,9 @@ def known() -> dict[str, dict[str, str]]:
     return golden.read()
 
 
-def test_every_run_has_a_golden_digest_and_none_is_left_over(known: dict[str, dict[str, str]]) -> None:
+def test_every_run_has_a_golden_digest_and_none_is_left_over(
+    known: dict[str, dict[str, str]],
+) -> None:
     assert set(known["digests"]) == set(golden.RUNS)
 
 
@@ -26,8 +28,14 @@ def here() -> dict[str, str]:
 def test_a_shipped_rack_has_its_golden_digest(
     run: str, rack_name: str, known: dict[str, dict[str, str]], here: dict[str, str]
 ) -> None:
-    others = {name: (there, here[name]) for name, there in known["machine"].items() if here[name] != there}
+    others = {
+        name: (there, here[name]) for name, there in known["machine"].items() if here[name] != there
+    }
     if "libm" in others:
-        pytest.skip("the C library here rounds sin, exp, ... otherwise than that of the golden digests")
+        pytest.skip(
+            "the C library here rounds sin, exp, ... otherwise than that of the golden digests"
+        )
     expected = known["digests"].get(run)
-    assert golden.digest(run, rack_name) == expected, f"the rack does otherwise than it did: {others or ''} make golden"
+    assert golden.digest(run, rack_name) == expected, (
+        f"the rack does otherwise than it did: {others or ''} make golden"
+    )

@@ -1,4 +1,5 @@
-"""A hand in a rack of real processes, in lockstep: its board is killed, an object is pushed, the recording shows it."""
+"""A hand in a rack of real processes, in lockstep: its board is killed, an object is pushed, the
+recording shows it."""
 
 from __future__ import annotations
 
@@ -74,7 +75,9 @@ def test_two_runs_have_one_digest(runs: list[Recording]) -> None:
 
 
 def test_restarted_board_goes_on_with_the_hand_as_it_was(runs: list[Recording]) -> None:
-    tick, position, stopped = (runs[0].signal("hand.status", name) for name in ("tick", "position", "stopped"))
+    tick, position, stopped = (
+        runs[0].signal("hand.status", name) for name in ("tick", "position", "stopped")
+    )
     gap = int(np.diff(tick).argmax())
     assert tick[gap] * 5e-4 == pytest.approx(KILLED_S, abs=0.005)
     assert np.diff(tick).max() * 5e-4 > 0.04
@@ -101,7 +104,9 @@ def test_recording_shows_tensions_and_joints_by_finger(runs: list[Recording]) ->
     own = slice(8, 12)
     expected = [both[:, row, own] for both in (wanted, tension) for row in (0, 1)]
     assert np.array_equal(rows.values, np.hstack(expected))
-    assert np.array_equal(read(file, "/hand/thumb/joints").values, run.signal("hand.status", "position")[:, 12:])
+    assert np.array_equal(
+        read(file, "/hand/thumb/joints").values, run.signal("hand.status", "position")[:, 12:]
+    )
 
 
 def test_recording_shows_a_push_as_an_arrow(runs: list[Recording]) -> None:
@@ -118,7 +123,10 @@ def test_recording_shows_a_push_as_an_arrow(runs: list[Recording]) -> None:
     [
         ("robot.hand.least=200", "robot.hand.rest: 15 N; above robot.hand.least = 200 N is valid"),
         ("robot.hand.flexors=['index0_flexor']", "robot.hand.flexors: 1 values; one per joint: 16"),
-        ("scene.push=[{ body = 'cup', at = 0, seconds = 1, force = [0, 0, 1] }]", "no such object; scene.objects: can"),
+        (
+            "scene.push=[{ body = 'cup', at = 0, seconds = 1, force = [0, 0, 1] }]",
+            "no such object; scene.objects: can",
+        ),
     ],
 )
 def test_check_refuses_what_is_wrong_with_a_hand(tmp_path: Path, setting: str, why: str) -> None:

@@ -1,4 +1,5 @@
-"""The rack hic, with real processes in lockstep: what boards read is as old as their places in the schedule say."""
+"""The rack hic, with real processes in lockstep: what boards read is as old as their places in the
+schedule say."""
 
 from __future__ import annotations
 

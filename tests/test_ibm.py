@@ -1,4 +1,5 @@
-"""The rack ibm, with real processes in lockstep: what brakes the arm on the way down is no touch."""
+"""The rack ibm, with real processes in lockstep: what brakes the arm on the way down is no
+touch."""
 
 from __future__ import annotations
 
@@ -18,9 +19,11 @@ from rack.tools.timing.analysis.report import write_report
 GUARDED = (7, 16)
 """Numbers of the requests that lower the blocks."""
 TOUCHES = (0.4735, 0.5236)
-"""Heights of the tool at which the blocks stand, m; a braking just before lets it press some mm further."""
+"""Heights of the tool at which the blocks stand, m; a braking just before lets it press some mm
+further."""
 MUTES = [*(("servo", at) for at in np.arange(8.25, 27.0, 0.5)), ("motion", 10.0), ("motion", 19.5)]
-"""Boards that write nothing for five cycles, and when, s: enough of them come while a block is lowered."""
+"""Boards that write nothing for five cycles, and when, s: enough of them come while a block is
+lowered."""
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +31,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]
     """The folder of a run whose arm is braked again and again, and its report."""
     folder = tmp_path_factory.mktemp("ibm")
     script = folder / "mutes.toml"
-    faults = [f'[[fault]]\nkind = "mute"\nboard = "{board}"\nat = {at}\ncycles = 5\n' for board, at in MUTES]
+    faults = [
+        f'[[fault]]\nkind = "mute"\nboard = "{board}"\nat = {at}\ncycles = 5\n'
+        for board, at in MUTES
+    ]
     script.write_text("\n".join(faults))
     config = load("ibm", [f"name=test-ibm-{os.getpid()}", "clock.mode=lockstep"], str(script))
     result = run_rack(config, None, folder / "run", Display())
@@ -46,7 +52,9 @@ def test_the_arm_was_braked_while_each_block_was_lowered(run: tuple[Path, dict[s
         assert len(set(braked) & set(range(lowering[0] + 1000, lowering[-1] - 500)))
 
 
-def test_no_braking_counts_as_touch_and_each_block_is_put_down(run: tuple[Path, dict[str, Any]]) -> None:
+def test_no_braking_counts_as_touch_and_each_block_is_put_down(
+    run: tuple[Path, dict[str, Any]],
+) -> None:
     printed = [event["text"] for event in Recording(run[0]).events if event["kind"] == "printed"]
     assert ["touched" in text for text in printed] == [True, True]
     assert [float(text.split()[-2]) for text in printed] == pytest.approx(TOUCHES, abs=4e-3)

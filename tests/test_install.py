@@ -15,7 +15,16 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-SOURCE = ("backplane", "boards", "configs", "levels", "tools", "pyproject.toml", "README.md", "LICENSE")
+SOURCE = (
+    "backplane",
+    "boards",
+    "configs",
+    "levels",
+    "tools",
+    "pyproject.toml",
+    "README.md",
+    "LICENSE",
+)
 LEVEL = """
 from rack.backplane.message import Field, State, status
 from rack.levels.level import Executor
@@ -49,7 +58,13 @@ def run(folder: Path, *command: str | Path) -> str:
     # Code that is compiled for the copy goes with it.
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache")}
     done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=100, check=False, env=environment
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+        env=environment,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -57,29 +72,59 @@ def run(folder: Path, *command: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the programs of an environment that has the project's wheel, and the libraries of this one."""
+    """Return the programs of an environment that has the project's wheel, and the libraries of this
+    one."""
     folder = tmp_path_factory.mktemp("install")
     (folder / "source").mkdir()
     for name in SOURCE:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__")
+            )
         else:
             shutil.copy(ROOT / name, folder / "source" / name)
     pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
     offline = ("--no-deps", "--no-index")
-    run(folder, *pip, "wheel", *offline, "--no-build-isolation", "--wheel-dir", folder, folder / "source")
+    run(
+        folder,
+        *pip,
+        "wheel",
+        *offline,
+        "--no-build-isolation",
+        "--wheel-dir",
+        folder,
+        folder / "source",
+    )
     venv.create(folder / "clean")
     programs = folder / "clean" / "bin"
-    purelib = run(folder, programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))")
-    # Only the libraries of this environment are seen there: an editable install is found by a hook, which is not.
+    purelib = run(
+        folder, programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"
+    )
+    # Only the libraries of this environment are seen there: an editable install is found by a hook,
+    # which is not.
     Path(purelib.strip(), "libraries.pth").write_text(sysconfig.get_path("purelib"))
-    run(folder, *pip, "--python", programs / "python", "install", *offline, next(folder.glob("*.whl")))
+    run(
+        folder,
+        *pip,
+        "--python",
+        programs / "python",
+        "install",
+        *offline,
+        next(folder.glob("*.whl")),
+    )
     return programs
 
 
 @pytest.mark.slow
-def test_the_wheel_runs_the_nasrem_rack_from_another_folder(installed: Path, tmp_path: Path) -> None:
-    place = run(tmp_path, installed / "python", "-c", "import rack.boards.config.files as f; print(f.__file__)")
+def test_the_wheel_runs_the_nasrem_rack_from_another_folder(
+    installed: Path, tmp_path: Path
+) -> None:
+    place = run(
+        tmp_path,
+        installed / "python",
+        "-c",
+        "import rack.boards.config.files as f; print(f.__file__)",
+    )
     assert place.startswith(str(installed.parent))
     name = f"installed-{os.getpid()}"
     words = ("run", "nasrem", "--set", f"name={name}", "--lockstep", "--seconds", "1", "--json")
@@ -89,7 +134,10 @@ def test_the_wheel_runs_the_nasrem_rack_from_another_folder(installed: Path, tmp
 
 @pytest.mark.slow
 def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_path: Path) -> None:
-    for package, file, text in (("tools", "numbers.py", "THREE = 3\n"), ("levels", "counter.py", LEVEL)):
+    for package, file, text in (
+        ("tools", "numbers.py", "THREE = 3\n"),
+        ("levels", "counter.py", LEVEL),
+    ):
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").touch()
         (tmp_path / package / file).write_text(text)

@@ -1,4 +1,5 @@
-"""Turns on the machine: a wait for one has a bound of its own, and takes nothing of a test's time."""
+"""Turns on the machine: a wait for one has a bound of its own, and takes nothing of a test's
+time."""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ def taken(folder: Path) -> Iterator[None]:
         os.close(fd)
 
 
-def test_a_turn_that_does_not_come_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_turn_that_does_not_come_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(machine, "_FOLDER", tmp_path)
     monkeypatch.setattr(machine, "WAIT_S", 0.05)
     with (
@@ -55,11 +58,25 @@ def test_a_turn_that_does_not_come_is_an_error(tmp_path: Path, monkeypatch: pyte
 def test_waiting_for_a_turn_is_no_part_of_a_tests_time(tmp_path: Path) -> None:
     path = tmp_path / "test_nothing.py"
     path.write_text(TEST)
-    command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", str(tmp_path), str(path)]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-c",
+        os.devnull,
+        "--rootdir",
+        str(tmp_path),
+        str(path),
+    ]
     command += ["-p", "tests.conftest", "-p", "no:cacheprovider"]
     with taken(tmp_path):
         process = subprocess.Popen(
-            command, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, stdout=subprocess.PIPE, text=True
+            command,
+            cwd=ROOT,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
+            stdout=subprocess.PIPE,
+            text=True,
         )
         # It has come to the gate, and waits there for longer than its test may last.
         wait_until((tmp_path / f"rack-tests-{os.getuid()}-gate").exists)

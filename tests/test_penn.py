@@ -1,4 +1,5 @@
-"""The rack penn, with real processes in lockstep: it wipes over an edge; its client dies, and the force is held."""
+"""The rack penn, with real processes in lockstep: it wipes over an edge; its client dies, and the
+force is held."""
 
 from __future__ import annotations
 
@@ -58,14 +59,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def table(run: Path, mailbox: str, *fields: str) -> list[np.ndarray]:
     """Return the columns of a mailbox: seconds, then `fields`."""
     names = ["tick", *(f"{mailbox}.{field}" for field in fields)]
-    rows = pq.read_table(run / "signals.parquet", columns=names, filters=[("mailbox", "=", mailbox)])
+    rows = pq.read_table(
+        run / "signals.parquet", columns=names, filters=[("mailbox", "=", mailbox)]
+    )
     time_s, *values = [np.array(rows[name].to_pylist()) for name in names]
     return [time_s * 1e-3, *values]
 
 
 @pytest.mark.slow
 def test_the_force_is_kept_on_the_flat_and_after_an_edge_that_nobody_knows(run: Path) -> None:
-    _, place, wrench, mode, current = table(run, "server.status", "place", "wrench", "mode", "current")
+    _, place, wrench, mode, current = table(
+        run, "server.status", "place", "wrench", "mode", "current"
+    )
     wiping = (mode == Mode.FORCE) & (current == 5)
     y, pressed = place[wiping, 1], wrench[wiping, 2]
     before, after = pressed[(y > -0.01) & (y < EDGE - 0.005)], pressed[y > EDGE + 0.05]
@@ -79,7 +84,9 @@ def test_the_force_is_kept_on_the_flat_and_after_an_edge_that_nobody_knows(run: 
     assert EDGE - 0.005 < off.min() < off.max() < EDGE + 0.05
 
 
-def test_a_lost_client_leaves_its_segment_ended_and_the_force_held_and_then_released(run: Path) -> None:
+def test_a_lost_client_leaves_its_segment_ended_and_the_force_held_and_then_released(
+    run: Path,
+) -> None:
     time_s, wrench, mode, resting, ended, ends, place, reason = table(
         run, "server.status", "wrench", "mode", "resting", "ended", "ends", "place", "reason"
     )

@@ -1,4 +1,5 @@
-"""One motion on every processor: what a rack does depends on no choice that a library makes at run time."""
+"""One motion on every processor: what a rack does depends on no choice that a library makes at run
+time."""
 
 from __future__ import annotations
 
@@ -19,15 +20,21 @@ SECONDS = 9.0
 """Of `nasrem`: the plans, the way to the first object, the grasp, the way up with it."""
 BLAS, NUMPY = "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"
 FOUND = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
-"""Sets of instructions that this processor has, and for which numpy has code of its own; each includes the last."""
+"""Sets of instructions that this processor has, and for which numpy has code of its own; each
+includes the last."""
 PROCESSORS: dict[str, dict[str, str]] = {
     "this one": {},
     "without AVX-512": {BLAS: "Haswell", NUMPY: " ".join(FOUND[1:])},
     "without AVX": {BLAS: "Nehalem", NUMPY: " ".join(FOUND)},
-    "of 2004": {BLAS: "Prescott", NUMPY: " ".join(FOUND), TUNABLES: "glibc.cpu.hwcaps=-AVX512F,-AVX2,-AVX,-FMA,-FMA4"},
+    "of 2004": {
+        BLAS: "Prescott",
+        NUMPY: " ".join(FOUND),
+        TUNABLES: "glibc.cpu.hwcaps=-AVX512F,-AVX2,-AVX,-FMA,-FMA4",
+    },
 }
-"""Environments that let the libraries take this processor for another. Boards see them as they are set here: only the
-choice of the C library, of which a level can't be independent, is made by the crate."""
+"""Environments that let the libraries take this processor for another. Boards see them as they are
+set here: only the choice of the C library, of which a level can't be independent, is made by the
+crate."""
 ARITHMETIC = """
 import hashlib, math
 import numpy as np
@@ -62,7 +69,9 @@ def test_what_levels_calculate_with_gives_equal_bits_on_every_processor() -> Non
     assert len({arithmetic(settings) for settings in PROCESSORS.values()}) == 1
 
 
-def test_a_rack_moves_the_same_on_every_processor(rack_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rack_moves_the_same_on_every_processor(
+    rack_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep"])
     digests = {}
     for processor, settings in PROCESSORS.items():

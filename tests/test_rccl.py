@@ -1,4 +1,5 @@
-"""The rack rccl, with real processes in lockstep: its planner stalls, and the arm finishes its queue and holds."""
+"""The rack rccl, with real processes in lockstep: its planner stalls, and the arm finishes its
+queue and holds."""
 
 from __future__ import annotations
 
@@ -33,7 +34,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rccl")
     script = folder / "stall.toml"
     script.write_text(STALL)
-    settings = [f"name=test-rccl-{os.getpid()}", "clock.mode=lockstep", LASTS, "board.planning.params.ahead=1"]
+    settings = [
+        f"name=test-rccl-{os.getpid()}",
+        "clock.mode=lockstep",
+        LASTS,
+        "board.planning.params.ahead=1",
+    ]
     result = run_rack(load("rccl", settings, str(script)), SECONDS, folder / "run", Display())
     assert result.recording == "complete"
     return folder / "run"
@@ -43,7 +49,10 @@ def table(run: Path, mailbox: str, *fields: str) -> list[np.ndarray]:
     """Return the columns of a mailbox: tick, then `fields`."""
     rows = pq.read_table(run / "signals.parquet")
     rows = rows.filter(pc.equal(rows["mailbox"], mailbox))
-    return [np.array(rows[name].to_pylist()) for name in ("tick", *(f"{mailbox}.{field}" for field in fields))]
+    return [
+        np.array(rows[name].to_pylist())
+        for name in ("tick", *(f"{mailbox}.{field}" for field in fields))
+    ]
 
 
 def test_a_stalled_planner_leaves_the_arm_holding_at_its_last_goal(run: Path) -> None:
@@ -56,7 +65,9 @@ def test_a_stalled_planner_leaves_the_arm_holding_at_its_last_goal(run: Path) ->
 
 
 def test_the_arm_follows_without_a_step_and_within_its_limits(run: Path) -> None:
-    _, position, target, violations, touches = table(run, "arm.status", "position", "target", "violations", "touches")
+    _, position, target, violations, touches = table(
+        run, "arm.status", "position", "target", "violations", "touches"
+    )
     assert np.abs(position - target).max() < 2e-3
     assert violations[-1] == touches[-1] == 0
     steps = np.diff(target[10:], 2, axis=0)

@@ -21,10 +21,12 @@ BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 ELSEWHERE = re.compile(
-    r"<|\.toml|RUN|rack (status|top|stop|record|replay|inject|estop|command|prompt)|kill-each-board|--view|--step"
+    r"<|\.toml|RUN|rack"
+    r" (status|top|stop|record|replay|inject|estop|command|prompt)|kill-each-board|--view|--step"
     r"|bench (response|systems|lan|hand)|rack run cell|--lan|rack lan"
 )
-"""Commands that need a run, or a running rack, of another line: they have tests of their own in tests/tools."""
+"""Commands that need a run, or a running rack, of another line: they have tests of their own in
+tests/tools."""
 COMMANDS = [
     (line.partition("#")[0].split()[1:], int("exit status 1" in line))
     for block in SHELL.findall(README.read_text())
@@ -34,12 +36,14 @@ COMMANDS = [
 
 
 def words_of(command: list[str]) -> list[str]:
-    """Return the words of a command for a test; of an option that is given twice the last one counts."""
+    """Return the words of a command for a test; of an option that is given twice the last one
+    counts."""
     if command == ["bench", "mailbox"]:
         return [*command, "--rounds", "20"]
     if command[0] != "run":
         return command
-    # A rack of the same name may be at work on this machine. What the racks do is asserted by test_golden.py.
+    # A rack of the same name may be at work on this machine. What the racks do is asserted by
+    # test_golden.py.
     seconds = "2" if "--lockstep" in command else "1"
     shorter = [] if command[1] == TO_ITS_END else ["--seconds", seconds, "--no-record"]
     return [*command, "--set", f"name={OWN_NAME}", "--share", *shorter]
@@ -47,29 +51,42 @@ def words_of(command: list[str]) -> list[str]:
 
 def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=55, check=False)
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=55, check=False
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("words", "status"), COMMANDS, ids=[" ".join(words) for words, _ in COMMANDS])
+@pytest.mark.parametrize(
+    ("words", "status"), COMMANDS, ids=[" ".join(words) for words, _ in COMMANDS]
+)
 def test_command_of_the_readme_works(words: list[str], status: int, tmp_path: Path) -> None:
     ended = rack(*words_of(words), folder=tmp_path)
     assert ended.returncode == status, ended.stderr
 
 
 def test_readme_shows_the_commands() -> None:
-    assert {"run", "check", "list", "clean", "bench", "gantt"} <= {words[0] for words, _ in COMMANDS}
+    assert {"run", "check", "list", "clean", "bench", "gantt"} <= {
+        words[0] for words, _ in COMMANDS
+    }
 
 
 def test_the_example_level_is_the_one_in_configs() -> None:
     shown = dict(BLOCK.findall(README.read_text()))
     assert shown
-    assert shown == {name: (README.parent / "configs" / "examples" / "own-level" / name).read_text() for name in shown}
+    assert shown == {
+        name: (README.parent / "configs" / "examples" / "own-level" / name).read_text()
+        for name in shown
+    }
 
 
 def test_every_file_that_the_pages_link_to_exists() -> None:
     pages = [*README.parent.glob("*.md"), *(README.parent / "configs").rglob("*.md")]
-    links = [(page, link) for page in pages for link in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())]
+    links = [
+        (page, link)
+        for page in pages
+        for link in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())
+    ]
     assert links
     assert not [f"{page.name}: {link}" for page, link in links if not (page.parent / link).exists()]
 
@@ -80,7 +97,11 @@ def test_the_map_names_every_room_and_no_other() -> None:
     heads = [row.split("|")[1] for row in table.splitlines() if row.startswith("| [")]
     named = {room.rstrip("/") for head in heads for room in re.findall(r"\[([\w/]+)\]", head)}
     floors = ("backplane", "boards", "levels", "tools")
-    rooms = {str(path.parent.relative_to(root)) for floor in floors for path in (root / floor).rglob("__init__.py")}
+    rooms = {
+        str(path.parent.relative_to(root))
+        for floor in floors
+        for path in (root / floor).rglob("__init__.py")
+    }
     assert named == rooms
 
 
@@ -88,7 +109,11 @@ def test_the_map_names_every_room_and_no_other() -> None:
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
     script = re.search(r"```python\n(from rack\.boards.*?)```", README.read_text(), re.DOTALL)
     assert script
-    named = script[1].replace('["clock', f'["name={OWN_NAME}", "clock').replace("seconds=10", "seconds=1")
+    named = (
+        script[1]
+        .replace('["clock', f'["name={OWN_NAME}", "clock')
+        .replace("seconds=10", "seconds=1")
+    )
     (tmp_path / "script.py").write_text(named)
     ended = python(tmp_path, "script.py")
     assert ended.returncode == 0, ended.stderr
@@ -96,7 +121,9 @@ def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_reads_back_as_the_readme_has_it(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_run_reads_back_as_the_readme_has_it(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     nasrem_run(tmp_path_factory).rename(tmp_path / "run")
     block = re.search(r"```python\n(from pathlib.*?)```", README.read_text(), re.DOTALL)
     assert block
@@ -117,4 +144,8 @@ def test_every_name_that_a_page_links_to_code_is_in_that_file() -> None:
         for name, link in re.findall(r"\[`(\w+)`\]\(([\w/.-]+\.py)\)", page.read_text())
     ]
     assert named
-    assert not [entry for entry in named if not re.search(rf"\b{entry[1]}\b", (README.parent / entry[2]).read_text())]
+    assert not [
+        entry
+        for entry in named
+        if not re.search(rf"\b{entry[1]}\b", (README.parent / entry[2]).read_text())
+    ]

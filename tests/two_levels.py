@@ -13,7 +13,9 @@ from rack.levels.tables import RobotConfig, SceneConfig
 
 COUNT_COMMAND = command("count_command", 1, Field("goal", "i8", "1", "count to reach"))
 COUNT_STATUS = status("count_status", 1, Field("count", "i8", "1", "count reached"))
-COUNT_PLAN = MessageType("count_plan", 1, (Field("steps", "i8", "1", "counts to go, by joint", ("joints",)),))
+COUNT_PLAN = MessageType(
+    "count_plan", 1, (Field("steps", "i8", "1", "counts to go, by joint", ("joints",)),)
+)
 SMALL_PLAN = MessageType("small_plan", 1, (Field("steps", "i8", "1", "counts to go"),))
 
 
@@ -33,11 +35,17 @@ class CountProgram(Program):
 
     count: tuple[int, ...] = pydantic.Field((), description="counts to reach, one after the other")
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterator[tuple[str, Any, str]]:
         """Refuse negative counts, for a reason that depends on the scene."""
         for at, count in enumerate(self.count):
             if count < 0:
-                yield f"count[{at}]", count, f"nothing to count; objects: {', '.join(scene.objects) or 'none'}"
+                yield (
+                    f"count[{at}]",
+                    count,
+                    f"nothing to count; objects: {', '.join(scene.objects) or 'none'}",
+                )
 
 
 class Programmed(Upper):
@@ -55,7 +63,10 @@ class Unfinished(Executor):
 class Lower(Executor):
     """Counts towards the goal, by its own plan."""
 
-    inputs = {"command": Input(COUNT_COMMAND, "above.command"), "plan": Input(SMALL_PLAN, "own.plan")}
+    inputs = {
+        "command": Input(COUNT_COMMAND, "above.command"),
+        "plan": Input(SMALL_PLAN, "own.plan"),
+    }
     outputs = {"status": COUNT_STATUS}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:

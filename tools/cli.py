@@ -1,7 +1,8 @@
-"""The `rack` command line. A command's module is imported only when that command runs or shows its help.
+"""The `rack` command line. A command's module is imported only when that command runs or shows its
+help.
 
-The parser, typer, takes longer to import than short commands take to run: what needs none goes past it, and `rack run`
-starts its crate before it.
+The parser, typer, takes longer to import than short commands take to run: what needs none goes past
+it, and `rack run` starts its crate before it.
 """
 
 from __future__ import annotations
@@ -26,14 +27,30 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
 
 COMMANDS = (
-    ("run", "rack.tools.commands.run:run", "Run a rack until its task ends, and report on the run."),
+    (
+        "run",
+        "rack.tools.commands.run:run",
+        "Run a rack until its task ends, and report on the run.",
+    ),
     ("check", "rack.tools.commands.check:check", "Validate a config and predict its timing."),
-    ("schema", "rack.tools.commands.schema:schema", "Show the keys of a config with their units and defaults."),
-    ("list", "rack.tools.commands.list:list_racks", "List the racks on this machine, or on others."),
+    (
+        "schema",
+        "rack.tools.commands.schema:schema",
+        "Show the keys of a config with their units and defaults.",
+    ),
+    (
+        "list",
+        "rack.tools.commands.list:list_racks",
+        "List the racks on this machine, or on others.",
+    ),
     ("status", "rack.tools.commands.status:status", "Show a running rack once."),
     ("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
     ("stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."),
-    ("clean", "rack.tools.commands.clean:clean", "Remove the shared memory that killed racks left behind."),
+    (
+        "clean",
+        "rack.tools.commands.clean:clean",
+        "Remove the shared memory that killed racks left behind.",
+    ),
     ("command", "rack.tools.commands.command:command", "Command one level of a running rack."),
     ("step", "rack.tools.commands.step:step", "Let a rack in lockstep go on by single cycles."),
     (
@@ -42,34 +59,69 @@ COMMANDS = (
         "Open a Python prompt on the host side of a rack.",
     ),
     ("inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."),
-    ("estop", "rack.tools.commands.estop:estop", "Engage the brakes of the arm at once, until --reset."),
+    (
+        "estop",
+        "rack.tools.commands.estop:estop",
+        "Engage the brakes of the arm at once, until --reset.",
+    ),
     ("record", "rack.tools.commands.record:record", "Record a running rack."),
     (
         "replay",
         "rack.tools.commands.replay:replay",
         "Open recordings in the viewer, of several racks on one time line.",
     ),
-    ("report", "rack.tools.commands.report:report", "Report on a recorded run, or compare two runs."),
-    ("analyze", "rack.tools.commands.analyze:analyze", "Compare a run with the timing model, equation by equation."),
-    ("gantt", "rack.tools.commands.gantt:gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
-    ("campaign", "rack.tools.commands.campaign:campaign", "Inject random faults into many runs, and judge each."),
+    (
+        "report",
+        "rack.tools.commands.report:report",
+        "Report on a recorded run, or compare two runs.",
+    ),
+    (
+        "analyze",
+        "rack.tools.commands.analyze:analyze",
+        "Compare a run with the timing model, equation by equation.",
+    ),
+    (
+        "gantt",
+        "rack.tools.commands.gantt:gantt",
+        "Draw a Gantt chart of a config's schedule, or of a run.",
+    ),
+    (
+        "campaign",
+        "rack.tools.commands.campaign:campaign",
+        "Inject random faults into many runs, and judge each.",
+    ),
     ("lan", "rack.tools.network.group:app", "Prepare racks that work together over a network."),
     ("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
-    ("reproduce", "rack.tools.commands.reproduce:reproduce", "Reproduce the paper, claim by claim, as one page."),
+    (
+        "reproduce",
+        "rack.tools.commands.reproduce:reproduce",
+        "Reproduce the paper, claim by claim, as one page.",
+    ),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 MAX_ARGUMENT = 4096
 """Characters, as in the longest path; longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"
 """Set by a shell that asks for the completion of a command line."""
-USAGE = (errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ELOOP, errno.EACCES)
+USAGE = (
+    errno.ENAMETOOLONG,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.ELOOP,
+    errno.EACCES,
+)
 """Errors of the system that mean that the user gave a wrong path."""
 
 
 def main() -> None:
     """Run the command line; an error of the user is one line."""
     if sys.platform != "linux":
-        sys.exit(f"rack runs only on Linux, not on {sys.platform}: it needs /dev/shm, pidfds and SCHED_FIFO")
+        sys.exit(
+            f"rack runs only on Linux, not on {sys.platform}: it needs /dev/shm, pidfds and"
+            " SCHED_FIFO"
+        )
     # First of all: importing what a command needs takes longer than many a command.
     INTERRUPT.catch()
     try:
@@ -81,7 +133,8 @@ def main() -> None:
             raise
         finally:
             _flush()
-        # After a short answer. What it imported need not be taken apart: that would be another tenth of its time.
+        # After a short answer. What it imported need not be taken apart: that would be another
+        # tenth of its time.
         os._exit(0)
     except Interrupted:
         return
@@ -123,7 +176,8 @@ def run_commands() -> None:
 
 
 def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
-    """Return what answers a command that is given with a name and --json at most; None for any other."""
+    """Return what answers a command that is given with a name and --json at most; None for any
+    other."""
     command, *rest = arguments or [""]
     names = [argument for argument in rest if argument != "--json"]
     if COMPLETION in os.environ or any(not name or name.startswith("-") for name in names):
@@ -168,8 +222,14 @@ def _flush(text: str = "") -> None:
 
 
 def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:
-    """Start the crate of `rack run`, which imports on the other core what takes longest; no other command has one."""
-    if arguments[:1] != ["run"] or len(arguments) == 1 or "--help" in arguments or COMPLETION in os.environ:
+    """Start the crate of `rack run`, which imports on the other core what takes longest; no other
+    command has one."""
+    if (
+        arguments[:1] != ["run"]
+        or len(arguments) == 1
+        or "--help" in arguments
+        or COMPLETION in os.environ
+    ):
         return nullcontext()
     from rack.boards.crate.line import NO_WINDOWS, SINGLE_THREADED, CrateLine
 
@@ -189,15 +249,24 @@ def commands() -> TyperGroup:
             super().__init__(name, short_help=line)
             self._source = source
 
-        def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        def make_context(
+            self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
+        ) -> Any:
             """Load the command; from here on it takes this one's place."""
-            return _loaded(self.name or "", self._source).make_context(info_name, args, parent, **extra)
+            return _loaded(self.name or "", self._source).make_context(
+                info_name, args, parent, **extra
+            )
 
     app = _app(
         add_completion=True,
         no_args_is_help=True,
-        help="Run, watch and command racks: crates of boards, one process each, under a common clock.",
-        epilog="Exit status: 0 success, 1 failure, 2 usage or config error, 128 + N ended by signal N.",
+        help=(
+            "Run, watch and command racks: crates of boards, one process each, under a common"
+            " clock."
+        ),
+        epilog=(
+            "Exit status: 0 success, 1 failure, 2 usage or config error, 128 + N ended by signal N."
+        ),
     )
     app.callback()(lambda: None)
     group = typer.main.get_command(app)
@@ -233,7 +302,11 @@ def _check_arguments(arguments: list[str]) -> None:
 
     for at, argument in enumerate(arguments, 1):
         if len(argument) > MAX_ARGUMENT:
-            raise Failure(f"argument {at} = {shown(argument)}: {len(argument)} characters; at most {MAX_ARGUMENT}", 2)
+            raise Failure(
+                f"argument {at} = {shown(argument)}: {len(argument)} characters; at most"
+                f" {MAX_ARGUMENT}",
+                2,
+            )
         if any("\ud800" <= c <= "\udfff" for c in argument):
             raise Failure(f"argument {at} = {shown(argument)}: not UTF-8", 2)
 

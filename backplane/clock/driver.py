@@ -1,12 +1,14 @@
 """The system controller's side of the clock: makes the ticks and releases the tasks that are due.
 
-In real time the clock works a little ahead of its grid, if any task sleeps by itself (`wake = "timer"`): at tick T's
-grid point the tick is begun and its releases are there. Whatever the clock reads as of T must then be final earlier:
-conditions on messages are evaluated as of T - 1, in both modes alike. Tasks that wait for a signal, or poll, are
-released at the grid point, by a second sleep of the clock within the tick.
+In real time the clock works a little ahead of its grid, if any task sleeps by itself (`wake =
+"timer"`): at tick T's grid point the tick is begun and its releases are there. Whatever the clock
+reads as of T must then be final earlier: conditions on messages are evaluated as of T - 1, in both
+modes alike. Tasks that wait for a signal, or poll, are released at the grid point, by a second
+sleep of the clock within the tick.
 
-Alternative considered: tasks that release themselves. Faults, operator commands, skipped ticks and the return of a
-restarted board, all decided by the clock before a tick's first cycle, would then depend on which process is faster.
+Alternative considered: tasks that release themselves. Faults, operator commands, skipped ticks and
+the return of a restarted board, all decided by the clock before a tick's first cycle, would then
+depend on which process is faster.
 """
 
 from __future__ import annotations
@@ -30,9 +32,11 @@ _TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
     int(word) for word in (System.TICK, System.TICK_NS, System.STOP_TICK, System.STOP_REQUEST)
 )
 LEAD_NS = 300_000
-"""How far ahead of its grid point the clock begins a tick: room for its own wake-up and for the work of a tick."""
+"""How far ahead of its grid point the clock begins a tick: room for its own wake-up and for the
+work of a tick."""
 LATE_PART = 2
-"""A core was away if the clock wakes late, or nothing runs that is due, for more than one part in so many of a tick."""
+"""A core was away if the clock wakes late, or nothing runs that is due, for more than one part in
+so many of a tick."""
 LEAD_PART = 3
 """The clock is ahead by at most one part in so many of a tick."""
 
@@ -53,16 +57,21 @@ class Controller(Protocol):
 class ClockDriver(ABC):
     """The part common to both modes: the tick, the releases, the end of the run.
 
-    `controller` is set by the clock's board, if it has one. The next `skip` ticks are skipped. `processes`: the
-    tasks, and the host boards, which the clock does not release. `is_flooded`: a fault makes a task write more than the
-    rings are made for.
+    `controller` is set by the clock's board, if it has one. The next `skip` ticks are skipped.
+    `processes`: the tasks, and the host boards, which the clock does not release. `is_flooded`: a
+    fault makes a task write more than the rings are made for.
     """
 
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         self.words = segment.words
         self.tasks = [ReleasedTask(segment, task) for task in by_priority(segment.layout)]
-        self.processes = [*self.tasks, *(ReleasedTask(segment, host) for host in segment.layout.hosts)]
-        groups = groupby(self.tasks, key=lambda task: (task.spec.role, task.spec.every, task.spec.phase))
+        self.processes = [
+            *self.tasks,
+            *(ReleasedTask(segment, host) for host in segment.layout.hosts),
+        ]
+        groups = groupby(
+            self.tasks, key=lambda task: (task.spec.role, task.spec.every, task.spec.phase)
+        )
         self._groups = [(every, phase, list(tasks)) for (_, every, phase), tasks in groups]
         self.controller: Controller | None = None
         self.skip = 0
@@ -77,7 +86,8 @@ class ClockDriver(ABC):
         return {task.spec.name: task for task in self.tasks}[name]
 
     def begin(self, tick: int) -> bool:
-        """Publish `tick` and do the work due before its releases; False when the tick is skipped."""
+        """Publish `tick` and do the work due before its releases; False when the tick is
+        skipped."""
         self.words[_TICK] = tick
         if self.controller is not None:
             self.controller.begin(tick)
@@ -89,7 +99,8 @@ class ClockDriver(ABC):
     def count_skipped(self, first: int, ticks: int) -> None:
         """Publish that the clock skips so many ticks from `first` on.
 
-        All at once, and the count last: a late task must see neither half a skip nor one that began after its release.
+        All at once, and the count last: a late task must see neither half a skip nor one that began
+        after its release.
         """
         self.words[System.SKIPPED_FROM] = first
         self.words[System.CLOCK_SKIPPED] += ticks
@@ -157,7 +168,8 @@ class ClockDriver(ABC):
 
 
 class RealtimeDriver(ClockDriver):
-    """The clock in real time, on an absolute grid of CLOCK_MONOTONIC. A late clock skips ticks and counts them."""
+    """The clock in real time, on an absolute grid of CLOCK_MONOTONIC. A late clock skips ticks and
+    counts them."""
 
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         super().__init__(segment, ended, alarms)
@@ -195,7 +207,8 @@ class RealtimeDriver(ClockDriver):
         """Return at once: real time does not wait."""
 
     def _release(self, tick: int, last: int) -> None:
-        """Give every task its release in (last, tick]: those that sleep in time, the others at the grid point."""
+        """Give every task its release in (last, tick]: those that sleep in time, the others at the
+        grid point."""
         due = self.due(tick, last)
         point = self._time_of(tick)
         sleeping = [task for task in due if task.sleeps]
@@ -225,9 +238,11 @@ class RealtimeDriver(ClockDriver):
             time.sleep(wait * 1e-9)
 
     def _sleep_until_next(self, tick: int) -> int:
-        """Sleep until a tick begins; return the newest tick to begin by then, at least the one after `tick`.
+        """Sleep until a tick begins; return the newest tick to begin by then, at least the one
+        after `tick`.
 
-        The clock preempts all else on its core: if it wakes late, that core was away. Reports tell stalls by it.
+        The clock preempts all else on its core: if it wakes late, that core was away. Reports tell
+        stalls by it.
         """
         due_ns = self._time_of(tick + 1)
         has_ticked = self._woke_ns
@@ -241,7 +256,8 @@ class RealtimeDriver(ClockDriver):
         skipped = next_tick - tick - 1
         if skipped:
             self.count_skipped(tick + 1, skipped)
-        # Before its first tick, at the start or after a restart, a late clock says nothing about its core.
+        # Before its first tick, at the start or after a restart, a late clock says nothing about
+        # its core.
         if has_ticked and (late_ns := self._woke_ns - due_ns) > self._period_ns // LATE_PART:
             self.alarms.ring(next_tick, Alarm.CLOCK_LATE, value=late_ns, since=tick + 1)
         return next_tick

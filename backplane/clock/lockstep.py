@@ -1,9 +1,11 @@
-"""The clock in lockstep: a tick begins when every task due before it has finished. Exact, repeatable, and fast.
+"""The clock in lockstep: a tick begins when every task due before it has finished. Exact,
+repeatable, and fast.
 
-Tasks on different cores run at once. Each reports by a semaphore of its own, and the clock waits for one of them at a
-time, first for the one that finished last in the tick before: the reports of the others are then there, and the clock
-wakes up once in a tick. Alternatives considered: one semaphore for all (the clock wakes up for every report, and takes
-the core from a task that still works), and a word that names the awaited task (it needs a memory barrier on each side).
+Tasks on different cores run at once. Each reports by a semaphore of its own, and the clock waits
+for one of them at a time, first for the one that finished last in the tick before: the reports of
+the others are then there, and the clock wakes up once in a tick. Alternatives considered: one
+semaphore for all (the clock wakes up for every report, and takes the core from a task that still
+works), and a word that names the awaited task (it needs a memory barrier on each side).
 """
 
 from __future__ import annotations
@@ -20,24 +22,31 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Run, System
 
 IDLE_S = 30.0
-"""Bound of the wait for a recorder that is stopped, or dead and not replaced. Its launcher replaces it much sooner."""
+"""Bound of the wait for a recorder that is stopped, or dead and not replaced. Its launcher replaces
+it much sooner."""
 # Plain integers for the hot path.
 _FOLLOWER_PID = int(System.FOLLOWER_PID)
 _FOLLOWER_TICK = int(System.FOLLOWER_TICK)
 _HOLD_AT = int(System.HOLD_AT)
 LOOK_S = 0.001
-"""Time between looks at what posts no semaphore: recorder and host, which must not be able to disturb the clock."""
+"""Time between looks at what posts no semaphore: recorder and host, which must not be able to
+disturb the clock."""
 
 
 class LockstepDriver(ClockDriver):
     """The driver of the clock in lockstep.
 
-    `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for each. Protocols whose
-    messages are visible at once need this to be repeatable.
+    `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for
+    each. Protocols whose messages are visible at once need this to be repeatable.
     """
 
     def __init__(
-        self, segment: Segment, ended: Ended, one_at_a_time: bool, history_ticks: int, alarms: AlarmWriter | None = None
+        self,
+        segment: Segment,
+        ended: Ended,
+        one_at_a_time: bool,
+        history_ticks: int,
+        alarms: AlarmWriter | None = None,
     ) -> None:
         super().__init__(segment, ended, alarms)
         self._one_at_a_time = one_at_a_time
@@ -49,7 +58,9 @@ class LockstepDriver(ClockDriver):
         tick = self.first_tick
         last = tick - 1
         self.words[System.STATE] = Run.RUNNING
-        while self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick):
+        while (
+            self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
+        ):
             if self.begin(tick):
                 if not self._step(tick, last):
                     break
@@ -98,10 +109,12 @@ class LockstepDriver(ClockDriver):
         self._wait(task, condition)
 
     def _wait(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """Wait until `condition` holds, which the task's reports make true; False when the launcher is gone."""
+        """Wait until `condition` holds, which the task's reports make true; False when the launcher
+        is gone."""
         wait = task.done.wait
         while not condition():
-            # The bound may be that of an earlier wait: a timeout that comes early costs one look around, no more.
+            # The bound may be that of an earlier wait: a timeout that comes early costs one look
+            # around, no more.
             if wait() and not self._look_around(task):
                 return False
         return True
@@ -116,7 +129,8 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
-        """Wait for a recorder, however slow, before its rings overflow: in lockstep time stands still meanwhile."""
+        """Wait for a recorder, however slow, before its rings overflow: in lockstep time stands
+        still meanwhile."""
         words = self.words
         since = time.monotonic()
         while (pid := words[_FOLLOWER_PID]) and self._is_ahead(tick):
@@ -130,7 +144,8 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _is_ahead(self, tick: int) -> bool:
-        """Say whether the recorder must catch up first; rings that are flooded hold little more than a tick."""
+        """Say whether the recorder must catch up first; rings that are flooded hold little more
+        than a tick."""
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True
         return self.words[_FOLLOWER_TICK] < tick - self._history_ticks

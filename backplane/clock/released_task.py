@@ -1,8 +1,9 @@
 """A task as the clock sees it, and the watchdog that finds tasks not responding to their releases.
 
-A missed release does not prove a fault: on a busy machine any process may be preempted for a while. A task is lost only
-with proof: a signal has stopped its process, or it waits for something other than its release, or it has used so much
-processor time that it will not end. A task that gets no processor time is starved.
+A missed release does not prove a fault: on a busy machine any process may be preempted for a while.
+A task is lost only with proof: a signal has stopped its process, or it waits for something other
+than its release, or it has used so much processor time that it will not end. A task that gets no
+processor time is starved.
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
 # Plain integers for the hot path.
-_RELEASED, _DEADLINE, _DONE, _LOST = (int(Block[name]) for name in ("RELEASED", "DEADLINE", "DONE", "LOST"))
+_RELEASED, _DEADLINE, _DONE, _LOST = (
+    int(Block[name]) for name in ("RELEASED", "DEADLINE", "DONE", "LOST")
+)
 
 
 RELEASES_MISSED = 4
-"""Missed releases before a task is checked: three gave one false trip in 24,000 cycles at 400 Hz."""
+"""Missed releases before a task is checked: three gave one false trip in 24,000 cycles at 400
+Hz."""
 LEAST_NS = 1_000_000_000
 """Least processor time, or waiting time, before a task counts as hanging."""
 
@@ -29,11 +33,13 @@ LEAST_NS = 1_000_000_000
 class ReleasedTask:
     """The clock's end of a task's control block.
 
-    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by itself. `is_posted`: it
-    waits for its semaphore, which `wake()` posts. `done`: the semaphore that it posts in lockstep. `missed` counts
-    releases since it last finished one: 1 when it becomes late, 2 while it finishes each one late, more while it
-    finishes none. `deadline`: tick before which its release, or plan, must be finished, or its messages are sent,
-    as last seen; it only moves later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for it.
+    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by
+    itself. `is_posted`: it waits for its semaphore, which `wake()` posts. `done`: the semaphore
+    that it posts in lockstep. `missed` counts releases since it last finished one: 1 when it
+    becomes late, 2 while it finishes each one late, more while it finishes none. `deadline`: tick
+    before which its release, or plan, must be finished, or its messages are sent, as last seen; it
+    only moves later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for
+    it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -53,7 +59,8 @@ class ReleasedTask:
         self.done = done_semaphore(segment.rack, spec.name)
 
     def is_free(self, release: int) -> bool:
-        """Say whether the task can take a release; it cannot while it works on a plan or is lost."""
+        """Say whether the task can take a release; it cannot while it works on a plan or is
+        lost."""
         block = self.block
         return block[_DEADLINE] <= release and not block[_LOST]
 
@@ -97,7 +104,8 @@ class ReleasedTask:
 
     @property
     def is_ready(self) -> bool:
-        """Whether a lost task's new process waits for its first release; that of a host board may be done already."""
+        """Whether a lost task's new process waits for its first release; that of a host board may
+        be done already."""
         return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
     @property
@@ -121,7 +129,8 @@ class ReleasedTask:
 
 
 def by_priority(layout: Layout) -> list[TaskSpec]:
-    """Return the tasks in the order in which the clock releases them: executors by rate, then planners."""
+    """Return the tasks in the order in which the clock releases them: executors by rate, then
+    planners."""
     return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.phase, t.slot))
 
 
@@ -135,7 +144,8 @@ class Watchdog:
         self._used_ns: dict[int, int] = {}  # task -> processor time when it was first checked
 
     def check(self, task: ReleasedTask, tick: int) -> None:
-        """Raise the alarms for a task that has missed a release by `tick`, and find out whether it hangs."""
+        """Raise the alarms for a task that has missed a release by `tick`, and find out whether it
+        hangs."""
         missed = task.missed
         spec = task.spec
         if missed == 1:
@@ -158,7 +168,9 @@ class Watchdog:
         state = state_of(pid)
         if state in STOPPED:
             return True
-        bound_ns = max(LEAST_NS, RELEASES_MISSED * spec.every * spec.within_cycles * self._period_ns)
+        bound_ns = max(
+            LEAST_NS, RELEASES_MISSED * spec.every * spec.within_cycles * self._period_ns
+        )
         if task.missed * spec.every * self._period_ns <= bound_ns:
             return False
         return state in WAITING or processor_ns(pid) - self._used_ns.get(task.index, 0) > bound_ns

@@ -32,7 +32,8 @@ class SystemClock:
         return self._words[_STATE] == Run.STOPPED
 
     def now(self) -> int:
-        """Return the current tick: in real time by the grid, as the clock board may be late; else the newest tick."""
+        """Return the current tick: in real time by the grid, as the clock board may be late; else
+        the newest tick."""
         if self.is_lockstep:
             return self._words[_TICK]
         return (monotonic_ns() - self._words[_EPOCH]) // self._words[_PERIOD]
@@ -47,19 +48,29 @@ class SystemClock:
         return self._words[_EPOCH] + tick * self._words[_PERIOD]
 
 
-def ticks_of(rate_hz: float, clock_ns: int, what: str, of: tuple[str, str] = ("clock", "tick")) -> int:
-    """Return the period, in ticks, of a rate. Raises `ClockError` with the nearest rates when off the grid.
+def ticks_of(
+    rate_hz: float, clock_ns: int, what: str, of: tuple[str, str] = ("clock", "tick")
+) -> int:
+    """Return the period, in ticks, of a rate. Raises `ClockError` with the nearest rates when off
+    the grid.
 
     `of`: the text's words for the grid and for one step of it.
     """
     clock_hz, (grid, step) = 1e9 / clock_ns, of
     if not rate_hz > 0:
-        raise ClockError(f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole number")
+        raise ClockError(
+            f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole"
+            " number"
+        )
     ticks = clock_hz / rate_hz
     every = round(ticks)
     if every >= 1 and abs(ticks - every) <= 1e-6 * ticks:
         return every
     # Above the clock's own rate there is only one neighbour.
     nearest = [n for n in (int(ticks) + 1, int(ticks)) if n >= 1]
-    rates = ", ".join(f"{clock_hz / n:.4g} Hz (every {n} {step}{'s' if n > 1 else ''})" for n in nearest)
-    raise ClockError(f"{what}: {rate_hz:g} Hz does not divide the {clock_hz:g} Hz {grid}; nearest: {rates}")
+    rates = ", ".join(
+        f"{clock_hz / n:.4g} Hz (every {n} {step}{'s' if n > 1 else ''})" for n in nearest
+    )
+    raise ClockError(
+        f"{what}: {rate_hz:g} Hz does not divide the {clock_hz:g} Hz {grid}; nearest: {rates}"
+    )

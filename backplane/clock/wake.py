@@ -1,14 +1,16 @@
 """Waiting for the next cycle: `waituntil(next-cycle)` of the paper's pseudo-code.
 
-"timer": the task sleeps to its own grid point and finds its release there, since the clock works a little ahead of the
-grid (`rack.backplane.clock.driver`). Its lateness is then that of one wake-up, not of two in a row (clock, then task).
-If the release is missing, the clock is late, stopped, or has skipped a tick: the task sleeps on to its next grid point,
-and the late clock wakes it with a post. A sleep of more than `NEAR_NS` is a wait for the task's semaphore with the grid
-point as its bound, so that the end of a run ends it; a shorter one takes less processor time.
+"timer": the task sleeps to its own grid point and finds its release there, since the clock works a
+little ahead of the grid (`rack.backplane.clock.driver`). Its lateness is then that of one wake-up,
+not of two in a row (clock, then task). If the release is missing, the clock is late, stopped, or
+has skipped a tick: the task sleeps on to its next grid point, and the late clock wakes it with a
+post. A sleep of more than `NEAR_NS` is a wait for the task's semaphore with the grid point as its
+bound, so that the end of a run ends it; a shorter one takes less processor time.
 
 "signal": the task blocks on its semaphore until the clock posts it at the grid point.
 
-"poll": a task with its own core busy-waits for its release, if a context switch is too large a part of its cycle.
+"poll": a task with its own core busy-waits for its release, if a context switch is too large a part
+of its cycle.
 
 In lockstep there is no grid: a task that would sleep is woken by a signal.
 """
@@ -41,14 +43,19 @@ SPINS = 100_000
 
 
 class NextCycle:
-    """The releases of one task, on the grid. A late task skips the releases that passed, and counts them.
+    """The releases of one task, on the grid. A late task skips the releases that passed, and counts
+    them.
 
-    An executor's release has passed at the next one. A planner's has passed at the end of its plan's time slice: until
-    then it is taken late, as of its own tick, since its result depends on ticks alone.
+    An executor's release has passed at the next one. A planner's has passed at the end of its
+    plan's time slice: until then it is taken late, as of its own tick, since its result depends on
+    ticks alone.
     """
 
-    def __init__(self, segment: Segment, task: str, clock_alarms: AlarmWriter | None = None) -> None:
-        """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an alarm there."""
+    def __init__(
+        self, segment: Segment, task: str, clock_alarms: AlarmWriter | None = None
+    ) -> None:
+        """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an
+        alarm there."""
         self._spec = spec = segment.layout.task(task)
         self._words, self._block = segment.words, segment.block(task)
         self._semaphore = wake_semaphore(segment.rack, task)
@@ -63,7 +70,9 @@ class NextCycle:
             self._pause = self._spin
         elif is_lockstep:
             self._pause = self._await_post
-        self._silent_clock = None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
+        self._silent_clock = (
+            None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
+        )
         # A restarted planner takes no release from before its start.
         self._due = self._block[_RELEASED] + 1
         self.hold_until(self._due)
@@ -71,7 +80,8 @@ class NextCycle:
         self.skipped = 0
 
     def wait(self) -> int | None:
-        """Wait for the next release and return its tick; None when the run is over and every release was taken.
+        """Wait for the next release and return its tick; None when the run is over and every
+        release was taken.
 
         Sets `skipped` to the releases that passed since the last one.
         """
@@ -79,16 +89,20 @@ class NextCycle:
         block = self._block
         is_posted = self._is_posted
         while True:
-            # Read first: a task that is late for the run's last release still takes it, so that the miss is seen.
+            # Read first: a task that is late for the run's last release still takes it, so that the
+            # miss is seen.
             is_over = words[_STATE] == _STOPPED
-            # The task's own release, not the clock's tick: in lockstep its turn may come later in a tick.
+            # The task's own release, not the clock's tick: in lockstep its turn may come later in a
+            # tick.
             newest = block[_RELEASED]
             if self._sleeps and newest >= self._due and self._is_ahead(newest):
-                # A task woken late may find the next release there already: the one before it is still to be taken.
+                # A task woken late may find the next release there already: the one before it is
+                # still to be taken.
                 newest -= self._spec.every
             if newest >= self._due:
                 if is_posted:
-                    # Its post, which nobody waited for: else the semaphore would overflow within weeks.
+                    # Its post, which nobody waited for: else the semaphore would overflow within
+                    # weeks.
                     self._semaphore.take()
                 return self._take(newest)
             if is_over or not self._pause():
@@ -112,7 +126,8 @@ class NextCycle:
         return monotonic_ns() < self._words[_EPOCH] + release * self._words[_PERIOD]
 
     def _sleep(self) -> bool:
-        """Sleep to the next release's grid point or, if that has passed, to the task's next one or a late release."""
+        """Sleep to the next release's grid point or, if that has passed, to the task's next one or
+        a late release."""
         words = self._words
         now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
@@ -125,7 +140,9 @@ class NextCycle:
                 sleep((point - now) * 1e-9)
                 return True
             is_due = now < point <= bound
-            deadline = min(bound, point if now < point else point + ((now - point) // step + 1) * step)
+            deadline = min(
+                bound, point if now < point else point + ((now - point) // step + 1) * step
+            )
         self._semaphore.bind(deadline)
         if not self._semaphore.wait() or is_due or self._block[_RELEASED] >= self._due:
             return True

@@ -1,10 +1,10 @@
 """The messages of a mailbox as the host side reads them: in blocks, and as the digest of a run.
 
-The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time. Each message carries
-the chain of its mailbox, so the digest is complete even if a recorder lost rows, and a restarted writer
-continues it. Messages that become visible after the last tick do not count: nothing reads them, and whether they are
-written before the run ends depends on timing. The mailboxes of host boards do not count either: they are not written
-at ticks.
+The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time.
+Each message carries the chain of its mailbox, so the digest is complete even if a recorder lost
+rows, and a restarted writer continues it. Messages that become visible after the last tick do not
+count: nothing reads them, and whether they are written before the run ends depends on timing. The
+mailboxes of host boards do not count either: they are not written at ticks.
 """
 
 from __future__ import annotations
@@ -52,8 +52,15 @@ class MailboxRing(Ring):
             # The writer does not know of this message, and will write its own in that place.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
-        checks = (xxh3(part.tobytes(), chain) for part, chain in zip(covered, rows["chain"].tolist(), strict=True))
-        good = lawful & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"]) & (rows["serial"] == serials)
+        checks = (
+            xxh3(part.tobytes(), chain)
+            for part, chain in zip(covered, rows["chain"].tolist(), strict=True)
+        )
+        good = (
+            lawful
+            & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"])
+            & (rows["serial"] == serials)
+        )
         return Drained(rows if good.all() else rows[good], lost)
 
 
@@ -63,7 +70,10 @@ def row_dtype(spec: MailboxSpec) -> np.dtype:
     return np.dtype(
         {
             "names": [word.name.lower() for word in Slot] + ["message"],
-            "formats": [*("u8" if word in (Slot.CHAIN, Slot.CHECK) else "i8" for word in Slot), message],
+            "formats": [
+                *("u8" if word in (Slot.CHAIN, Slot.CHECK) else "i8" for word in Slot),
+                message,
+            ],
             "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
             "itemsize": slot_stride(spec),
         }
@@ -71,21 +81,25 @@ def row_dtype(spec: MailboxSpec) -> np.dtype:
 
 
 def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
-    """Return serial and chain of every timed mailbox's newest message that was visible before tick `until`."""
+    """Return serial and chain of every timed mailbox's newest message that was visible before tick
+    `until`."""
     found = {}
     for spec in segment.layout.timed:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
         oldest = max(0, head - slots.depth)
         # A lost, damaged or forged message has no valid chain: the one before it has.
-        while serial > oldest and not (slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)):
+        while serial > oldest and not (
+            slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)
+        ):
             serial -= 1
         found[spec.name] = (serial, slots.chain if serial > oldest else 0)
     return found
 
 
 def digest(segment: Segment, until: int | None = None) -> str:
-    """Return the run's digest, 32 hexadecimal digits, up to tick `until` (default: where it stopped)."""
+    """Return the run's digest, 32 hexadecimal digits, up to tick `until` (default: where it
+    stopped)."""
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)
     for name, (serial, chain) in sorted(chains(segment, stop).items()):

@@ -1,12 +1,13 @@
 """Mailboxes of the host side: a bounded ring from one host board to one bus adapter, not by ticks.
 
-The host board writes at any time. A full ring is an answer, `False`, never a wait: nothing is overwritten that the
-adapter has not taken. The adapter takes messages in its own cycles, as many as it wants, and refuses those that are
-damaged, forged, or hold what no message of that type may hold. Its place in the ring is in shared memory, so an adapter
-that is restarted goes on there.
+The host board writes at any time. A full ring is an answer, `False`, never a wait: nothing is
+overwritten that the adapter has not taken. The adapter takes messages in its own cycles, as many as
+it wants, and refuses those that are damaged, forged, or hold what no message of that type may hold.
+Its place in the ring is in shared memory, so an adapter that is restarted goes on there.
 
-Alternatives considered: a pipe or a socket per host board (the kernel copies each message twice, and a dead reader
-raises in the writer), and protocol time-slice (a host board has no ticks at which its messages could become visible).
+Alternatives considered: a pipe or a socket per host board (the kernel copies each message twice,
+and a dead reader raises in the writer), and protocol time-slice (a host board has no ticks at which
+its messages could become visible).
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
 SPARE = 2
-"""Slots more than messages may wait: the one being written, and one that the adapter copies meanwhile."""
+"""Slots more than messages may wait: the one being written, and one that the adapter copies
+meanwhile."""
 _HEAD = int(Box.HEAD)
 _TAKEN = int(Box.TAKEN)
 _REFUSED = int(Box.REFUSED)
@@ -40,7 +42,8 @@ class HostWriter(DoubleBufferWriter):
         return self._box[_HEAD] - self._box[_TAKEN] >= self.spec.capacity
 
     def send(self, tick: int) -> bool:
-        """Publish `message`, written at `tick`; return False, and count it, when the ring is full."""
+        """Publish `message`, written at `tick`; return False, and count it, when the ring is
+        full."""
         if self.is_full:
             self._box[_REFUSED] += 1
             return False
@@ -48,7 +51,8 @@ class HostWriter(DoubleBufferWriter):
 
 
 class HostReader:
-    """The adapter's end of a ring. `taken` and `refused` count messages taken from it, and those that were bad."""
+    """The adapter's end of a ring. `taken` and `refused` count messages taken from it, and those
+    that were bad."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.mailbox(name)
@@ -86,7 +90,8 @@ class HostReader:
         return self._fetched(serial)
 
     def take_newest(self, most: int) -> Message | None:
-        """Take all that wait and return the newest good one, looking at no more than `most`; None: there is none."""
+        """Take all that wait and return the newest good one, looking at no more than `most`; None:
+        there is none."""
         waiting = self.waiting
         head = self._box[_HEAD]
         self._box[_TAKEN] = head
@@ -105,7 +110,8 @@ class HostReader:
 
 
 class ProperContent:
-    """Says whether a message holds only what its type permits: finite numbers, lengths, members of enums, ASCII.
+    """Says whether a message holds only what its type permits: finite numbers, lengths, members of
+    enums, ASCII.
 
     In an array of groups, those that are all zero are empty.
     """
@@ -113,9 +119,15 @@ class ProperContent:
     def __init__(self, fields: tuple[FieldSpec, ...]) -> None:
         self._numbers = [field.name for field in fields if np.dtype(field.kind).kind == "f"]
         self._texts = [field.name for field in fields if np.dtype(field.kind).kind == "S"]
-        self._lengths = [(field.name, field.length, bool(field.shape)) for field in fields if field.length]
-        self._enums = [(field.name, [number for _, number in field.values]) for field in fields if field.values]
-        self._groups = [(field.name, ProperContent(field.fields)) for field in fields if field.fields]
+        self._lengths = [
+            (field.name, field.length, bool(field.shape)) for field in fields if field.length
+        ]
+        self._enums = [
+            (field.name, [number for _, number in field.values]) for field in fields if field.values
+        ]
+        self._groups = [
+            (field.name, ProperContent(field.fields)) for field in fields if field.fields
+        ]
 
     def __call__(self, message: Message) -> bool:
         """Say whether a message is proper."""
@@ -128,10 +140,15 @@ class ProperContent:
             return False
         if not all(np.isin(record[name], numbers).all() for name, numbers in self._enums):
             return False
-        if not all(_has_length(record[name], limits, is_vector) for name, limits, is_vector in self._lengths):
+        if not all(
+            _has_length(record[name], limits, is_vector)
+            for name, limits, is_vector in self._lengths
+        ):
             return False
         groups = [(record[name], content) for name, content in self._groups]
-        return all(content._permits(group[group != np.zeros_like(group)]) for group, content in groups)
+        return all(
+            content._permits(group[group != np.zeros_like(group)]) for group, content in groups
+        )
 
 
 def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:

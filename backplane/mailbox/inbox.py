@@ -1,8 +1,9 @@
-"""The inbox of a board under protocol interrupt, as arithmetic: which messages are served, when, and which are lost.
+"""The inbox of a board under protocol interrupt, as arithmetic: which messages are served, when,
+and which are lost.
 
-An interrupt handler serves one message at a time, in the order of arrival. `depth` messages may wait; one that arrives
-when so many wait is lost. All times are ns. Nothing here knows of shared memory: boards, `rack check` and recordings
-use the same arithmetic.
+An interrupt handler serves one message at a time, in the order of arrival. `depth` messages may
+wait; one that arrives when so many wait is lost. All times are ns. Nothing here knows of shared
+memory: boards, `rack check` and recordings use the same arithmetic.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import NamedTuple
 
 
 class Inbox:
-    """A first-in-first-out server with `depth` places to wait. `lost` counts arrivals that found all of them taken."""
+    """A first-in-first-out server with `depth` places to wait. `lost` counts arrivals that found
+    all of them taken."""
 
     def __init__(self, depth: int) -> None:
         self.depth = depth
@@ -25,7 +27,8 @@ class Inbox:
         self._starts: deque[int] = deque()
 
     def arrive(self, at_ns: int, service_ns: int) -> int | None:
-        """Return the end of the service of a message that arrives, not before the last one; None: it is lost."""
+        """Return the end of the service of a message that arrives, not before the last one; None:
+        it is lost."""
         starts = self._starts
         while starts and starts[0] <= at_ns:
             starts.popleft()
@@ -41,7 +44,8 @@ class Inbox:
 
 
 FULL_LOAD = 0.999
-"""Load of a handler from which its inbox counts as filling up: below 1 already, so that bursts stay short to follow."""
+"""Load of a handler from which its inbox counts as filling up: below 1 already, so that bursts stay
+short to follow."""
 
 
 class InterruptSource(NamedTuple):
@@ -52,10 +56,12 @@ class InterruptSource(NamedTuple):
 
 
 class Burst(NamedTuple):
-    """The worst case of an inbox: every source sends at once, then in each of its periods, until nothing waits.
+    """The worst case of an inbox: every source sends at once, then in each of its periods, until
+    nothing waits.
 
-    `waiting` is the most that wait, `longest_ns` the longest time from arrival to the end of service, `load` the
-    handler's part of the processor. From `FULL_LOAD` on the inbox fills up, whatever its depth: both are then None.
+    `waiting` is the most that wait, `longest_ns` the longest time from arrival to the end of
+    service, `load` the handler's part of the processor. From `FULL_LOAD` on the inbox fills up,
+    whatever its depth: both are then None.
     """
 
     load: float
@@ -68,7 +74,8 @@ class Burst(NamedTuple):
 
 
 def burst_of(sources: Sequence[InterruptSource]) -> Burst:
-    """Return the worst case of an inbox with these sources: the critical instant of a first-in-first-out server."""
+    """Return the worst case of an inbox with these sources: the critical instant of a
+    first-in-first-out server."""
     load = sum(source.service_ns / source.every_ns for source in sources)
     if load >= FULL_LOAD:
         return Burst(load, None, None)
@@ -76,7 +83,8 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
     free_ns = 0
     longest_ns = 0
     for at_ns, service_ns in merge(*(_arrivals(source) for source in sources)):
-        # The arrivals of one instant come together: the first period ends where the next one begins idle.
+        # The arrivals of one instant come together: the first period ends where the next one begins
+        # idle.
         if at_ns and at_ns >= free_ns:
             break
         end_ns = inbox.arrive(at_ns, service_ns)

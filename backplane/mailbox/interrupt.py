@@ -1,23 +1,29 @@
-"""Protocol interrupt: every message interrupts each board that reads it, and a handler there serves one at a time.
+"""Protocol interrupt: every message interrupts each board that reads it, and a handler there serves
+one at a time.
 
-A message is sent at a logical instant: the release of the cycle that writes it plus that cycle's budgeted processor
-time, one tick without a budget; a plan at the end of its time slice. At the reading board it joins the `Inbox`. A level
-sees it at its first release at or after the end of its service. When too many wait it is lost, at that board only.
+A message is sent at a logical instant: the release of the cycle that writes it plus that cycle's
+budgeted processor time, one tick without a budget; a plan at the end of its time slice. At the
+reading board it joins the `Inbox`. A level sees it at its first release at or after the end of its
+service. When too many wait it is lost, at that board only.
 
-Every reading task works its board's inbox out by itself, from the heads of the slots in shared memory: who sent what
-when. That is a function of ticks alone, so all tasks of a board agree, and runs repeat, as long as messages are there
-at their instant. So a message must be written before the first tick that is not before it, and lockstep waits for it.
-One that is late counts as a miss of its writer, and as sent in the tick in which it is written.
+Every reading task works its board's inbox out by itself, from the heads of the slots in shared
+memory: who sent what when. That is a function of ticks alone, so all tasks of a board agree, and
+runs repeat, as long as messages are there at their instant. So a message must be written before the
+first tick that is not before it, and lockstep waits for it. One that is late counts as a miss of
+its writer, and as sent in the tick in which it is written.
 
-A reader that is restarted replays the messages that the slots still hold, two seconds at least, and continues as the
-one before it, if the inbox was empty at any time within them. A writer that is restarted continues as under time-slice.
+A reader that is restarted replays the messages that the slots still hold, two seconds at least, and
+continues as the one before it, if the inbox was empty at any time within them. A writer that is
+restarted continues as under time-slice.
 
-Between tasks in one slot a message passes no bus, so it interrupts nobody: it is read as under time-slice.
+Between tasks in one slot a message passes no bus, so it interrupts nobody: it is read as under
+time-slice.
 
-Alternatives considered: the wall-clock instant of the write (runs would differ even if no deadline is missed), the end
-of the writer's cycle (time-slice with the handler's time on top: the reason to interrupt, that a message need not wait
-for a cycle's end, would not show), a process per board that serves interrupts and keeps the inbox in shared memory (a
-context switch for each message, and one more process that may die).
+Alternatives considered: the wall-clock instant of the write (runs would differ even if no deadline
+is missed), the end of the writer's cycle (time-slice with the handler's time on top: the reason to
+interrupt, that a message need not wait for a cycle's end, would not show), a process per board that
+serves interrupts and keeps the inbox in shared memory (a context switch for each message, and one
+more process that may die).
 """
 
 from __future__ import annotations
@@ -45,12 +51,14 @@ def how_sent(spec: MailboxSpec) -> InterruptSpec:
 
 
 def sent_ns(spec: MailboxSpec, visible_at: int, clock_ns: int) -> int:
-    """Return the instant at which a message was sent that is visible from that tick at the earliest."""
+    """Return the instant at which a message was sent that is visible from that tick at the
+    earliest."""
     return (visible_at - spec.delay) * clock_ns + how_sent(spec).sent_ns
 
 
 class InterruptWriter(Writer):
-    """The one writer of a mailbox under protocol interrupt. Its messages must be written before they are sent."""
+    """The one writer of a mailbox under protocol interrupt. Its messages must be written before
+    they are sent."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
@@ -62,17 +70,20 @@ class InterruptWriter(Writer):
         return self.is_in_time(tick, now)
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
-        """Say whether a message released at `tick` and written now is there when it is to be sent."""
+        """Say whether a message released at `tick` and written now is there when it is to be
+        sent."""
         return now is None or now < tick + self._due
 
     def visible_at(self, tick: int, now: int | None) -> int:
-        """Return the earliest tick at which the message is visible; a late one is sent in the tick that writes it."""
+        """Return the earliest tick at which the message is visible; a late one is sent in the tick
+        that writes it."""
         released = tick if now is None else max(tick, now - self._due + 1)
         return released + self._delay
 
 
 class InterruptLine:
-    """One mailbox that interrupts a board, as that board sees it: the serials served, and the number lost there."""
+    """One mailbox that interrupts a board, as that board sees it: the serials served, and the
+    number lost there."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.spec = spec
@@ -92,7 +103,8 @@ class InterruptLine:
 
     @property
     def found(self) -> int:
-        """Serial of the newest message that a reader is to judge: served, lost on its way, or not its writer's."""
+        """Serial of the newest message that a reader is to judge: served, lost on its way, or not
+        its writer's."""
         served = self.served
         return max(served[-1] if served else 0, self._missing, self._suspect)
 
@@ -125,7 +137,8 @@ class InterruptLine:
         self._passed = serial - 1
 
     def _accepts(self, serial: int) -> bool:
-        """Say whether a message comes from the writer that holds the claim, or from an earlier holder."""
+        """Say whether a message comes from the writer that holds the claim, or from an earlier
+        holder."""
         slots = self._slots
         if not slots.copy(serial) or not slots.is_lawful(self._signature):
             return False
@@ -134,7 +147,8 @@ class InterruptLine:
 
 
 class BoardInbox:
-    """The inbox of the board in a slot, as one of its tasks works it out. `lines` are its mailboxes by name."""
+    """The inbox of the board in a slot, as one of its tasks works it out. `lines` are its mailboxes
+    by name."""
 
     def __init__(self, segment: Segment, slot: int) -> None:
         boxes = segment.layout.interrupting(slot)
@@ -172,7 +186,8 @@ class BoardInbox:
             self.service_ns += line.service_ns
 
     def _arrive(self, at_ns: int, line: InterruptLine, serial: int) -> None:
-        # A message that was not there at its instant cannot come before others that have been served.
+        # A message that was not there at its instant cannot come before others that have been
+        # served.
         self._newest_ns = max(self._newest_ns, at_ns)
         end_ns = self.inbox.arrive(self._newest_ns, line.service_ns)
         if end_ns is None:
@@ -205,7 +220,8 @@ class InterruptReader(Reader):
         return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading:
-        """Take the newest good message that was served before a lost, damaged or forged one, if it is unread."""
+        """Take the newest good message that was served before a lost, damaged or forged one, if it
+        is unread."""
         for older in reversed(self._line.served):
             if self.serial < older < serial:
                 if self._obtain(older):

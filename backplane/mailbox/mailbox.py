@@ -1,12 +1,14 @@
 """Mailboxes under logical execution time: one writer, many readers.
 
-The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(tick)` and gets a `Reading`: message and
-verdict. `tick` is the release tick of the calling cycle. A message written in the cycle released at tick T becomes
-visible at T + delay, the end of that cycle, however early it was written. Reads therefore depend on ticks alone.
+The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(tick)` and gets a
+`Reading`: message and verdict. `tick` is the release tick of the calling cycle. A message written
+in the cycle released at tick T becomes visible at T + delay, the end of that cycle, however early
+it was written. Reads therefore depend on ticks alone.
 
-Alternatives considered: a sequence lock (a writer killed inside a write leaves its readers spinning for ever), a kernel
-lock (the paper's, 3 to 4 times the cost: protocol `lock`), the newest whole message (not a function of ticks alone:
-protocol `double-buffer`). For the memory order that readers rely on see `slots`.
+Alternatives considered: a sequence lock (a writer killed inside a write leaves its readers spinning
+for ever), a kernel lock (the paper's, 3 to 4 times the cost: protocol `lock`), the newest whole
+message (not a function of ticks alone: protocol `double-buffer`). For the memory order that readers
+rely on see `slots`.
 """
 
 from __future__ import annotations
@@ -47,8 +49,8 @@ class Verdict(IntEnum):
 class Reading(NamedTuple):
     """A message, all zero before the first one, and the verdict of the read.
 
-    `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`: in a mailbox where
-    every message counts, the unread ones before this one, oldest first.
+    `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`:
+    in a mailbox where every message counts, the unread ones before this one, oldest first.
     """
 
     value: Message
@@ -70,8 +72,8 @@ class Reading(NamedTuple):
 class Writer:
     """The one writer of a mailbox, under protocol time-slice.
 
-    Opening claims the mailbox: a second writer is refused with `MailboxError` while the process of the first one lives.
-    A new writer continues after the last whole message, in a new epoch.
+    Opening claims the mailbox: a second writer is refused with `MailboxError` while the process of
+    the first one lives. A new writer continues after the last whole message, in a new epoch.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -90,7 +92,9 @@ class Writer:
         if not self._claim.take():
             pid = self._slots.box[Box.WRITER_PID]
             self._claim.close()
-            raise MailboxError(f"mailbox '{name}' has a writer already, process {pid}; permitted: one")
+            raise MailboxError(
+                f"mailbox '{name}' has a writer already, process {pid}; permitted: one"
+            )
         box = self._slots.box
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] = epoch = epoch_of(box[Box.EPOCH] + 1)
@@ -101,8 +105,8 @@ class Writer:
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`, released at `tick`; return False when it is too late.
 
-        It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes visible at the next
-        boundary of the writer's period.
+        It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes
+        visible at the next boundary of the writer's period.
         """
         due = tick + self._delay
         visible_at = tick + self._shown_after if now is None else self.visible_at(tick, now)
@@ -110,7 +114,8 @@ class Writer:
         return now is None or now < due
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
-        """Say whether a message released at `tick` and written now comes in time; `now` as in `write`."""
+        """Say whether a message released at `tick` and written now comes in time; `now` as in
+        `write`."""
         return now is None or now < tick + self._delay
 
     def visible_at(self, tick: int, now: int | None) -> int:
@@ -166,7 +171,8 @@ class ReadStatistics:
 
 
 class Reader:
-    """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the mailbox's depth."""
+    """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the
+    mailbox's depth."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
@@ -263,7 +269,8 @@ class Reader:
         return self._unchanged
 
     def _blame(self, serial: int) -> None:
-        """Count the fault of the message fetched last. If its slot holds another message, it is lost: not counted."""
+        """Count the fault of the message fetched last. If its slot holds another message, it is
+        lost: not counted."""
         slots = self.slots
         if not slots.keeps(serial):
             return
@@ -303,7 +310,8 @@ class DoubleBufferWriter(Writer):
 
 
 class DoubleBufferReader(Reader):
-    """A reader under protocol double-buffer (section 3.3 of the paper): gets the newest whole message.
+    """A reader under protocol double-buffer (section 3.3 of the paper): gets the newest whole
+    message.
 
     It reacts faster than time-slice; in real time it no longer depends on ticks alone.
     """

@@ -1,8 +1,10 @@
-"""The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`, made safe against dead holders.
+"""The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`, made safe
+against dead holders.
 
-A semaphore whose holder was killed stays down for ever, and does not show who held it. So processes wait on the
-semaphore, within a bound, but the critical section belongs to the one that holds the kernel's lock on the mailbox,
-which ends with its process. An access cut off by its bound is a bus error: a verdict, never a hang.
+A semaphore whose holder was killed stays down for ever, and does not show who held it. So processes
+wait on the semaphore, within a bound, but the critical section belongs to the one that holds the
+kernel's lock on the mailbox, which ends with its process. An access cut off by its bound is a bus
+error: a verdict, never a hang.
 """
 
 from __future__ import annotations
@@ -13,7 +15,13 @@ from collections.abc import Callable, Sequence
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.interrupt import BoardInbox, InterruptReader, InterruptWriter
-from rack.backplane.mailbox.mailbox import DoubleBufferReader, DoubleBufferWriter, Reader, Reading, Writer
+from rack.backplane.mailbox.mailbox import (
+    DoubleBufferReader,
+    DoubleBufferWriter,
+    Reader,
+    Reading,
+    Writer,
+)
 from rack.backplane.mailbox.queue import QueueReader, QueueWriter
 from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
@@ -30,8 +38,8 @@ _OWNER = int(Box.OWNER)
 class MailboxLock:
     """Mutual exclusion on one mailbox, with a bounded wait.
 
-    `held_up` counts the waits that timed out while a dead or stopped process held the lock: a fault, unlike a holder
-    that has been preempted.
+    `held_up` counts the waits that timed out while a dead or stopped process held the lock: a
+    fault, unlike a holder that has been preempted.
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
@@ -47,8 +55,9 @@ class MailboxLock:
         """Take the lock within its bound; False when a living holder keeps it."""
         if not self._semaphore.acquire(self._wait_s):
             self._check_holder()
-        # After a timeout, the kernel's lock is free if the semaphore's holder is dead; one of several waiters gets it.
-        # After a successful wait it may be taken: such a waiter got in between the two steps and is the owner.
+        # After a timeout, the kernel's lock is free if the semaphore's holder is dead; one of
+        # several waiters gets it. After a successful wait it may be taken: such a waiter got in
+        # between the two steps and is the owner.
         if not self._owner.take():
             return False
         self._box[_OWNER] = self._pid
@@ -84,7 +93,9 @@ class LockWriter(DoubleBufferWriter):
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`; return False when the lock's bound cut it off."""
-        return self._locked(lambda: super(LockWriter, self).publish(tick, visible_at, basis, damage))
+        return self._locked(
+            lambda: super(LockWriter, self).publish(tick, visible_at, basis, damage)
+        )
 
     def _locked(self, access: Callable[[], bool]) -> bool:
         obtained = self.lock.acquire()
@@ -146,21 +157,28 @@ OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader
 
 
 def open_writer(segment: Segment, name: str) -> Writer:
-    """Claim a mailbox for writing under its protocol. Raises `MailboxError` when it has a writer."""
+    """Claim a mailbox for writing under its protocol. Raises `MailboxError` when it has a
+    writer."""
     return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
 
 
-def open_reader(segment: Segment, name: str, asynchronous: bool = False, inbox: BoardInbox | None = None) -> Reader:
-    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is whole.
+def open_reader(
+    segment: Segment, name: str, asynchronous: bool = False, inbox: BoardInbox | None = None
+) -> Reader:
+    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is
+    whole.
 
     `inbox`: that of the reading board, if anything interrupts it.
     """
     if inbox is not None and name in inbox.lines:
         return InterruptReader(segment, name, inbox)
     protocol = segment.layout.mailbox(name).protocol
-    return READERS["double-buffer" if asynchronous and protocol == "time-slice" else protocol](segment, name)
+    return READERS["double-buffer" if asynchronous and protocol == "time-slice" else protocol](
+        segment, name
+    )
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading its newest message at no cost to others: for the clock and the host side."""
+    """Open a mailbox for reading its newest message at no cost to others: for the clock and the
+    host side."""
     return OBSERVERS[segment.layout.mailbox(name).protocol](segment, name)

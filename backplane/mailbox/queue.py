@@ -1,26 +1,30 @@
-"""Mailboxes under protocol queue: first in first out, one reader, each message read once and in order.
+"""Mailboxes under protocol queue: first in first out, one reader, each message read once and in
+order.
 
-The writer sends any number of messages in a cycle. They are published together at its end, by one store, and become
-visible as under time-slice: a writer killed before that has sent none of them. The reader takes those that are visible
-at its release tick, oldest first, as many as it has room for.
+The writer sends any number of messages in a cycle. They are published together at its end, by one
+store, and become visible as under time-slice: a writer killed before that has sent none of them.
+The reader takes those that are visible at its release tick, oldest first, as many as it has room
+for.
 
-A queue is bounded: its `capacity` is the largest number of unread messages. When it is full `send` returns False: the
-writer never waits, and no unread message is overwritten. What has been taken is a message too: in each of its cycles
-the reader writes its position into a mailbox of its own, `<queue>_taken`, under time-slice. So fullness depends on
-ticks alone: what the reader takes at tick T gives the writer room from T plus the reader's cycle on.
+A queue is bounded: its `capacity` is the largest number of unread messages. When it is full `send`
+returns False: the writer never waits, and no unread message is overwritten. What has been taken is
+a message too: in each of its cycles the reader writes its position into a mailbox of its own,
+`<queue>_taken`, under time-slice. So fullness depends on ticks alone: what the reader takes at tick
+T gives the writer room from T plus the reader's cycle on.
 
-The reader's position is in shared memory before its level processes, so a message is read at most once, whatever
-happens: a reader killed in a cycle has taken the messages of that cycle, and its successor continues after them. The
-other order would read them twice, and a message that makes its reader fail would make every successor fail too. A
-level that must know whether a message was acted on compares its id with the one that the reader's status echoes.
-A successor reads the position from a word in the queue's head, in which it is multiplied by 3: an AN code, since no
-multiple of 3 is one bit away from another. The mailbox alone would not do: if its newest message is damaged, the one
+The reader's position is in shared memory before its level processes, so a message is read at most
+once, whatever happens: a reader killed in a cycle has taken the messages of that cycle, and its
+successor continues after them. The other order would read them twice, and a message that makes its
+reader fail would make every successor fail too. A level that must know whether a message was acted
+on compares its id with the one that the reader's status echoes. A successor reads the position from
+a word in the queue's head, in which it is multiplied by 3: an AN code, since no multiple of 3 is
+one bit away from another. The mailbox alone would not do: if its newest message is damaged, the one
 before it holds an older position. If it is the word that is damaged, the mailbox is whole.
 
 A lost, damaged or forged message is counted, and the order goes on with the next one.
 
-Alternative considered: a position word in the mailbox's head, without a mailbox. It is not a function of ticks, so
-whether a queue is full would depend on which process is faster.
+Alternative considered: a position word in the mailbox's head, without a mailbox. It is not a
+function of ticks, so whether a queue is full would depend on which process is faster.
 """
 
 from __future__ import annotations
@@ -39,7 +43,12 @@ TAKEN = MessageType(
     "queue_taken",
     1,
     (
-        Field("taken", "i8", "1", "serial of the newest message that the reader of the queue has taken; 0: none"),
+        Field(
+            "taken",
+            "i8",
+            "1",
+            "serial of the newest message that the reader of the queue has taken; 0: none",
+        ),
         Field("unread", "i8", "1", "messages that this reader could see, and left in the queue"),
     ),
 )
@@ -66,13 +75,17 @@ def is_position(spec: MailboxSpec) -> bool:
 
 
 def queues_of(layout: Layout) -> list[MailboxSpec]:
-    """Return the queues between tasks; the rings of host boards are not by ticks, so they have no position."""
+    """Return the queues between tasks; the rings of host boards are not by ticks, so they have no
+    position."""
     names = {box.name for box in layout.mailboxes}
-    return [box for box in layout.mailboxes if box.protocol == "queue" and taken_name(box.name) in names]
+    return [
+        box for box in layout.mailboxes if box.protocol == "queue" and taken_name(box.name) in names
+    ]
 
 
 class QueueWriter(Writer):
-    """The one writer of a queue. A level fills `message` and calls its `send`; the board calls `write`, once a cycle.
+    """The one writer of a queue. A level fills `message` and calls its `send`; the board calls
+    `write`, once a cycle.
 
     `taken` is the reader's position as of the writer's release tick: the board keeps it up to date.
     """
@@ -106,7 +119,8 @@ class QueueWriter(Writer):
         return True
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish the messages sent in the cycle released at `tick`; return False when it is too late for them."""
+        """Publish the messages sent in the cycle released at `tick`; return False when it is too
+        late for them."""
         if not self._pending:
             return True
         visible_at = self.visible_at(tick, now)
@@ -116,12 +130,14 @@ class QueueWriter(Writer):
         return now is None or now < tick + self._delay
 
     def visible_at(self, tick: int, now: int | None) -> int:
-        """Return the tick from which messages released at `tick` and written now are visible, lost ones too."""
+        """Return the tick from which messages released at `tick` and written now are visible, lost
+        ones too."""
         self._shown_at = super().visible_at(tick, now)
         return self._shown_at
 
     def outgoing(self) -> Iterator[None]:
-        """Put each message of the cycle into `message` in turn; the level finds its own content there again."""
+        """Put each message of the cycle into `message` in turn; the level finds its own content
+        there again."""
         slots = self._slots
         present = bytes(self.message.raw)
         if self._shared[_HEAD] != slots.box[_HEAD]:
@@ -139,7 +155,8 @@ class QueueWriter(Writer):
         return True
 
     def lose(self) -> None:
-        """Publish a serial without its message, as an injected loss does: the reader finds the gap at its tick."""
+        """Publish a serial without its message, as an injected loss does: the reader finds the gap
+        at its tick."""
         slots = self._slots
         slots.heads[(self.serial + 1) & slots.mask][_VISIBLE] = self._shown_at
         slots.lose()
@@ -153,7 +170,8 @@ class QueueWriter(Writer):
 class QueueReader(Reader):
     """The one reader of a queue: a second one is refused with `MailboxError`.
 
-    `taken` is its position, the serial of the newest message taken. A new reader continues after its predecessor's.
+    `taken` is its position, the serial of the newest message taken. A new reader continues after
+    its predecessor's.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -170,9 +188,11 @@ class QueueReader(Reader):
         return self.take(tick, ALL)
 
     def take(self, tick: int, most: int, now: int | None = None) -> Reading:
-        """Take the messages visible at `tick`, oldest first, at most `most`, and publish the position.
+        """Take the messages visible at `tick`, oldest first, at most `most`, and publish the
+        position.
 
-        The newest taken is the value, the others are in `earlier`. `now`: the clock's tick, as in `Writer.write`.
+        The newest taken is the value, the others are in `earlier`. `now`: the clock's tick, as in
+        `Writer.write`.
         """
         self.accesses += 1
         box = self._box
@@ -202,7 +222,8 @@ class QueueReader(Reader):
         return written if rest else max(written, taken)
 
     def _sees(self, serial: int, last: int, tick: int) -> bool:
-        """Say whether a message may be read, or is not there to wait for; no good one is visible that far ahead."""
+        """Say whether a message may be read, or is not there to wait for; no good one is visible
+        that far ahead."""
         if serial > last:
             return False
         ahead = self._heads[serial & self._mask][_VISIBLE] - tick
@@ -234,7 +255,8 @@ class QueueReader(Reader):
         self.statistics.forger = pid_of(self.slots.signature)
 
     def _blame_intruder(self, serial: int) -> None:
-        """Count a message that is not the writer's, and that its next one will replace: it is not taken."""
+        """Count a message that is not the writer's, and that its next one will replace: it is not
+        taken."""
         if self.slots.fetch(serial) and not self.slots.is_lawful(self._signature):
             self.statistics.bad_reads += 1
             self._count_forged()

@@ -1,18 +1,21 @@
 """The slots of one mailbox: how whole messages get into shared memory and out again.
 
-A message is built in a local record, copied into the slot after the newest one, and published by one store of its
-serial in the mailbox's head. A writer killed at any instruction leaves every published message intact. A reader checks
-serial and checksum of its copy, so it never returns half a message.
+A message is built in a local record, copied into the slot after the newest one, and published by
+one store of its serial in the mailbox's head. A writer killed at any instruction leaves every
+published message intact. A reader checks serial and checksum of its copy, so it never returns half
+a message.
 
-Memory order: the one writer fills the slot before it stores the head's serial. On x86-64 other cores see stores in that
-order. On weaker machines a reader may see the serial first: its copy then fails the check, or holds another serial, and
-the read steps back to the message before. Words are aligned to 8 bytes, so they are never torn.
+Memory order: the one writer fills the slot before it stores the head's serial. On x86-64 other
+cores see stores in that order. On weaker machines a reader may see the serial first: its copy then
+fails the check, or holds another serial, and the read steps back to the message before. Words are
+aligned to 8 bytes, so they are never torn.
 
-The checksum is XXH3, 64 bits, seeded with the checksum of the message before. So one pass over a message tells a
-reader whether its copy is whole and undamaged; and the newest checksum stands for all that was ever written, so that
-one comparison shows whether two runs are equal (`history.digest`). Alternatives considered: CRC32 and a chained hash,
-two passes that took half of a write; CRC32 alone, seeded likewise: 32 bits are few for a digest, and on 200 bytes it
-takes five times as long.
+The checksum is XXH3, 64 bits, seeded with the checksum of the message before. So one pass over a
+message tells a reader whether its copy is whole and undamaged; and the newest checksum stands for
+all that was ever written, so that one comparison shows whether two runs are equal
+(`history.digest`). Alternatives considered: CRC32 and a chained hash, two passes that took half of
+a write; CRC32 alone, seeded likewise: 32 bits are few for a digest, and on 200 bytes it takes five
+times as long.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
 
 def claim(epoch: int, pid: int) -> int:
-    """Return a writer's signature: the epoch of its claim and, in the upper half, its process id."""
+    """Return a writer's signature: the epoch of its claim and, in the upper half, its process
+    id."""
     return epoch | pid << EPOCH_BITS
 
 
@@ -78,8 +82,9 @@ def _format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
 class Slots:
     """One process's access to the slots of a mailbox: a local `record` and its `message`.
 
-    `record` holds the head's eight words (`words.Slot`), then the message; `words` and `covered` are views of its head
-    and of what the checksum covers. `places` are the slots, `heads` their words.
+    `record` holds the head's eight words (`words.Slot`), then the message; `words` and `covered`
+    are views of its head and of what the checksum covers. `places` are the slots, `heads` their
+    words.
     """
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
@@ -94,7 +99,9 @@ class Slots:
         self.message = Message(self.dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
-        self.places = [segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)]
+        self.places = [
+            segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)
+        ]
         self.heads = [place[:SLOT_HEAD_SIZE].cast("q") for place in self.places]
         self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
         self.covered = self.record[CHECKED_FROM:]
@@ -103,18 +110,22 @@ class Slots:
         """Continue after the newest published message, as a writer."""
         # Without the sign: a flipped one is no reason to fail.
         head = whole = self.box[Box.HEAD] & (UNSIGNED >> 1)
-        # A serial may have been lost: the chain continues from the newest message that is in its slot.
+        # A serial may have been lost: the chain continues from the newest message that is in its
+        # slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):
             whole -= 1
         self.words[_SERIAL] = head
         self.words[_EPOCH] = signature
-        self.words[_CHECK] = self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
+        self.words[_CHECK] = (
+            self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
+        )
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
-        """Copy the local message into the next slot, then publish it; return the process of an intruder, 0: none.
+        """Copy the local message into the next slot, then publish it; return the process of an
+        intruder, 0: none.
 
-        An intruder has published since this writer's last message; its message is overwritten. `damage`: bits of the
-        message to flip in the slot.
+        An intruder has published since this writer's last message; its message is overwritten.
+        `damage`: bits of the message to flip in the slot.
         """
         words = self.words
         box = self.box
@@ -147,12 +158,15 @@ class Slots:
         return self.heads[serial & self.mask][_SERIAL] == serial
 
     def keeps(self, serial: int) -> bool:
-        """Say whether that serial's slot has not been reused: a copy made before this call is then of that message."""
+        """Say whether that serial's slot has not been reused: a copy made before this call is then
+        of that message."""
         return serial >= oldest_kept(self.box[0], self.depth)
 
     def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
         """Return each slot's head, as words, and the part of the slot that its checksum covers."""
-        return [(head, slot[CHECKED_FROM:]) for head, slot in zip(self.heads, self.places, strict=True)]
+        return [
+            (head, slot[CHECKED_FROM:]) for head, slot in zip(self.heads, self.places, strict=True)
+        ]
 
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""
@@ -161,7 +175,9 @@ class Slots:
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.record[:] = self.places[serial & self.mask]
-        return self.words[_SERIAL] == serial and self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])
+        return self.words[_SERIAL] == serial and self.words[_CHECK] == xxh3(
+            self.covered, self.words[_CHAIN]
+        )
 
     def between(self, before: int, newest: int) -> Iterator[Message]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
@@ -172,7 +188,8 @@ class Slots:
                 yield message
 
     def copy(self, serial: int) -> bool:
-        """Copy that serial's slot, without any check, into the local record; False when it was reused meanwhile."""
+        """Copy that serial's slot, without any check, into the local record; False when it was
+        reused meanwhile."""
         self.record[:] = self.places[serial & self.mask]
         return self.keeps(serial)
 
@@ -192,13 +209,16 @@ class Slots:
         return self.words[_EPOCH]
 
     def is_lawful(self, known: int) -> bool:
-        """Say whether that message comes from the writer that holds the claim, or from an earlier holder.
+        """Say whether that message comes from the writer that holds the claim, or from an earlier
+        holder.
 
         `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
         """
         signature = self.words[_EPOCH]
         holder = self.box[_CLAIMANT]
-        return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(holder)
+        return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(
+            holder
+        )
 
     @property
     def tick(self) -> int:

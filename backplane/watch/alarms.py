@@ -1,4 +1,5 @@
-"""Alarm rings: a task or the clock reports the faults that it has found. One fixed record per alarm, never a wait.
+"""Alarm rings: a task or the clock reports the faults that it has found. One fixed record per
+alarm, never a wait.
 
 An alarm is raised once per episode: when a condition is found, not in every cycle while it lasts.
 """
@@ -37,7 +38,8 @@ PEER = -2
 BY_DEMAND = -1
 NO_TORQUE = -2
 AT_START = -3
-"""Why brakes engaged, where no error says it: on a demand, because no torque came in time, or had come at all."""
+"""Why brakes engaged, where no error says it: on a demand, because no torque came in time, or had
+come at all."""
 
 
 class Alarm(IntEnum):
@@ -48,9 +50,11 @@ class Alarm(IntEnum):
     FAULT_ENDS = 2  # [entry; times it acted]
     HANG = 3  # [task; releases missed]
     REJOINED = 4  # [task, -1: the clock itself; ticks it was away]
-    DEMAND = 5  # [task whose loss demands it, PEER: another rack's, -1: the emergency stop or nobody; Demand]
+    # [task whose loss demands it, PEER: another rack's, -1: the emergency stop or nobody; Demand]
+    DEMAND = 5
     COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was issued
-    FLOWS = 7  # [mailbox; ticks since the fault ended]  a good message made after a fault of its messages
+    # [mailbox; ticks since the fault ended] a good message made after a fault of its messages
+    FLOWS = 7
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
     PLAN_LATE = 11  # [task; releases missed]  a plan has not finished within its cycles (eq. 3.8)
@@ -63,16 +67,23 @@ class Alarm(IntEnum):
     DISORDER = 24  # [mailbox; ticks]  a later serial has an earlier tick
     DAMAGED = 25  # [mailbox; -]  a message failed its check
     BABBLE = 26  # [mailbox; serials per cycle]
-    MASQUERADE = 27  # [mailbox; process id that the message names]  not from the writer that holds the claim
+    MASQUERADE = (
+        27  # [mailbox; process id that the message names]  not from the writer that holds the claim
+    )
     LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock
     # Raised by writers: mailboxes.
-    QUEUE_FULL = 29  # [mailbox; messages refused in the cycle]  its reader does not take messages as fast as they come
+    # [mailbox; messages refused in the cycle] its reader does not take messages as fast as they
+    # come
+    QUEUE_FULL = 29
     # Raised by tasks: the clock.
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
-    CLOCK_LATE = 32  # [-1; lateness, ns]  by the clock too: it woke so much later than the grid point of tick `since`
+    # [-1; lateness, ns] by the clock too: it woke so much later than the grid point of tick `since`
+    CLOCK_LATE = 32
     # Raised by boards: what interrupts them.
-    INBOX_FULL = 33  # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
+    INBOX_FULL = (
+        33  # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
+    )
     # Raised by the servo level: the arm.
     SENSOR_RANGE = 40  # [joint; value]  NaN, or beyond the joint's range
     SENSOR_STUCK = 41  # [joint; cycles]  no change while the arm is driven
@@ -81,13 +92,20 @@ class Alarm(IntEnum):
     ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
     COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is NaN or infinite
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
-    BRAKES_CLOSED = 47  # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
+    BRAKES_CLOSED = (
+        47  # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
+    )
     BRAKES_OPENED = 48  # [as they engaged; ticks they were engaged]
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
-    LATCHED = 51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
-    MODIFICATION = 52  # [number among the level's `names`; -]  a control modification failed and was taken out
-    FORCE_LIMIT = 53  # [-1; N]  a contact's force beyond the arm's limit, or the end of the wrist sensor's range
+    LATCHED = (
+        51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
+    )
+    MODIFICATION = (
+        52  # [number among the level's `names`; -]  a control modification failed and was taken out
+    )
+    # [-1; N] a contact's force beyond the arm's limit, or the end of the wrist sensor's range
+    FORCE_LIMIT = 53
     MOMENT_LIMIT = 54  # [-1; N m]  a contact's torque, likewise
     # Raised by the board of a hand.
     TENSION_INVALID = 55  # [joint; -]  rejected: a tension is NaN or infinite
@@ -114,10 +132,19 @@ class AlarmWriter:
         address = segment.map.alarms[task]
         self._head = segment.words[address // 8 : address // 8 + 1]
         first = address + LINE
-        self._slots = np.frombuffer(segment.view(first, ALARM_DEPTH * ALARM_RECORD_SIZE), dtype=RECORD)
+        self._slots = np.frombuffer(
+            segment.view(first, ALARM_DEPTH * ALARM_RECORD_SIZE), dtype=RECORD
+        )
         self._attention = attention
 
-    def ring(self, tick: int, code: Alarm, subject: int = -1, value: float = 0.0, since: int | None = None) -> None:
+    def ring(
+        self,
+        tick: int,
+        code: Alarm,
+        subject: int = -1,
+        value: float = 0.0,
+        since: int | None = None,
+    ) -> None:
         """Append an alarm, and wake the Rack unless it is one of `MISSES`."""
         count = self._head[0] + 1
         found = tick if since is None else since
@@ -137,7 +164,8 @@ def alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""Accesses, and cycles of the writer, without a finding after which the next one begins a new episode."""
+"""Accesses, and cycles of the writer, without a finding after which the next one begins a new
+episode."""
 
 
 class Episodes:
@@ -152,8 +180,11 @@ class Episodes:
         self._alarms = alarms
         self._last: dict[Alarm, tuple[int, int]] = {}
 
-    def find(self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None) -> None:
-        """Note a finding in an access, counted by the caller; raise the alarm if it begins an episode."""
+    def find(
+        self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None
+    ) -> None:
+        """Note a finding in an access, counted by the caller; raise the alarm if it begins an
+        episode."""
         if not self.is_open(code, access, tick):
             self.ring(code, tick, value, since)
         self._last[code] = access, tick

@@ -1,9 +1,10 @@
-"""Checks on the messages of a mailbox: each one that has become visible since the last read, in serial order.
+"""Checks on the messages of a mailbox: each one that has become visible since the last read, in
+serial order.
 
-A fault is reported only on evidence that a slow machine cannot produce: a serial whose slot was never filled, a later
-serial with an earlier tick, two messages for one release, a message stamped after the end of the cycle that made it.
-The reader may be delayed too. So a message is copied first, then its slot must still be its own (`Slots.keeps`), and
-only then is the copy judged.
+A fault is reported only on evidence that a slow machine cannot produce: a serial whose slot was
+never filled, a later serial with an earlier tick, two messages for one release, a message stamped
+after the end of the cycle that made it. The reader may be delayed too. So a message is copied
+first, then its slot must still be its own (`Slots.keeps`), and only then is the copy judged.
 """
 
 from __future__ import annotations
@@ -44,9 +45,11 @@ class ReadFindings:
 
 
 class MessageWatch:
-    """Judges the messages of one mailbox for one reader; those before its first read are not judged.
+    """Judges the messages of one mailbox for one reader; those before its first read are not
+    judged.
 
-    `seen` is the serial of the newest message judged, -1 before the first read; `newest` is its release tick.
+    `seen` is the serial of the newest message judged, -1 before the first read; `newest` is its
+    release tick.
     """
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
@@ -59,7 +62,8 @@ class MessageWatch:
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_by_ticks
-        # From this delay on a message is late. A message visible at once carries the tick at which it was written.
+        # From this delay on a message is late. A message visible at once carries the tick at which
+        # it was written.
         self.late_from = self._spec.delay + self._is_sliced
         self._findings = ReadFindings(reader, episodes)
         self._held_up = 0
@@ -119,7 +123,10 @@ class MessageWatch:
             if (
                 head[_SERIAL] == serial
                 and self.newest < released > head[_VISIBLE] - late
-                and (serial == taken or xxh3(body, head[_CHAIN] & UNSIGNED) == head[_CHECK] & UNSIGNED)
+                and (
+                    serial == taken
+                    or xxh3(body, head[_CHAIN] & UNSIGNED) == head[_CHECK] & UNSIGNED
+                )
                 and slots.keeps(serial)
             ):
                 self.newest = released
@@ -137,8 +144,8 @@ class MessageWatch:
         if slots.serial == serial and slots.is_sound:
             self._judge_time(slots.tick, slots.visible, tick)
         elif slots.serial == 0 or slots.is_sound:
-            # Its slot is empty, or holds another whole message: it is lost. It is not missing before the first tick at
-            # which it would have been visible.
+            # Its slot is empty, or holds another whole message: it is lost. It is not missing
+            # before the first tick at which it would have been visible.
             if self._is_sliced and expected + self._spec.delay > tick:
                 return False
             self.newest = expected
@@ -158,7 +165,9 @@ class MessageWatch:
             # Held back, not just finished late, if its cycle had ended before it was published.
             ended_ns = self._cycles.ended_ns(released)
             if ended_ns is not None and self._slots.stamp_ns > ended_ns:
-                self._find(Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released)
+                self._find(
+                    Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released
+                )
         self.newest = max(released, self.newest)
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:

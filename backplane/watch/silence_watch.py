@@ -1,9 +1,10 @@
 """Checks on a silent mailbox: its writer is lost, mute, or only late.
 
-Executors write in every cycle, so the age of their messages has a limit; plans have none. Silence alone is a reason to
-hold (`is_lost`) but does not prove a fault. For an alarm the writer must be dead or stopped, or must have finished
-cycles for which no message came. A mailbox that is written only when there is something new has a limit of its own, for
-the age of its information; its writer reports why nothing comes, and may void what it wrote, or keep it.
+Executors write in every cycle, so the age of their messages has a limit; plans have none. Silence
+alone is a reason to hold (`is_lost`) but does not prove a fault. For an alarm the writer must be
+dead or stopped, or must have finished cycles for which no message came. A mailbox that is written
+only when there is something new has a limit of its own, for the age of its information; its writer
+reports why nothing comes, and may void what it wrote, or keep it.
 """
 
 from __future__ import annotations
@@ -30,11 +31,12 @@ _KEPT = int(Box.KEPT)
 
 
 class ReadingTask:
-    """The task that reads: the tick `since` which it has read without a pause, and which writers are dead or stopped.
+    """The task that reads: the tick `since` which it has read without a pause, and which writers
+    are dead or stopped.
 
-    After a pause of this task or of the clock, all messages are old but no writer is silent. `troubles` counts reads
-    that failed or found a bad message. `now` returns the clock's tick; None: no read is ever late. `inbox` is that of
-    its board, None if nothing interrupts it.
+    After a pause of this task or of the clock, all messages are old but no writer is silent.
+    `troubles` counts reads that failed or found a bad message. `now` returns the clock's tick;
+    None: no read is ever late. `inbox` is that of its board, None if nothing interrupts it.
     """
 
     def __init__(self, inbox: BoardInbox | None = None) -> None:
@@ -58,7 +60,8 @@ class ReadingTask:
         self._last = tick
 
     def is_gone(self, pid: int, tick: int) -> bool:
-        """Say whether a process is dead or stopped. The kernel is asked once per cycle and process."""
+        """Say whether a process is dead or stopped. The kernel is asked once per cycle and
+        process."""
         if tick != self._asked_at:
             self._asked_at = tick
             self._gone.clear()
@@ -73,7 +76,9 @@ class SilenceWatch:
     Ask `is_lost` once the newest message is `quiet` ticks old.
     """
 
-    def __init__(self, segment: Segment, reader: Reader, episodes: Episodes, task: ReadingTask) -> None:
+    def __init__(
+        self, segment: Segment, reader: Reader, episodes: Episodes, task: ReadingTask
+    ) -> None:
         spec = reader.spec
         is_periodic = segment.layout.task(spec.writer).role == "executor"
         self.quiet = 0 if spec.max_age else MUTE_CYCLES * spec.every if is_periodic else NOT_YET
@@ -88,7 +93,8 @@ class SilenceWatch:
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost or has been silent for too long; raise an alarm if the cause is proven."""
+        """Say whether the writer is lost or has been silent for too long; raise an alarm if the
+        cause is proven."""
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
             is_old = tick - self._reader.basis > max_age and not is_on(box[_KEPT], tick)
@@ -103,7 +109,8 @@ class SilenceWatch:
 
     def is_writer_lost(self, tick: int) -> bool:
         """Say whether the writer is lost, however old its messages are."""
-        # From the tick after the loss: within that tick the answer would depend on which process is faster.
+        # From the tick after the loss: within that tick the answer would depend on which process is
+        # faster.
         return self._reader.newest != NOT_YET and 0 < self._block[_LOST] <= tick
 
     def _investigate(self, tick: int, age: int) -> None:
@@ -115,9 +122,13 @@ class SilenceWatch:
             self._report(Alarm.MUTE, tick, age)
 
     def _is_mute(self, tick: int) -> bool:
-        """Say whether the writer has finished a release that writes a message, and the newest is of an earlier one."""
+        """Say whether the writer has finished a release that writes a message, and the newest is of
+        an earlier one."""
         accesses = self._reader.accesses
-        if any(self._episodes.is_open(code, accesses, tick) for code in (Alarm.HELD_BACK, Alarm.DISORDER)):
+        if any(
+            self._episodes.is_open(code, accesses, tick)
+            for code in (Alarm.HELD_BACK, Alarm.DISORDER)
+        ):
             # Messages come, but late.
             return False
         # In this order: a writer publishes before it reports the cycle as finished.

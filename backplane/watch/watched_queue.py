@@ -1,6 +1,8 @@
-"""The reader of a queue that watches it: lost, damaged, forged and late messages, and a lost writer.
+"""The reader of a queue that watches it: lost, damaged, forged and late messages, and a lost
+writer.
 
-Silence proves nothing, since a queue is written on demand. Only a writer found dead or hanging counts as lost.
+Silence proves nothing, since a queue is written on demand. Only a writer found dead or hanging
+counts as lost.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ _VISIBLE = int(Slot.VISIBLE_AT)
 
 
 class QueueWatch(MessageWatch):
-    """Judges the messages that the reader of a queue has taken, several of one release among them."""
+    """Judges the messages that the reader of a queue has taken, several of one release among
+    them."""
 
     def __init__(self, segment: Segment, reader: QueueReader, episodes: Episodes) -> None:
         super().__init__(segment, reader, episodes)
@@ -54,10 +57,16 @@ class QueueWatch(MessageWatch):
 
 
 class WatchedQueue:
-    """Reads a queue for its task, as many messages as the task has `room` for, and raises its alarms about them."""
+    """Reads a queue for its task, as many messages as the task has `room` for, and raises its
+    alarms about them."""
 
     def __init__(
-        self, segment: Segment, name: str, alarms: AlarmWriter, task: ReadingTask, room: Callable[[], int]
+        self,
+        segment: Segment,
+        name: str,
+        alarms: AlarmWriter,
+        task: ReadingTask,
+        room: Callable[[], int],
     ) -> None:
         self.reader = reader = QueueReader(segment, name)
         self._messages = QueueWatch(segment, reader, Episodes(segment, name, alarms))
@@ -81,5 +90,6 @@ class WatchedQueue:
 
     def is_writer_lost(self, tick: int) -> bool:
         """Say whether the writer is lost."""
-        # From the tick after the loss: within that tick the answer would depend on which process is faster.
+        # From the tick after the loss: within that tick the answer would depend on which process is
+        # faster.
         return 0 < self._writer[_LOST] <= tick

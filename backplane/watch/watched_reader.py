@@ -1,4 +1,5 @@
-"""Readers that watch their mailbox: every read also checks for damaged, late, forged and missing messages."""
+"""Readers that watch their mailbox: every read also checks for damaged, late, forged and missing
+messages."""
 
 from __future__ import annotations
 
@@ -34,10 +35,11 @@ def watched(
     room: Callable[[], int] = everything,
     asynchronous: bool = False,
 ) -> WatchedReader | SporadicReader | WatchedQueue:
-    """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have no period.
+    """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have
+    no period.
 
-    `room`: how many messages of a queue to take, asked before each read. `asynchronous`: the task gets each message as
-    soon as it is whole, under any other protocol.
+    `room`: how many messages of a queue to take, asked before each read. `asynchronous`: the task
+    gets each message as soon as it is whole, under any other protocol.
     """
     spec = segment.layout.mailbox(name)
     if spec.protocol == "queue":
@@ -47,9 +49,12 @@ def watched(
 
 
 class WatchedReader:
-    """Reads a mailbox for a task and raises the task's alarms about it. A clean read costs a few comparisons more."""
+    """Reads a mailbox for a task and raises the task's alarms about it. A clean read costs a few
+    comparisons more."""
 
-    def __init__(self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask) -> None:
+    def __init__(
+        self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
+    ) -> None:
         self.reader = reader
         episodes = Episodes(segment, reader.spec.name, alarms)
         self._messages = MessageWatch(segment, reader, episodes)
@@ -62,7 +67,8 @@ class WatchedReader:
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading:
-        """Return the newest message visible at `tick`, with its verdict, and whether its writer is lost."""
+        """Return the newest message visible at `tick`, with its verdict, and whether its writer is
+        lost."""
         reader = self.reader
         messages = self._messages
         reading = reader.read(tick)
@@ -74,12 +80,17 @@ class WatchedReader:
             found = reader.found
             newest = reader.newest
             # The usual case of `judge`: the next message, good and in time.
-            if 0 < found == messages.seen + 1 and messages.newest < newest > reader.visible - self._late_from:
+            if (
+                0 < found == messages.seen + 1
+                and messages.newest < newest > reader.visible - self._late_from
+            ):
                 messages.seen = found
                 messages.newest = newest
             else:
                 messages.judge(tick)
-        if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(tick):
+        if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(
+            tick
+        ):
             return self._lost[reading.verdict]
         return reading
 
@@ -89,13 +100,17 @@ class WatchedReader:
 
 
 class SporadicReader:
-    """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and the clock's.
+    """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and
+    the clock's.
 
-    A command may leave part of an earlier one in force, so none is skipped: the newest comes with the unread ones
-    before it. The first read returns all that the slots hold, since a restarted board must know them.
+    A command may leave part of an earlier one in force, so none is skipped: the newest comes with
+    the unread ones before it. The first read returns all that the slots hold, since a restarted
+    board must know them.
     """
 
-    def __init__(self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask) -> None:
+    def __init__(
+        self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
+    ) -> None:
         self.reader = reader
         self._task = task
         self._slots = Slots(segment, reader.spec)
@@ -103,7 +118,8 @@ class SporadicReader:
         self._bad_reads = 0
 
     def read(self, tick: int) -> Reading:
-        """Return the newest message visible at `tick`, with its verdict, and the unread ones before it."""
+        """Return the newest message visible at `tick`, with its verdict, and the unread ones before
+        it."""
         before = self.reader.serial
         reading = self.reader.read(tick)
         if self.reader.statistics.bad_reads != self._bad_reads:
@@ -120,12 +136,16 @@ class SporadicReader:
 
 
 class GridReader:
-    """Reads a mailbox at the ticks of a grid only; in between, the last reading stands and the bus is not accessed.
+    """Reads a mailbox at the ticks of a grid only; in between, the last reading stands and the bus
+    is not accessed.
 
-    A read that falls into a skipped cycle is left out. So a restarted task reads at the same ticks as before.
+    A read that falls into a skipped cycle is left out. So a restarted task reads at the same ticks
+    as before.
     """
 
-    def __init__(self, watched: WatchedReader | SporadicReader | WatchedQueue, grid: TickGrid) -> None:
+    def __init__(
+        self, watched: WatchedReader | SporadicReader | WatchedQueue, grid: TickGrid
+    ) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
         kept = [Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)]
@@ -133,7 +153,8 @@ class GridReader:
         self._was_lost = False
 
     def read(self, tick: int) -> Reading:
-        """Return the newest message visible at `tick` if it is due, otherwise that of the last read."""
+        """Return the newest message visible at `tick` if it is due, otherwise that of the last
+        read."""
         if (tick - self._phase) % self._every == 0:
             reading = self._watched.read(tick)
             self._was_lost = reading.is_lost

@@ -1,7 +1,9 @@
 """Configs: from TOML to a rack.
 
-- `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a `RackConfig`.
-- `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults, commands.
+- `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a
+  `RackConfig`.
+- `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults,
+  commands.
 - `wire(config)`: the layout alone.
 - `shared_out(config)`: a line for every requested core that does not exist.
 - `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
@@ -23,7 +25,17 @@ if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
     from rack.boards.config.timing import budgets, rack_timing
 
-__all__ = ["CONFIGS", "FAULTS", "RackConfig", "Resolved", "budgets", "load", "loads", "names", "rack_timing"]
+__all__ = [
+    "CONFIGS",
+    "FAULTS",
+    "RackConfig",
+    "Resolved",
+    "budgets",
+    "load",
+    "loads",
+    "names",
+    "rack_timing",
+]
 __all__ += ["resolve", "shared_out", "wire"]
 _PLACES = {
     "rack.boards.config.files": ("CONFIGS", "FAULTS", "names"),

@@ -28,7 +28,8 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 def takes(config: RackConfig, board: str, commands: Commands) -> str:
-    """Return the commands that a level takes as text, with the names that it knows: "hold, resume, table saw|slow"."""
+    """Return the commands that a level takes as text, with the names that it knows: "hold, resume,
+    table saw|slow"."""
     table = config.board[board]
     executor = find_class(table.executor, Executor)
     words = []
@@ -36,8 +37,14 @@ def takes(config: RackConfig, board: str, commands: Commands) -> str:
         names = ""
         # A table may be in the middle of being edited.
         with suppress(LevelError):
-            names = "|".join(executor.wording(what, table.params, config.scene)) if what in NAMED else ""
-        words.append(" ".join(word for word in (what.name.lower(), names, goal_names(goals)) if word))
+            names = (
+                "|".join(executor.wording(what, table.params, config.scene))
+                if what in NAMED
+                else ""
+            )
+        words.append(
+            " ".join(word for word in (what.name.lower(), names, goal_names(goals)) if word)
+        )
     return ", ".join(words)
 
 
@@ -48,7 +55,8 @@ def setting_name(config: RackConfig, board: str, number: int) -> str:
 
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:
-    """Return the command in a mapping, as in a `[[command]]` table. Raises `ConfigError` with every mistake."""
+    """Return the command in a mapping, as in a `[[command]]` table. Raises `ConfigError` with every
+    mistake."""
     try:
         return CommandConfig.model_validate(given)
     except ValidationError as error:

@@ -49,7 +49,9 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
         # Two faults of one config must not draw the same random numbers.
         seed=crc32(f"{config.seed} {place}".encode()) % SEEDS if fault.seed is None else fault.seed,
         when=None if fault.when is None else condition(fault.when, layout),
-        parameters=tuple(float(fault.parameters.get(p.name, p.default or 0.0)) for p in kind.parameters),
+        parameters=tuple(
+            float(fault.parameters.get(p.name, p.default or 0.0)) for p in kind.parameters
+        ),
     )
 
 
@@ -59,7 +61,9 @@ def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
         return -1
     named = (at for at, box in enumerate(layout.mailboxes) if box.name == fault.mailbox)
     # One message is forged, in one mailbox: by default the first that has a reader.
-    own = (at for at, box in enumerate(layout.mailboxes) if box.writer == fault.board and box.readers)
+    own = (
+        at for at, box in enumerate(layout.mailboxes) if box.writer == fault.board and box.readers
+    )
     return next(own if fault.mailbox is None else named, -1)
 
 

@@ -1,4 +1,5 @@
-"""Config files: found by name or path, merged with the files that they extend, with absolute paths."""
+"""Config files: found by name or path, merged with the files that they extend, with absolute
+paths."""
 
 from __future__ import annotations
 
@@ -20,8 +21,11 @@ EXTENDS = "configs that this file extends, by name or path, in order; its own ke
 """Meaning of `extends`, the one key that only files have."""
 
 
-def assembled(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> Tables:
-    """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults of a script.
+def assembled(
+    name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
+) -> Tables:
+    """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
+    of a script.
 
     Paths in an override are relative to the current folder. Raises `ConfigError`.
     """
@@ -33,9 +37,14 @@ def assembled(name_or_path: str | Path, overrides: Sequence[str] = (), faults: s
 
 
 def named_classes(tables: Tables) -> tuple[str, ...]:
-    """Return the classes of levels that tables name, as "package.module:Class"; nothing else in them is checked."""
+    """Return the classes of levels that tables name, as "package.module:Class"; nothing else in
+    them is checked."""
     boards = tables.get("board")
-    found = [board for board in boards.values() if isinstance(board, dict)] if isinstance(boards, dict) else []
+    found = (
+        [board for board in boards.values() if isinstance(board, dict)]
+        if isinstance(boards, dict)
+        else []
+    )
     names = [board.get(role) for board in found for role in ("executor", "planner")]
     adapters = tables.get("adapter")
     names += [LAN_ADAPTER] if isinstance(adapters, dict) and "lan" in adapters else []
@@ -45,8 +54,8 @@ def named_classes(tables: Tables) -> tuple[str, ...]:
 def read(name_or_path: str | Path) -> Tables:
     """Return the tables of a config, merged with those of the files that it extends.
 
-    A name means a bundled config; text that contains '/' or ends in '.toml' is a path, if it is no name as `names`
-    lists them, or such a file exists. Raises `ConfigError`.
+    A name means a bundled config; text that contains '/' or ends in '.toml' is a path, if it is no
+    name as `names` lists them, or such a file exists. Raises `ConfigError`.
     """
     return _read(_path(name_or_path, "config", CONFIGS), (), {})
 
@@ -54,13 +63,17 @@ def read(name_or_path: str | Path) -> Tables:
 def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = None) -> Tables:
     """Return config tables with the faults of a script appended.
 
-    A script contains `[[fault]]` tables and nothing else. A name means a script in the folder of the rack, `own`, if it
-    has one of its own, else a bundled script. Raises `ConfigError`.
+    A script contains `[[fault]]` tables and nothing else. A name means a script in the folder of
+    the rack, `own`, if it has one of its own, else a bundled script. Raises `ConfigError`.
     """
-    path = _path(name_or_path, "--faults", *([] if own is None or own == CONFIGS else [own]), FAULTS)
+    path = _path(
+        name_or_path, "--faults", *([] if own is None or own == CONFIGS else [own]), FAULTS
+    )
     script = _tables(path)
     wrong = [
-        Mistake(f"{path.name}: {key}", None, "a fault script contains [[fault]] tables and nothing else")
+        Mistake(
+            f"{path.name}: {key}", None, "a fault script contains [[fault]] tables and nothing else"
+        )
         for key, value in script.items()
         if key != "fault" or not isinstance(value, list)
     ]
@@ -73,18 +86,23 @@ def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = Non
 def names(folder: Path = CONFIGS) -> list[str]:
     """Return the names of the bundled racks, or of the configs in another folder.
 
-    A config is `<name>.toml`, or `<name>/<name>.toml`, next to its page. Other racks in that folder, files with a name
-    of their own, are `<name>/<rack>`.
+    A config is `<name>.toml`, or `<name>/<name>.toml`, next to its page. Other racks in that
+    folder, files with a name of their own, are `<name>/<rack>`.
     """
     found = [path.stem for path in folder.glob("*.toml")]
     for main in (path for path in folder.glob("*/*.toml") if path.stem == path.parent.name):
-        racks = [path.stem for path in main.parent.glob("*.toml") if path == main or "name" in _tables(path)]
+        racks = [
+            path.stem
+            for path in main.parent.glob("*.toml")
+            if path == main or "name" in _tables(path)
+        ]
         found += [main.stem if rack == main.stem else f"{main.stem}/{rack}" for rack in racks]
     return sorted(found)
 
 
 def file_at(path: Path) -> Path | None:
-    """Return the absolute path of a file; None if it does not exist or the path is invalid (unknown ~user)."""
+    """Return the absolute path of a file; None if it does not exist or the path is invalid (unknown
+    ~user)."""
     try:
         path = path.expanduser()
         return path.resolve() if path.is_file() else None
@@ -93,17 +111,23 @@ def file_at(path: Path) -> Path | None:
 
 
 def anchor(tables: Tables, folder: Path) -> Tables:
-    """Return the tables with absolute paths, resolved from `folder`, or for a bundled model from configs/."""
+    """Return the tables with absolute paths, resolved from `folder`, or for a bundled model from
+    configs/."""
     anchored = dict(tables)
     robot = tables.get("robot")
     own = tables.get("python_path")
     if isinstance(robot, dict) and isinstance(robot.get("model"), str):
-        anchored["robot"] = {**robot, "model": str(_find(robot["model"], folder) or folder / robot["model"])}
+        anchored["robot"] = {
+            **robot,
+            "model": str(_find(robot["model"], folder) or folder / robot["model"]),
+        }
     if isinstance(own, list) and all(isinstance(item, str) for item in own):
         anchored["python_path"] = [str((folder / item).resolve()) for item in own]
     adapters = tables.get("adapter")
     if isinstance(adapters, dict):
-        anchored["adapter"] = {name: _with_certificates(adapter, folder) for name, adapter in adapters.items()}
+        anchored["adapter"] = {
+            name: _with_certificates(adapter, folder) for name, adapter in adapters.items()
+        }
     boards = tables.get("board")
     if isinstance(boards, dict):
         anchored["board"] = {
@@ -120,7 +144,8 @@ def _with_certificates(adapter: Any, folder: Path) -> Any:
 
 
 def with_table_files(board: Any, path: Callable[[str], str]) -> Any:
-    """Return a board's table with `path` applied to the files of its level's state tables, if it has any."""
+    """Return a board's table with `path` applied to the files of its level's state tables, if it
+    has any."""
     params = board.get("params") if isinstance(board, dict) else None
     if not isinstance(params, dict) or not isinstance(files := params.get("tables"), dict):
         return board
@@ -137,7 +162,10 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
     known = [folder for folder in folders if not is_path or text in names(folder)]
-    files = [*([file_at(Path(text))] if is_path else []), *(_named(text, folder) for folder in known)]
+    files = [
+        *([file_at(Path(text))] if is_path else []),
+        *(_named(text, folder) for folder in known),
+    ]
     found = next((file for file in files if file is not None), None)
     if found is None:
         by_name = ", ".join(names(folders[-1]))
@@ -146,7 +174,8 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
 
 
 def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tables:
-    """Return the tables of a file, merged with those that it extends; `known` caches files extended more than once."""
+    """Return the tables of a file, merged with those that it extends; `known` caches files extended
+    more than once."""
     if path in known:
         return known[path]
     if path in chain:
@@ -164,7 +193,8 @@ def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tab
 
 
 def _extended(base: Tables, top: Tables) -> Tables:
-    """Return a file's tables merged over those it extends; a [robot] with its own model replaces the arm."""
+    """Return a file's tables merged over those it extends; a [robot] with its own model replaces
+    the arm."""
     robot = top.get("robot")
     if isinstance(robot, dict) and "model" in robot:
         base = {key: value for key, value in base.items() if key != "robot"}
@@ -175,7 +205,9 @@ def _tables(path: Path) -> Tables:
     try:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
-            raise ConfigError([Mistake(str(path), None, f"too large, {size} bytes; permitted: {MAX_FILE_BYTES}")])
+            raise ConfigError(
+                [Mistake(str(path), None, f"too large, {size} bytes; permitted: {MAX_FILE_BYTES}")]
+            )
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([Mistake(str(path), None, f"cannot be read: {error}")]) from None
@@ -186,9 +218,16 @@ def _bases(extends: Any, path: Path) -> list[Path]:
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
-    found = {item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item) for item in extends}
+    found = {
+        item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
+        for item in extends
+    }
     lost = [
-        Mistake(place, item, f"no such file next to {path.name} or among the bundled configs: {', '.join(names())}")
+        Mistake(
+            place,
+            item,
+            f"no such file next to {path.name} or among the bundled configs: {', '.join(names())}",
+        )
         for item, base in found.items()
         if base is None
     ]
@@ -203,5 +242,6 @@ def _named(name: str, folder: Path = CONFIGS) -> Path | None:
 
 
 def _find(reference: str, folder: Path) -> Path | None:
-    """Return the file that a config in `folder` refers to: next to it, else among the bundled ones."""
+    """Return the file that a config in `folder` refers to: next to it, else among the bundled
+    ones."""
     return file_at(folder / reference) or file_at(CONFIGS / reference)

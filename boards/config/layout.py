@@ -1,4 +1,5 @@
-"""From the wiring of a rack to its layout: all mailboxes and tasks, as plain data for its segment."""
+"""From the wiring of a rack to its layout: all mailboxes and tasks, as plain data for its
+segment."""
 
 from __future__ import annotations
 
@@ -10,7 +11,15 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.layout import ExchangeSpec, FieldSpec, InterruptSpec, Layout, MailboxSpec, TaskSpec, depth_for
+from rack.backplane.layout import (
+    ExchangeSpec,
+    FieldSpec,
+    InterruptSpec,
+    Layout,
+    MailboxSpec,
+    TaskSpec,
+    depth_for,
+)
 from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
@@ -21,9 +30,11 @@ from rack.boards.config.wiring import TaskPorts, Wiring
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""
 KEPT_S = 2.0
-"""Simulated time that mailboxes and trace rings retain for a recorder, which real-time boards may starve for 1 s."""
+"""Simulated time that mailboxes and trace rings retain for a recorder, which real-time boards may
+starve for 1 s."""
 SUSTAINED = 4
-"""Messages a cycle of the writer, on average, of which a recorder loses none however deep the queue is."""
+"""Messages a cycle of the writer, on average, of which a recorder loses none however deep the queue
+is."""
 WORD_BYTES = 4
 """Bytes of a word of `[protocol.interrupt]`: of the 68020's bus."""
 NS_PER_US = 1e3
@@ -31,7 +42,8 @@ NS_PER_MS = 1e6
 
 
 def obtained_core(core: int) -> int:
-    """Return the core for a task that requests `core`; cores that the machine lacks map to the others in turn."""
+    """Return the core for a task that requests `core`; cores that the machine lacks map to the
+    others in turn."""
     available = sorted(os.sched_getaffinity(0))
     return core if core in available else available[core % len(available)]
 
@@ -43,19 +55,23 @@ def shared_out(config: RackConfig) -> list[str]:
         wanted.setdefault(place.core, []).append(place.name)
     available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     return [
-        f"core {core} is not available (available: {available}): core {obtained_core(core)} runs {', '.join(tasks)}"
+        f"core {core} is not available (available: {available}): core {obtained_core(core)} runs"
+        f" {', '.join(tasks)}"
         for core, tasks in sorted(wanted.items())
         if obtained_core(core) != core
     ]
 
 
 def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
-    """Return how an executor reads the ports listed in its board's table, by port; times in ticks."""
+    """Return how an executor reads the ports listed in its board's table, by port; times in
+    ticks."""
     board = ports.place.board
     every = wiring.every[board]
     phase = wiring.config.board[board].phase
     return {
-        port: ExchangeSpec(board, every * entry.every, phase + every * entry.phase, entry.asynchronous)
+        port: ExchangeSpec(
+            board, every * entry.every, phase + every * entry.phase, entry.asynchronous
+        )
         for port, entry in ports.exchange.items()
     }
 
@@ -78,19 +94,30 @@ class LayoutMaker:
         mailboxes = [box for name in wiring.writers for box in self._written(name)]
         # The clock passes an operator's commands on.
         for name, kind in wiring.operated.items():
-            mailboxes.append(self._mailbox(name, kind, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH))
+            mailboxes.append(
+                self._mailbox(name, kind, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
+            )
         tasks = tuple(self._tasks.values())
         hosts = tuple(self._hosts.values())
         return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
 
     def _written(self, name: str) -> Iterator[MailboxSpec]:
-        """Yield a mailbox that a task or host board writes; with a queue the one of its reader's position."""
+        """Yield a mailbox that a task or host board writes; with a queue the one of its reader's
+        position."""
         ports, output = self._wiring.writers[name]
         if name in self._wiring.from_host:
             # The ring of a host board: a queue that is not by ticks.
             capacity = self._capacity(name)
             depth = depth_for(capacity + SPARE, 1)
-            yield self._mailbox(name, output.type, writer=ports.task, every=1, delay=0, capacity=capacity, depth=depth)
+            yield self._mailbox(
+                name,
+                output.type,
+                writer=ports.task,
+                every=1,
+                delay=0,
+                capacity=capacity,
+                depth=depth,
+            )
             return
         writer = self._tasks[ports.task]
         every = writer.every * output.cycles
@@ -106,7 +133,9 @@ class LayoutMaker:
             delay=delay,
             depth=depth_for(max(slowest + delay, self._kept), every),
             rests_on=tuple(
-                box for box in ports.rests_on(name.partition(".")[2]) if self._wiring.protocol(box) != "queue"
+                box
+                for box in ports.rests_on(name.partition(".")[2])
+                if self._wiring.protocol(box) != "queue"
             ),
             phase=writer.phase,
             max_age=round(output.max_age_s * 1e9 / self._config.clock_ns),
@@ -119,38 +148,56 @@ class LayoutMaker:
             yield box
 
     def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
-        """Yield a queue with its size, and the mailbox in which its reader writes its position for the writer."""
+        """Yield a queue with its size, and the mailbox in which its reader writes its position for
+        the writer."""
         delay = _slice(reader)
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         capacity = self._capacity(box.name)
-        # From its release until it can know what the reader has taken, the writer can send no more than the capacity.
+        # From its release until it can know what the reader has taken, the writer can send no more
+        # than the capacity.
         most = capacity * (1 + self._kept // (box.delay + delay))
         # A deep queue keeps fewer.
         slots = depth_for(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
         yield replace(box, capacity=capacity, depth=slots)
         depth = depth_for(max(_slice(writer) + delay, self._kept), read.every)
         visible = (read.phase + delay) % read.every
-        place = {"writer": reader.name, "every": read.every, "delay": delay, "depth": depth, "phase": visible}
+        place = {
+            "writer": reader.name,
+            "every": read.every,
+            "delay": delay,
+            "depth": depth,
+            "phase": visible,
+        }
         position = self._mailbox(taken_name(box.name), TAKEN, **place)
         yield replace(position, readers=(writer.name,), protocol="time-slice")
 
     def _capacity(self, queue: str) -> int:
         return self._config.protocol.depth.get(queue, UNREAD)
 
-    def _with_interrupts(self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]) -> MailboxSpec:
-        """Return a mailbox of protocol interrupt with what its messages cost, and when they are sent and visible.
+    def _with_interrupts(
+        self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]
+    ) -> MailboxSpec:
+        """Return a mailbox of protocol interrupt with what its messages cost, and when they are
+        sent and visible.
 
-        Between tasks of one slot, and into the network adapter, which reads shared memory, nothing is interrupted.
+        Between tasks of one slot, and into the network adapter, which reads shared memory, nothing
+        is interrupted.
         """
         clock_ns = self._config.clock_ns
         table = self._config.protocol.interrupt
-        spared = {task.slot for task in readers if task.role == "host" or self._wiring.is_of_network(task.board)}
+        spared = {
+            task.slot
+            for task in readers
+            if task.role == "host" or self._wiring.is_of_network(task.board)
+        }
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
         sent_ns = self._sent_ns(writer)
         slots = tuple(sorted({task.slot for task in readers} - spared - {writer.slot}))
         delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
-        interrupt = InterruptSpec(sent_ns, service_ns, table.depth, -(-sent_ns // clock_ns), box.delay, slots)
+        interrupt = InterruptSpec(
+            sent_ns, service_ns, table.depth, -(-sent_ns // clock_ns), box.delay, slots
+        )
         # As late as it is served, a message is still in its slot.
         waits = -(-(table.depth + 1) * service_ns // clock_ns)
         slowest = max(map(_slice, readers), default=0)
@@ -158,12 +205,17 @@ class LayoutMaker:
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
     def _sent_ns(self, writer: TaskSpec) -> int:
-        """Return the time from a release until its messages are sent: its budget, or a tick; a plan's: its slice."""
+        """Return the time from a release until its messages are sent: its budget, or a tick; a
+        plan's: its slice."""
         longest_ns = _slice(writer) * self._config.clock_ns
         if writer.role == "planner":
             return longest_ns
         budget = self._config.board[writer.board].budget
-        parts = () if budget is None else (budget.exchange_ms, budget.read_ms, budget.process_ms, budget.write_ms)
+        parts = (
+            ()
+            if budget is None
+            else (budget.exchange_ms, budget.read_ms, budget.process_ms, budget.write_ms)
+        )
         return min(round(sum(parts) * NS_PER_MS) or self._config.clock_ns, longest_ns)
 
     def _task(self, place: TaskPlace) -> TaskSpec:
@@ -190,17 +242,29 @@ class LayoutMaker:
         """Return the record of a host board: it has no rate, and leaves no trace."""
         is_external = self._config.host[place.board].external
         return TaskSpec(
-            place.name, place.board, place.role, place.slot, place.core, 0, 1, 1, 0, is_external=is_external
+            place.name,
+            place.board,
+            place.role,
+            place.slot,
+            place.core,
+            0,
+            1,
+            1,
+            0,
+            is_external=is_external,
         )
 
     def _mailbox(self, name: str, kind: MessageType, **times: Any) -> MailboxSpec:
-        """Return the record of a mailbox: its message, readers and protocol, and the other fields as given."""
+        """Return the record of a mailbox: its message, readers and protocol, and the other fields
+        as given."""
         reading = self._wiring.reading.get(name, ())
         dtype = kind.dtype(self._sizes)
         return MailboxSpec(
             name=name,
             readers=self._wiring.readers(name),
-            exchanges=tuple(exchanges(self._wiring, p)[port] for p, port in reading if port in p.exchange),
+            exchanges=tuple(
+                exchanges(self._wiring, p)[port] for p, port in reading if port in p.exchange
+            ),
             protocol=self._wiring.protocol(name),
             message=kind.name,
             version=kind.version,
@@ -216,7 +280,8 @@ def _slice(task: TaskSpec) -> int:
 
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
-    """Return the fields of a message type with offsets, shapes and numpy types, for tools that attach by name."""
+    """Return the fields of a message type with offsets, shapes and numpy types, for tools that
+    attach by name."""
     return _specs(kind, kind.dtype(sizes))
 
 
@@ -236,7 +301,11 @@ def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
                 unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
                 meaning=field.meaning,
                 fields=_specs(field.kind, scalar) if isinstance(field.kind, MessageType) else (),
-                values=() if isinstance(field.unit, str) else tuple((n.name.lower(), int(n)) for n in field.unit),
+                values=(
+                    ()
+                    if isinstance(field.unit, str)
+                    else tuple((n.name.lower(), int(n)) for n in field.unit)
+                ),
                 length=field.length,
             )
         )

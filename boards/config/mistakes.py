@@ -13,22 +13,36 @@ from pydantic_core import ErrorDetails
 
 from rack.boards.errors import Mistake
 
-HINTS = {"robot": "; a [robot] with its own model is a different arm and inherits nothing from extended files"}
+HINTS = {
+    "robot": (
+        "; a [robot] with its own model is a different arm and inherits nothing from extended files"
+    )
+}
 """Hints for tables that lack a key."""
 
 
-def mistakes_of(error: ValidationError, model: type[BaseModel], tables: Any, place: str = "") -> list[Mistake]:
-    """Return the mistakes of `tables`, which are at `place` in the config and failed validation as `model`."""
+def mistakes_of(
+    error: ValidationError, model: type[BaseModel], tables: Any, place: str = ""
+) -> list[Mistake]:
+    """Return the mistakes of `tables`, which are at `place` in the config and failed validation as
+    `model`."""
     found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
-    # A value that may have several types yields a mistake for each type: keep the first, or that of its item.
+    # A value that may have several types yields a mistake for each type: keep the first, or that of
+    # its item.
     first = {mistake.place: mistake for mistake in reversed(found)}
-    within = {place for place in first if any(other.startswith((f"{place}[", f"{place}.")) for other in first)}
+    within = {
+        place
+        for place in first
+        if any(other.startswith((f"{place}[", f"{place}.")) for other in first)
+    }
     return [first[place] for place in reversed(first) if place not in within]
 
 
 def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
     keys = _keys(entry["loc"], tables, entry["type"] == "missing")
-    where = (place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)).lstrip(".")
+    where = (
+        place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
+    ).lstrip(".")
     if entry["type"].startswith("union_tag"):  # a table of several kinds, selected by one key
         about = entry["ctx"]
         permitted = about.get("expected_tags", "").replace("'", "")
@@ -42,7 +56,12 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
         near = difflib.get_close_matches(str(keys[-1]), known, 1)
         why = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
         return Mistake(where, entry["input"], f"unknown key; {why}")
-    text = entry["msg"].removeprefix("Value error, ").removeprefix("Input ").replace("valid tuple", "list")
+    text = (
+        entry["msg"]
+        .removeprefix("Value error, ")
+        .removeprefix("Input ")
+        .replace("valid tuple", "list")
+    )
     if entry["type"] == "value_error" and isinstance(entry["input"], dict):
         return Mistake(where, None, text)
     return Mistake(where, entry["input"], f"{text}{meaning}")
@@ -59,8 +78,11 @@ def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int 
     return [*keys, loc[-1]] if is_missing else keys
 
 
-def _declared(model: type[BaseModel], keys: list[int | str], table: Any) -> tuple[list[str], FieldInfo | None]:
-    """Return the names of all keys of the table that contains the last of `keys`, and that key's field."""
+def _declared(
+    model: type[BaseModel], keys: list[int | str], table: Any
+) -> tuple[list[str], FieldInfo | None]:
+    """Return the names of all keys of the table that contains the last of `keys`, and that key's
+    field."""
     models = [model]
     known = dict[str, FieldInfo]()
     field = None
@@ -84,9 +106,16 @@ def _declared(model: type[BaseModel], keys: list[int | str], table: Any) -> tupl
 
 
 def _fits(kind: type[BaseModel], table: Any) -> bool:
-    """Say whether a table may be of this kind, judged by its keys with fixed values, as in do = "goto"."""
-    fixed = {key: get_args(f.annotation) for key, f in kind.model_fields.items() if get_origin(f.annotation) is Literal}
-    return isinstance(table, dict) and all(table.get(key) in values for key, values in fixed.items())
+    """Say whether a table may be of this kind, judged by its keys with fixed values, as in do =
+    "goto"."""
+    fixed = {
+        key: get_args(f.annotation)
+        for key, f in kind.model_fields.items()
+        if get_origin(f.annotation) is Literal
+    }
+    return isinstance(table, dict) and all(
+        table.get(key) in values for key, values in fixed.items()
+    )
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -109,5 +138,6 @@ def repeats(names: Iterable[str]) -> Iterator[tuple[str, int]]:
 
 
 def at_key(place: str, key: str) -> str:
-    """Return the place of a key of a table; what was not given in a config has no place of its own."""
+    """Return the place of a key of a table; what was not given in a config has no place of its
+    own."""
     return f"{place}.{key}" if place else key

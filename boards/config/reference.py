@@ -1,6 +1,8 @@
-"""Every key of a config with type, unit, range, default and meaning, from the models that validate it.
+"""Every key of a config with type, unit, range, default and meaning, from the models that validate
+it.
 
-`[task]` and the tables `params` of boards are declared by the levels' classes, so those tables depend on the config.
+`[task]` and the tables `params` of boards are declared by the levels' classes, so those tables
+depend on the config.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from rack.boards.errors import ConfigError, shown
 from rack.boards.faults.kind import KINDS
 
 UNIT = re.compile(
-    r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N m|N|rad/s[23]?|rad|m/s|mm|m|ms|us|1/s|s|Hz|ticks|cycles)"
+    r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N"
+    r" m|N|rad/s[23]?|rad|m/s|mm|m|ms|us|1/s|s|Hz|ticks|cycles)"
     r"(?: or (?:rad/s|rad|N m))?)(?=$|[;:,])"
 )
 """The unit in a description: between a comma and the end, or further punctuation."""
@@ -54,7 +57,8 @@ class KeyTable:
 
 
 class Place(NamedTuple):
-    """The place of a table in TOML: its path, whether it is an item of a list, and the key that selects its variant."""
+    """The place of a table in TOML: its path, whether it is an item of a list, and the key that
+    selects its variant."""
 
     path: str
     is_list: bool = False
@@ -64,11 +68,18 @@ class Place(NamedTuple):
     def heading(self) -> str:
         """The heading of the table in TOML."""
         text = f"[[{self.path}]]" if self.is_list else f"[{self.path}]"
-        return f"{text} with {self.variant}" if self.variant else text if self.path else "(top of the file)"
+        return (
+            f"{text} with {self.variant}"
+            if self.variant
+            else text
+            if self.path
+            else "(top of the file)"
+        )
 
 
 def key_tables(config: RackConfig) -> list[KeyTable]:
-    """Return every table that a config of these boards may contain. Raises `ConfigError` for a missing class."""
+    """Return every table that a config of these boards may contain. Raises `ConfigError` for a
+    missing class."""
     wiring = Wiring(config)
     if mistakes := [*ports(wiring), *exchange(wiring)]:
         raise ConfigError(mistakes)
@@ -85,7 +96,8 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
 
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
-    """Return the table `name`, or all whose names begin with it. Raises `LookupError` with the existing tables."""
+    """Return the table `name`, or all whose names begin with it. Raises `LookupError` with the
+    existing tables."""
     known = {found.name: found for found in key_tables(config)}
     wanted = name.strip("[]")
     start, _, rest = wanted.partition(".")
@@ -96,7 +108,9 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     found = [known[wanted]] if wanted in known else [known[name] for name in _within(wanted, known)]
     if not found:
         top = dict.fromkeys(name.partition(".")[0] for name in known)
-        raise LookupError(f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'")
+        raise LookupError(
+            f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'"
+        )
     return found
 
 
@@ -115,14 +129,18 @@ def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[Ke
     properties = schema.get("properties", {})
     required = schema.get("required", ())
     inner = {key: list(_inner(entry, known, Place(key))) for key, entry in properties.items()}
-    keys = [_key(key, properties[key], key in required) for key, found in inner.items() if not found]
+    keys = [
+        _key(key, properties[key], key in required) for key, found in inner.items() if not found
+    ]
     if keys:
         yield KeyTable(name, place.heading, _summary(schema.get("description", "")), tuple(keys))
     for key, found in inner.items():
         for entry, at in found:
             variant = at.variant.rpartition(" ")[2].strip('"')
             below = ".".join(part for part in ("" if name == WHOLE else name, key, variant) if part)
-            yield from _walk(entry, known, below, at._replace(path=f"{place.path}.{at.path}".lstrip(".")))
+            yield from _walk(
+                entry, known, below, at._replace(path=f"{place.path}.{at.path}".lstrip("."))
+            )
 
 
 def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Place]]:
@@ -193,7 +211,11 @@ def _range(entry: Schema) -> str:
     if values := entry.get("enum") or ([entry["const"]] if "const" in entry else []):
         return ", ".join(map(shown, values))
     if (held := _held(entry)) is not None:
-        count = f"{entry['minItems']} to {entry['maxItems']} items" if "maxItems" in entry and "items" in entry else ""
+        count = (
+            f"{entry['minItems']} to {entry['maxItems']} items"
+            if "maxItems" in entry and "items" in entry
+            else ""
+        )
         return "; ".join(filter(None, (count, _permitted(held))))
     low, high, above, below = (
         _number(entry[key]) if key in entry else ""
@@ -202,7 +224,9 @@ def _range(entry: Schema) -> str:
     if low and high:
         return f"{low} to {high}"
     least = f"{low} or more" if low else f"above {above}" if above else ""
-    return ", ".join(filter(None, (least, f"at most {high}" if high else f"below {below}" if below else "")))
+    return ", ".join(
+        filter(None, (least, f"at most {high}" if high else f"below {below}" if below else ""))
+    )
 
 
 def _number(value: float) -> str:
@@ -218,7 +242,8 @@ def _summary(docstring: str) -> str:
 
 
 def _fault_kinds() -> Iterator[KeyTable]:
-    """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides the common ones."""
+    """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides
+    the common ones."""
     for kind in KINDS:
         keys = [
             Key(
@@ -232,4 +257,9 @@ def _fault_kinds() -> Iterator[KeyTable]:
             for parameter in kind.parameters
         ]
         if keys:
-            yield KeyTable(f"fault.{kind.name}", f'[[fault]] with kind = "{kind.name}"', kind.means, tuple(keys))
+            yield KeyTable(
+                f"fault.{kind.name}",
+                f'[[fault]] with kind = "{kind.name}"',
+                kind.means,
+                tuple(keys),
+            )

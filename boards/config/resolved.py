@@ -1,6 +1,8 @@
-"""From TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires everything, once.
+"""From TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires
+everything, once.
 
-The two are separate so that at launch the crate imports the levels while this process resolves the config.
+The two are separate so that at launch the crate imports the levels while this process resolves the
+config.
 """
 
 from __future__ import annotations
@@ -46,43 +48,53 @@ from rack.levels.tables import GoalConfig, RobotConfig, Table
 LINGER_S = 0.5
 """Simulated time that a run continues after the task ends, to let the arm come to rest."""
 SILENT_S = 30.0
-"""Simulated time without a status after which the level that ends the run counts as dead; at least 8 of its cycles."""
+"""Simulated time without a status after which the level that ends the run counts as dead; at least
+8 of its cycles."""
 AHEAD_S = KEPT_S / 2
-"""Simulated time by which lockstep may run ahead of a recorder: half of the time that the rings retain."""
+"""Simulated time by which lockstep may run ahead of a recorder: half of the time that the rings
+retain."""
 _PERMIT = (
-    "To allow it, add the line '@GROUP - {}' for one of your groups to /etc/security/limits.conf and log in "
-    "again (ulimit -{} shows the limit), or grant {}"
+    "To allow it, add the line '@GROUP - {}' for one of your groups to /etc/security/limits.conf"
+    " and log in again (ulimit -{} shows the limit), or grant {}"
 )
 PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
 """How a user obtains real-time priorities."""
 PERMIT_LOCK = _PERMIT.format("memlock unlimited", "l", "CAP_IPC_LOCK")
 FILES = 32
-"""Files that a process of a rack may have open, beside one for each other process and each mailbox that it writes."""
+"""Files that a process of a rack may have open, beside one for each other process and each mailbox
+that it writes."""
 
 T = TypeVar("T", bound=Table)
 
 
-def load(name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None) -> RackConfig:
-    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the import path.
+def load(
+    name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
+) -> RackConfig:
+    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the
+    import path.
 
-    Faults of the script `faults`, by name or path, are appended to its own. Paths in an override are relative to the
-    current folder. Raises `ConfigError` with every mistake if a single table is wrong; `resolve` checks the rest.
+    Faults of the script `faults`, by name or path, are appended to its own. Paths in an override
+    are relative to the current folder. Raises `ConfigError` with every mistake if a single table is
+    wrong; `resolve` checks the rest.
     """
     return validated(assembled(name_or_path, overrides, faults))
 
 
 def loads(text: str) -> RackConfig:
-    """Return the config in TOML text, as `RackConfig.text` writes it. Raises `ConfigError` as `load` does."""
+    """Return the config in TOML text, as `RackConfig.text` writes it. Raises `ConfigError` as
+    `load` does."""
     return validated(anchor(parse(text), CONFIGS))
 
 
 def resolve(config: RackConfig) -> Resolved:
-    """Check and wire a config to run on this machine, now. Raises `ConfigError` with every mistake."""
+    """Check and wire a config to run on this machine, now. Raises `ConfigError` with every
+    mistake."""
     return _examined(config, credential_mistakes(config)).resolved()
 
 
 def wire(config: RackConfig) -> Layout:
-    """Return the layout of a config, which may have run elsewhere. Raises `ConfigError` with every mistake."""
+    """Return the layout of a config, which may have run elsewhere. Raises `ConfigError` with every
+    mistake."""
     return _examined(config).resolved().layout
 
 
@@ -104,12 +116,14 @@ class Resolved:
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
     def with_entries(self, entries: Mapping[str, Entries]) -> Resolved:
-        """Return the rack for a replay: no host boards, but what each bus adapter wrote in the recorded run."""
+        """Return the rack for a replay: no host boards, but what each bus adapter wrote in the
+        recorded run."""
         tasks = tuple(replace(task, entries=entries.get(task.task)) for task in self.tasks)
         return replace(self, tasks=tasks, hosts=())
 
     def clock(self, seconds: float | None) -> ClockWiring:
-        """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task ends."""
+        """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task
+        ends."""
         clock = self.config.clock
         tick_ns = self.config.clock_ns
         return ClockWiring(
@@ -124,12 +138,17 @@ class Resolved:
             priority=clock.priority,
             keeps_awake=clock.mode == "realtime" and clock.idle_cores == "awake",
             restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
-            on_loss={task.name: self._on_loss(task.board) for task in self.layout.tasks if task.role == "executor"},
+            on_loss={
+                task.name: self._on_loss(task.board)
+                for task in self.layout.tasks
+                if task.role == "executor"
+            },
         )
 
     @property
     def _clock_core(self) -> int:
-        """Core of the clock: in lockstep that of the fastest board, since a switch is faster than waking up a core."""
+        """Core of the clock: in lockstep that of the fastest board, since a switch is faster than
+        waking up a core."""
         if self.config.clock.mode == "lockstep":
             # A polling board does not give its core away.
             boards = [t for t in self.layout.tasks if t.role == "executor" and t.wake != "poll"]
@@ -142,32 +161,46 @@ class Resolved:
 
     def _on_loss(self, board: str) -> Demand:
         """Return the demand on the arm while a board is lost; none if the level below holds."""
-        return {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}[self.config.board[board].on_loss]
+        return {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}[
+            self.config.board[board].on_loss
+        ]
 
     @property
     def ends_run(self) -> str | None:
         """The status mailbox whose state ends the run; None: no level ends it."""
-        return next((f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None)
+        return next(
+            (f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None
+        )
 
     @property
     def _ending_every(self) -> int:
-        return 0 if self.ends_run is None else self.layout.task(self.layout.mailbox(self.ends_run).writer).every
+        return (
+            0
+            if self.ends_run is None
+            else self.layout.task(self.layout.mailbox(self.ends_run).writer).every
+        )
 
     @property
     def crate_priority(self) -> int:
-        """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary processes."""
-        priorities = [task.priority for task in self.layout.tasks if task.priority and task.role == "executor"]
+        """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary
+        processes."""
+        priorities = [
+            task.priority for task in self.layout.tasks if task.priority and task.role == "executor"
+        ]
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
-        """Return notes for the launch to report: cores replaced, priorities refused, idle cores held awake, ..."""
+        """Return notes for the launch to report: cores replaced, priorities refused, idle cores
+        held awake, ..."""
         refused = self._refused(segment)
         found = [*shared_out(self.config), *network_notes(self.config)]
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
         found += self._unlocked(segment)
         if self.clock(None).keeps_awake:
             with cores_kept_awake() as refusal:
-                found.append(f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}')
+                found.append(
+                    f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
+                )
         if self.config.clock.mode == "lockstep":
             why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
             found += [f"what {host.board} {why}" for host in self.hosts if host.is_external]
@@ -186,19 +219,33 @@ class Resolved:
             raise LaunchError(f"rack '{self.config.name}': {why}")
 
     def _unlocked(self, segment: Segment) -> list[str]:
-        memory = {t.name: mapped_and_locked(segment.block(t.name)[Block.PID]) for t in self.layout.tasks}
+        memory = {
+            t.name: mapped_and_locked(segment.block(t.name)[Block.PID]) for t in self.layout.tasks
+        }
         unlocked = {name: mapped for name, (mapped, locked) in memory.items() if not locked}
         if not unlocked or self.config.clock.mode == "lockstep":
             return []
-        limit = f"the limit is {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())}"
-        return [f"memory not locked for {', '.join(unlocked)}: {limit}; page faults may delay cycles. {PERMIT_LOCK}"]
+        limit = (
+            f"the limit is {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps"
+            f" {max(unlocked.values())}"
+        )
+        return [
+            f"memory not locked for {', '.join(unlocked)}: {limit}; page faults may delay cycles."
+            f" {PERMIT_LOCK}"
+        ]
 
     def _refused(self, segment: Segment) -> str:
         if self.config.clock.mode == "lockstep":
             # It has no deadlines to miss.
             return ""
-        refused = [t.name for t in self.layout.tasks if t.priority and not segment.block(t.name)[Block.PRIORITY]]
-        return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
+        refused = [
+            t.name
+            for t in self.layout.tasks
+            if t.priority and not segment.block(t.name)[Block.PRIORITY]
+        ]
+        return (
+            f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
+        )
 
 
 def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> _Examined:
@@ -212,7 +259,8 @@ def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> _Examined:
 class _Examined:
     """A config with the findings of its check.
 
-    `broken` names tables that were removed for mistakes already known; nothing that depends on them is checked.
+    `broken` names tables that were removed for mistakes already known; nothing that depends on them
+    is checked.
     """
 
     def __init__(
@@ -245,8 +293,12 @@ class _Examined:
         layout = self._layout
         assert layout is not None, "no mistakes"
         faults = injections(config, layout)
-        failing = {layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"}
-        tasks = tuple(self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks)
+        failing = {
+            layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"
+        }
+        tasks = tuple(
+            self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks
+        )
         hosts = tuple(self._host(ports) for ports in self._wiring.hosts)
         # A goal that the config states replaces that of the program.
         rows = config.scene.objects.index
@@ -280,7 +332,9 @@ class _Examined:
             task=ports.task,
             target=reference(self._config, ports.place),
             inputs={
-                port: source for port, source in ports.reads.items() if not from_host.intersection(mailboxes_of(source))
+                port: source
+                for port, source in ports.reads.items()
+                if not from_host.intersection(mailboxes_of(source))
             },
             outputs={port: box for port, box in ports.writes.items() if box not in of_host},
             context=self._contexts[spec.board],
@@ -289,7 +343,9 @@ class _Examined:
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
             exchange=exchanges(self._wiring, ports),
-            transfer=BusTimes(**{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}),
+            transfer=BusTimes(
+                **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
+            ),
         )
 
     def _contexts_of_boards(self) -> dict[str, LevelContext]:
@@ -327,7 +383,8 @@ class _Examined:
 
 
 def validated(tables: Tables) -> RackConfig:
-    """Return the config in tables, and add its levels to the import path. Raises `ConfigError` as `load` does."""
+    """Return the config in tables, and add its levels to the import path. Raises `ConfigError` as
+    `load` does."""
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
@@ -343,7 +400,8 @@ def validated(tables: Tables) -> RackConfig:
 
 
 def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield place and table for the valid tables of a list; the mistakes of the others are already known."""
+    """Yield place and table for the valid tables of a list; the mistakes of the others are already
+    known."""
     entries = tables.get(key)
     for at, entry in enumerate(entries if isinstance(entries, list) else []):
         with suppress(ValidationError):
@@ -353,14 +411,26 @@ def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]
 def _broken(error: ValidationError) -> frozenset[str]:
     """Return the tables with mistakes, as "robot", "board.servo" or "host.program"."""
     places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
-    return frozenset(".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places)
+    return frozenset(
+        ".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places
+    )
 
 
 def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
     """Return a config made of the tables without mistakes."""
-    kept = {key: value for key, value in tables.items() if key in RackConfig.model_fields and key not in broken}
-    boards = {name: table for name, table in kept.get("board", {}).items() if f"board.{name}" not in broken}
-    hosts = {name: table for name, table in kept.get("host", {}).items() if f"host.{name}" not in broken}
+    kept = {
+        key: value
+        for key, value in tables.items()
+        if key in RackConfig.model_fields and key not in broken
+    }
+    boards = {
+        name: table
+        for name, table in kept.get("board", {}).items()
+        if f"board.{name}" not in broken
+    }
+    hosts = {
+        name: table for name, table in kept.get("host", {}).items() if f"host.{name}" not in broken
+    }
     # Stand-ins for required tables; nothing that depends on a broken table is checked.
     spare = {"name": "unnamed", "clock": {"period_ms": 1}}
     none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}

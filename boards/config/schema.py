@@ -1,8 +1,8 @@
 """The tables of a rack's config: every key with its unit, range and meaning.
 
-`[robot]` and `[scene]` are declared in `rack.levels.robot` and `rack.levels.scene`; what `[task]` and
-`[board.<name>.params]` may hold is declared by the classes of the levels. In a description the unit
-follows a comma; `rack schema` shows it in a separate column.
+`[robot]` and `[scene]` are declared in `rack.levels.robot` and `rack.levels.scene`; what `[task]`
+and `[board.<name>.params]` may hold is declared by the classes of the levels. In a description the
+unit follows a comma; `rack schema` shows it in a separate column.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 def _listed(value: Any) -> Any:
     """Return a single name as a list of one, and TOML's list as a tuple."""
-    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+    return (
+        (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+    )
 
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
@@ -61,11 +63,17 @@ class ClockConfig(Table):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
     period_ms: float = Field(
-        ge=SHORTEST_MS, le=1000, allow_inf_nan=False, description="tick period, ms; a whole number of ns"
+        ge=SHORTEST_MS,
+        le=1000,
+        allow_inf_nan=False,
+        description="tick period, ms; a whole number of ns",
     )
     mode: Mode = Field(
         "realtime",
-        description="realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is done",
+        description=(
+            "realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is"
+            " done"
+        ),
     )
     speed: float = Field(
         1.0,
@@ -76,18 +84,26 @@ class ClockConfig(Table):
     )
     wake: Wake = Field(
         "timer",
-        description="how boards wait for their next cycle: timer: each sleeps to its own grid point; signal: until the "
-        "clock wakes them; poll: busy-wait",
+        description=(
+            "how boards wait for their next cycle: timer: each sleeps to its own grid point;"
+            " signal: until the clock wakes them; poll: busy-wait"
+        ),
     )
     idle_cores: IdleCores = Field(
         "sleep",
-        description="in real time, idle cores sleep or are held awake, which root alone may do; awake: wake-ups are "
-        "earlier by some 20 us on bare metal; a virtual machine may lose its cores for ms; see rack bench clock",
+        description=(
+            "in real time, idle cores sleep or are held awake, which root alone may do; awake:"
+            " wake-ups are earlier by some 20 us on bare metal; a virtual machine may lose its"
+            " cores for ms; see rack bench clock"
+        ),
     )
     core: Core = Field(0, description="core of the system controller")
-    priority: Priority = Field(0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling")
+    priority: Priority = Field(
+        0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling"
+    )
     on_no_realtime: OnNoRealtime = Field(
-        "warn", description="if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch"
+        "warn",
+        description="if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch",
     )
 
 
@@ -101,22 +117,35 @@ class TimingConfig(Table):
         None,
         ge=SHORTEST_MS,
         le=1e9,
-        description="goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max is R_s / n",
+        description=(
+            "goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max"
+            " is R_s / n"
+        ),
     )
-    clock_ms: Milliseconds = Field(0.0, description="processor time of the system clock's board per tick, ms")
+    clock_ms: Milliseconds = Field(
+        0.0, description="processor time of the system clock's board per tick, ms"
+    )
     small_share: float = Field(
-        0.1, gt=0, le=1, description="largest fraction of a cycle that counts as much smaller than it (eq. 3.10)"
+        0.1,
+        gt=0,
+        le=1,
+        description="largest fraction of a cycle that counts as much smaller than it (eq. 3.10)",
     )
 
 
 class ScheduleConfig(Table):
-    """`[schedule]`: a static cyclic schedule, in which every board has its place; see `rack.levels.timing.frames`."""
+    """`[schedule]`: a static cyclic schedule, in which every board has its place; see
+    `rack.levels.timing.frames`."""
 
     minor_ms: Positive = Field(
-        description="minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"
+        description=(
+            "minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"
+        )
     )
     major_ms: Positive = Field(
-        description="major frame, ms; a multiple of the minor one, which every board's cycle divides"
+        description=(
+            "major frame, ms; a multiple of the minor one, which every board's cycle divides"
+        )
     )
 
 
@@ -130,40 +159,66 @@ class BudgetConfig(Table):
     plan_ms: Milliseconds = Field(0.0, description="P: plan, per plan, ms")
     update_ms: Milliseconds = Field(0.0, description="U: write the plan, per plan, ms")
     plan_within_ms: float | None = Field(
-        None, gt=0, le=1e7, description="longest acceptable time for a new plan, ms; an upper limit on within_cycles"
+        None,
+        gt=0,
+        le=1e7,
+        description="longest acceptable time for a new plan, ms; an upper limit on within_cycles",
     )
 
 
 class TransferConfig(Table):
-    """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower bus."""
+    """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower
+    bus."""
 
-    read_ms: Milliseconds = Field(0.0, description="R: the executor reads commands and statuses, per cycle, ms")
-    write_ms: Milliseconds = Field(0.0, description="W: the executor writes commands and statuses, per cycle, ms")
-    exchange_ms: Milliseconds = Field(0.0, description="C: the executor reads the plan, per cycle, ms")
+    read_ms: Milliseconds = Field(
+        0.0, description="R: the executor reads commands and statuses, per cycle, ms"
+    )
+    write_ms: Milliseconds = Field(
+        0.0, description="W: the executor writes commands and statuses, per cycle, ms"
+    )
+    exchange_ms: Milliseconds = Field(
+        0.0, description="C: the executor reads the plan, per cycle, ms"
+    )
     update_ms: Milliseconds = Field(0.0, description="U: the planner writes its plan, ms")
 
 
 class ExchangeConfig(Table):
-    """`[board.<name>.exchange.<port>]`: when the executor reads one of its ports; default: in every cycle."""
+    """`[board.<name>.exchange.<port>]`: when the executor reads one of its ports; default: in every
+    cycle."""
 
     every: int = Field(
-        1, ge=1, le=LONGEST_EVERY, description="read in every n-th cycle; in between, the last message stays"
+        1,
+        ge=1,
+        le=LONGEST_EVERY,
+        description="read in every n-th cycle; in between, the last message stays",
     )
-    phase: int = Field(0, ge=0, description="number, less than every, of the first cycle that reads it, cycles")
+    phase: int = Field(
+        0, ge=0, description="number, less than every, of the first cycle that reads it, cycles"
+    )
     asynchronous: bool = Field(
-        False, description="read the newest message as soon as it is written; in real time, runs then differ"
+        False,
+        description=(
+            "read the newest message as soon as it is written; in real time, runs then differ"
+        ),
     )
 
 
 class SupervisionConfig(Table):
-    """`[supervision]`: restarts of boards that die or hang. When none are left, the brakes stay engaged."""
+    """`[supervision]`: restarts of boards that die or hang. When none are left, the brakes stay
+    engaged."""
 
     restarts: Restarts = Field(
         5, description="maximum number of restarts of one task within within_s; 0: never restart"
     )
-    within_s: Positive = Field(10.0, description="time window in which restarts are counted, s; simulated time")
+    within_s: Positive = Field(
+        10.0, description="time window in which restarts are counted, s; simulated time"
+    )
     lockstep_restart_s: Positive = Field(
-        0.5, description="in lockstep, simulated time until a lost task returns, s; in real time it returns when ready"
+        0.5,
+        description=(
+            "in lockstep, simulated time until a lost task returns, s; in real time it returns when"
+            " ready"
+        ),
     )
 
 
@@ -171,48 +226,91 @@ class BoardConfig(Table):
     """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
 
     slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
-    core: Core = Field(0, description="core of the board; if the machine lacks it, another core is used")
+    core: Core = Field(
+        0, description="core of the board; if the machine lacks it, another core is used"
+    )
     rate_hz: Positive | None = Field(
-        None, ge=1e-6, description="rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"
+        None,
+        ge=1e-6,
+        description=(
+            "rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"
+        ),
     )
     every: int | None = Field(
-        None, ge=1, le=LONGEST_EVERY, description="instead of rate_hz: period of the executor, ticks"
+        None,
+        ge=1,
+        le=LONGEST_EVERY,
+        description="instead of rate_hz: period of the executor, ticks",
     )
     phase: int = Field(
-        0, ge=0, description="first tick of the board, less than its period; its releases follow every period, ticks"
+        0,
+        ge=0,
+        description=(
+            "first tick of the board, less than its period; its releases follow every period, ticks"
+        ),
     )
-    priority: Priority = Field(0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling")
-    wake: Wake | None = Field(None, description="how this board waits for its next cycle; default: clock.wake")
-    above: Neighbours = Field((), description="board of the level above, whose commands this level reads; or a list")
-    below: Neighbours = Field((), description="board of the level below, whose status this level reads; or a list")
+    priority: Priority = Field(
+        0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling"
+    )
+    wake: Wake | None = Field(
+        None, description="how this board waits for its next cycle; default: clock.wake"
+    )
+    above: Neighbours = Field(
+        (), description="board of the level above, whose commands this level reads; or a list"
+    )
+    below: Neighbours = Field(
+        (), description="board of the level below, whose status this level reads; or a list"
+    )
     executor: ClassName = Field(description="class of the executor, package.module:Class")
-    planner: ClassName | None = Field(None, description="class of the planner, package.module:Class")
+    planner: ClassName | None = Field(
+        None, description="class of the planner, package.module:Class"
+    )
     coupling: Coupling = Field(
-        "none", description="tight: planner on this board; loose: on its own board; none: no planner"
+        "none",
+        description="tight: planner on this board; loose: on its own board; none: no planner",
     )
     within_cycles: int = Field(1, ge=1, le=10_000, description="time allowed for one plan, cycles")
     planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner")
-    planner_core: Core | None = Field(None, description="core of a loosely coupled planner; default: the board's")
-    planner_priority: Priority = Field(0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling")
+    planner_core: Core | None = Field(
+        None, description="core of a loosely coupled planner; default: the board's"
+    )
+    planner_priority: Priority = Field(
+        0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling"
+    )
     reads: dict[str, Sources] = Field(
         {}, description="mailbox by port of the executor, or a list; overrides the level's own"
     )
-    planner_reads: dict[str, Sources] = Field({}, description="mailbox by port of the planner, likewise")
+    planner_reads: dict[str, Sources] = Field(
+        {}, description="mailbox by port of the planner, likewise"
+    )
     exchange: dict[str, ExchangeConfig] = Field(
-        {}, description="when the executor reads a port, by port; also records the ages of all its messages"
+        {},
+        description=(
+            "when the executor reads a port, by port; also records the ages of all its messages"
+        ),
     )
     params: dict[str, Any] = Field({}, description="parameters of the level, declared by its class")
-    budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
-    transfer: TransferConfig = Field(TransferConfig(), description="emulation of a slower bus for this board")
-    ends_run: bool = Field(False, description="end the run when this level's status is done or error")
-    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board's tasks")
+    budget: BudgetConfig | None = Field(
+        None, description="worst-case processor times, for the timing model"
+    )
+    transfer: TransferConfig = Field(
+        TransferConfig(), description="emulation of a slower bus for this board"
+    )
+    ends_run: bool = Field(
+        False, description="end the run when this level's status is done or error"
+    )
+    restarts: Restarts | None = Field(
+        None, description="overrides supervision.restarts for this board's tasks"
+    )
     restarts_within_s: Positive | None = Field(
         None, description="overrides supervision.within_s for this board's tasks, s"
     )
     on_loss: OnLoss = Field(
         "hold",
-        description="while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then brakes; "
-        "brake: the arm brakes at once",
+        description=(
+            "while this board is lost: hold: the level below holds; stop: the arm ramps to rest,"
+            " then brakes; brake: the arm brakes at once"
+        ),
     )
 
 
@@ -221,20 +319,38 @@ LAN = "lan"
 
 
 class LanConfig(LanTable):
-    """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see `rack.boards.lan.adapter`."""
+    """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see
+    `rack.boards.lan.adapter`."""
 
     slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
-    core: Core = Field(0, description="core of the board; if the machine lacks it, another core is used")
-    rate_hz: Positive = Field(50.0, ge=1e-6, description="rate of the board, Hz; must divide the clock rate")
-    priority: Priority = Field(0, description="SCHED_FIFO priority, above the other boards' of its core; 0: ordinary")
-    budget: BudgetConfig | None = Field(None, description="worst-case processor times, for the timing model")
-    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board")
-    restarts_within_s: Positive | None = Field(None, description="overrides supervision.within_s for this board, s")
+    core: Core = Field(
+        0, description="core of the board; if the machine lacks it, another core is used"
+    )
+    rate_hz: Positive = Field(
+        50.0, ge=1e-6, description="rate of the board, Hz; must divide the clock rate"
+    )
+    priority: Priority = Field(
+        0, description="SCHED_FIFO priority, above the other boards' of its core; 0: ordinary"
+    )
+    budget: BudgetConfig | None = Field(
+        None, description="worst-case processor times, for the timing model"
+    )
+    restarts: Restarts | None = Field(
+        None, description="overrides supervision.restarts for this board"
+    )
+    restarts_within_s: Positive | None = Field(
+        None, description="overrides supervision.within_s for this board, s"
+    )
 
     def board(self) -> BoardConfig:
         """Return the board."""
-        own = {key: getattr(self, key) for key in LanConfig.model_fields.keys() - LanTable.model_fields.keys()}
-        params = self.model_dump(exclude_none=True, by_alias=True, include=set(LanTable.model_fields))
+        own = {
+            key: getattr(self, key)
+            for key in LanConfig.model_fields.keys() - LanTable.model_fields.keys()
+        }
+        params = self.model_dump(
+            exclude_none=True, by_alias=True, include=set(LanTable.model_fields)
+        )
         # Without its adapter a rack does not know which others are there.
         on_loss: OnLoss = "stop" if self.on_peer_loss == "stop" else "hold"
         return BoardConfig(executor=LAN_ADAPTER, params=params, on_loss=on_loss, **own)
@@ -243,26 +359,43 @@ class LanConfig(LanTable):
 class AdapterConfig(Table):
     """`[adapter]`: ways out of the rack."""
 
-    lan: LanConfig | None = Field(None, description="exchange of mailboxes with other racks over a network")
+    lan: LanConfig | None = Field(
+        None, description="exchange of mailboxes with other racks over a network"
+    )
 
 
 class HostConfig(Table):
-    """`[host.<name>]`: one board of the host side, without slot, rate and priority: see `rack.levels.host_program`."""
+    """`[host.<name>]`: one board of the host side, without slot, rate and priority: see
+    `rack.levels.host_program`."""
 
     program: ClassName = Field(description="class of the program, package.module:Class")
-    external: bool = Field(False, description="the rack does not start it: it is run by 'rack prompt'")
-    below: Neighbours = Field((), description="bus adapter through which it reaches the levels; or a list")
-    reads: dict[str, Sources] = Field({}, description="mailbox by port; overrides the program's own")
-    params: dict[str, Any] = Field({}, description="parameters of the program, declared by its class")
+    external: bool = Field(
+        False, description="the rack does not start it: it is run by 'rack prompt'"
+    )
+    below: Neighbours = Field(
+        (), description="bus adapter through which it reaches the levels; or a list"
+    )
+    reads: dict[str, Sources] = Field(
+        {}, description="mailbox by port; overrides the program's own"
+    )
+    params: dict[str, Any] = Field(
+        {}, description="parameters of the program, declared by its class"
+    )
     computing_ms: float = Field(
         0.0,
         ge=0.0,
         le=1e9,
-        description="in lockstep, simulated time from a wake-up until what it sends is passed on and it may be woken "
-        "again, ms; in real time its computing takes as long as it takes",
+        description=(
+            "in lockstep, simulated time from a wake-up until what it sends is passed on and it may"
+            " be woken again, ms; in real time its computing takes as long as it takes"
+        ),
     )
-    restarts: Restarts | None = Field(None, description="overrides supervision.restarts for this board")
-    restarts_within_s: Positive | None = Field(None, description="overrides supervision.within_s for this board, s")
+    restarts: Restarts | None = Field(
+        None, description="overrides supervision.restarts for this board"
+    )
+    restarts_within_s: Positive | None = Field(
+        None, description="overrides supervision.within_s for this board, s"
+    )
 
 
 class CommandConfig(Table):
@@ -270,28 +403,41 @@ class CommandConfig(Table):
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
     what: Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"] = Field(
-        description="hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify: put "
-        "a control modification in or take it out; table: decide by another state table; do: do one of the level's own "
-        "commands"
+        description=(
+            "hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there;"
+            " modify: put a control modification in or take it out; table: decide by another state"
+            " table; do: do one of the level's own commands"
+        )
     )
     tick: int | None = Field(
-        None, ge=0, le=LAST_TICK, description="tick at which the command is issued; give at most one of tick, at"
+        None,
+        ge=0,
+        le=LAST_TICK,
+        description="tick at which the command is issued; give at most one of tick, at",
     )
     at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
         None, description="instead of tick: simulated time, s"
     )
     joints: tuple[Finite, ...] | None = Field(None, description="goal: one position per joint, rad")
-    position: Vector | None = Field(None, description="goal: tool position, m; with quaternion or direction")
+    position: Vector | None = Field(
+        None, description="goal: tool position, m; with quaternion or direction"
+    )
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
         None, description="goal: tool orientation as w, x, y, z"
     )
     direction: Vector | None = Field(
-        None, description="goal: direction of the tool's z axis, rotation about it left free; default: down"
+        None,
+        description=(
+            "goal: direction of the tool's z axis, rotation about it left free; default: down"
+        ),
     )
     home: bool = Field(False, description="goal: the arm's start position")
     name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = Field(
         None,
-        description="control modification to put in or take out; name of a table; command to do, as in pick block1",
+        description=(
+            "control modification to put in or take out; name of a table; command to do, as in pick"
+            " block1"
+        ),
     )
     on: bool | None = Field(None, description="true: put it in; false: take it out")
 
@@ -324,24 +470,39 @@ class TaskPlace(NamedTuple):
 class RackConfig(Table):
     """A rack: everything that a run depends on."""
 
-    name: RackName = Field(description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40")
+    name: RackName = Field(
+        description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40"
+    )
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of all random numbers")
     python_path: tuple[Annotated[Path, Field(strict=False)], ...] = Field(
-        (), description="folders with your own levels, added to the import path; relative to this file"
+        (),
+        description="folders with your own levels, added to the import path; relative to this file",
     )
     clock: ClockConfig = Field(description="the system clock")
     protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
-    timing: TimingConfig = Field(TimingConfig(), description="assumptions of the timing model about the processors")
-    schedule: ScheduleConfig | None = Field(None, description="static cyclic schedule of all boards, if they have one")
+    timing: TimingConfig = Field(
+        TimingConfig(), description="assumptions of the timing model about the processors"
+    )
+    schedule: ScheduleConfig | None = Field(
+        None, description="static cyclic schedule of all boards, if they have one"
+    )
     robot: RobotConfig | None = Field(None, description="the arm; required by levels that move one")
     scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
     task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
-    board: dict[str, BoardConfig] = Field(min_length=1, description="boards by name; each runs the level of that name")
+    board: dict[str, BoardConfig] = Field(
+        min_length=1, description="boards by name; each runs the level of that name"
+    )
     adapter: AdapterConfig = Field(AdapterConfig(), description="ways out of the rack: the network")
-    host: dict[str, HostConfig] = Field({}, description="boards of the host side by name, without real time")
-    supervision: SupervisionConfig = Field(SupervisionConfig(), description="restarts of lost boards")
+    host: dict[str, HostConfig] = Field(
+        {}, description="boards of the host side by name, without real time"
+    )
+    supervision: SupervisionConfig = Field(
+        SupervisionConfig(), description="restarts of lost boards"
+    )
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
-    command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at its tick")
+    command: tuple[CommandConfig, ...] = Field(
+        (), description="operator commands, each at its tick"
+    )
 
     @model_validator(mode="after")
     def _with_adapters(self) -> Self:
@@ -356,17 +517,23 @@ class RackConfig(Table):
         return round(self.clock.period_ms * 1e6)
 
     def every(self, board: str) -> int:
-        """Return the period of a board's executor, ticks. Raises `ClockError` if it is off the grid."""
+        """Return the period of a board's executor, ticks. Raises `ClockError` if it is off the
+        grid."""
         config = self.board[board]
         if config.every is not None:
             return config.every
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
     def links(self) -> Iterator[tuple[str, str]]:
-        """Yield board above and board below of every two neighbours, whichever of them names the other."""
+        """Yield board above and board below of every two neighbours, whichever of them names the
+        other."""
         listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
         listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
-        yield from (link for link in dict.fromkeys(listed) if {*link} <= self.board.keys() and link[0] != link[1])
+        yield from (
+            link
+            for link in dict.fromkeys(listed)
+            if {*link} <= self.board.keys() and link[0] != link[1]
+        )
 
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""
@@ -375,10 +542,13 @@ class RackConfig(Table):
             if board.planner is not None:
                 slot = board.slot if board.planner_slot is None else board.planner_slot
                 core = board.core if board.planner_core is None else board.planner_core
-                yield TaskPlace(f"{name}.planner", name, "planner", slot, core, board.planner_priority)
+                yield TaskPlace(
+                    f"{name}.planner", name, "planner", slot, core, board.planner_priority
+                )
 
     def hosts(self) -> Iterator[TaskPlace]:
-        """Yield every board of the host side, outside the crate: it has no slot, and runs on any core."""
+        """Yield every board of the host side, outside the crate: it has no slot, and runs on any
+        core."""
         for name in self.host:
             yield TaskPlace(name, name, "host", OUTSIDE, ANY_CORE, 0)
 

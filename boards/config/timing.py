@@ -9,7 +9,13 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
-from rack.boards.config.schema import BoardConfig, BudgetConfig, CommandConfig, RackConfig, ScheduleConfig
+from rack.boards.config.schema import (
+    BoardConfig,
+    BudgetConfig,
+    CommandConfig,
+    RackConfig,
+    ScheduleConfig,
+)
 from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.rack import BoardTiming, CyclicSchedule, RackTiming
@@ -21,8 +27,11 @@ PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 """Keys of a budget that only a board with a planner has."""
 
 
-def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None) -> RackTiming:
-    """Return the timing model's record of a rack, with the budgets `found`, by board; default: the config's own."""
+def rack_timing(
+    config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None
+) -> RackTiming:
+    """Return the timing model's record of a rack, with the budgets `found`, by board; default: the
+    config's own."""
     found = budgets(config) if found is None else found
     goal_ms = config.timing.response_ms
     clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
@@ -31,7 +40,9 @@ def rack_timing(config: RackConfig, layout: Layout, found: Mapping[str, Budget] 
         is_lockstep=config.clock.mode == "lockstep",
         speed=config.clock.speed,
         clock_ns=config.clock_ns,
-        clock=TimedTask(CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, tick_ns(config), parts),
+        clock=TimedTask(
+            CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, tick_ns(config), parts
+        ),
         boards={name: _board(config, layout, name, found.get(name)) for name in config.board},
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
@@ -55,13 +66,16 @@ def inboxes(layout: Layout) -> dict[str, InboxTiming]:
             names = tuple(box.name for box in boxes)
             how = [how_sent(box) for box in boxes]
             times = zip(boxes, how, strict=True)
-            sources = [InterruptSource(box.every * layout.clock_ns, sent.service_ns) for box, sent in times]
+            sources = [
+                InterruptSource(box.every * layout.clock_ns, sent.service_ns) for box, sent in times
+            ]
             found[name] = InboxTiming(name, names, tuple(sources), how[0].depth)
     return found
 
 
 def without_interrupts(timing: RackTiming, found: Mapping[str, Budget]) -> dict[str, Budget]:
-    """Return budgets measured in a run, by board, without what interrupts took; in lockstep they take nothing."""
+    """Return budgets measured in a run, by board, without what interrupts took; in lockstep they
+    take nothing."""
     if timing.is_lockstep:
         return dict(found)
     return {
@@ -99,9 +113,13 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
 
 
 def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
-    """Return the ticks at which an executor reads the messages of others, by writer, if not in every cycle."""
+    """Return the ticks at which an executor reads the messages of others, by writer, if not in
+    every cycle."""
     own = [
-        (box.writer, exchange.grid) for box in layout.mailboxes for exchange in box.exchanges if exchange.task == board
+        (box.writer, exchange.grid)
+        for box in layout.mailboxes
+        for exchange in box.exchanges
+        if exchange.task == board
     ]
     return {writer: max(grid for other, grid in own if other == writer) for writer, _ in own}
 
@@ -119,15 +137,24 @@ def first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
 
 
 def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
-    """Say whether a board's plan update is the paper's critical section: tightly coupled, under protocol lock."""
-    return config.board[board].coupling == "tight" and layout.mailbox(f"{board}.plan").protocol == "lock"
+    """Say whether a board's plan update is the paper's critical section: tightly coupled, under
+    protocol lock."""
+    return (
+        config.board[board].coupling == "tight"
+        and layout.mailbox(f"{board}.plan").protocol == "lock"
+    )
 
 
 def budgets(config: RackConfig) -> dict[str, Budget]:
     """Return the config's budgets, by board; boards without one are omitted."""
     tables = {name: board.budget for name, board in config.board.items()}
     return {
-        name: Budget(**{key: round(getattr(table, f"{key.removesuffix('_ns')}_ms") * NS_PER_MS) for key in PARTS})
+        name: Budget(
+            **{
+                key: round(getattr(table, f"{key.removesuffix('_ns')}_ms") * NS_PER_MS)
+                for key in PARTS
+            }
+        )
         for name, table in tables.items()
         if table is not None
     }
@@ -143,7 +170,10 @@ def _budgeted(board: BoardConfig, budget: Budget | None) -> BoardConfig:
     wanted = None if board.budget is None else board.budget.plan_within_ms
     if budget is None:
         return board.model_copy(update={"budget": None})
-    times = {f"{part.removesuffix('_ns')}_ms": time_ns / NS_PER_MS for part, time_ns in asdict(budget).items()}
+    times = {
+        f"{part.removesuffix('_ns')}_ms": time_ns / NS_PER_MS
+        for part, time_ns in asdict(budget).items()
+    }
     if board.planner is None:
         times = {key: time for key, time in times.items() if key not in PLANNER_BUDGET}
     return board.model_copy(update={"budget": BudgetConfig(**times, plan_within_ms=wanted)})

@@ -17,7 +17,8 @@ INTEGER_BITS = 64
 """TOML's own limit; Python's integers have none."""
 PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
 SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)
-""""key.sub=value"; a key that contains a dot is quoted, as in TOML: protocol.mailbox."level.plan"=lock."""
+""""key.sub=value"; a key that contains a dot is quoted, as in TOML:
+protocol.mailbox."level.plan"=lock."""
 TOO_DEEP = f"nested too deeply; permitted: {MAX_DEPTH} levels"
 TOO_LONG = f"integer too long; permitted: {INTEGER_BITS} bits"
 FREE_FORM = ("params", "task")
@@ -27,7 +28,8 @@ Tables = dict[str, Any]
 
 
 def parse(text: str, place: str = "config") -> Tables:
-    """Return the tables of TOML text. Raises `ConfigError` with the invalid line, or every value out of bounds."""
+    """Return the tables of TOML text. Raises `ConfigError` with the invalid line, or every value
+    out of bounds."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -43,7 +45,9 @@ def parse(text: str, place: str = "config") -> Tables:
 
 def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
     """Yield mistakes that are valid TOML: deep nesting, long integers, NUL in text, dates."""
-    waiting: list[tuple[str, int, Any]] = [(f"{place}: {key}", 1, value) for key, value in tables.items()]
+    waiting: list[tuple[str, int, Any]] = [
+        (f"{place}: {key}", 1, value) for key, value in tables.items()
+    ]
     while waiting:
         where, depth, value = waiting.pop()
         if isinstance(value, dict | list) and depth >= MAX_DEPTH:
@@ -57,7 +61,9 @@ def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
         elif isinstance(value, str) and "\0" in value:
             yield Mistake(where, value, "text must not contain NUL")
         elif not isinstance(value, str | int | float):
-            yield Mistake(where, str(value), "dates and times are not permitted; use a number or quoted text")
+            yield Mistake(
+                where, str(value), "dates and times are not permitted; use a number or quoted text"
+            )
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
@@ -88,8 +94,8 @@ def merge(base: Tables, top: Tables) -> Tables:
 def override(tables: Tables, settings: Sequence[str]) -> Tables:
     """Return the tables with each setting `key.sub=value` applied, in order.
 
-    Values are TOML; any other text is taken as a string. A number in a key is an index into a list, as in
-    `task.action.0.by=30`. Raises `ConfigError` with every mistake.
+    Values are TOML; any other text is taken as a string. A number in a key is an index into a list,
+    as in `task.action.0.by=30`. Raises `ConfigError` with every mistake.
     """
     mistakes: list[Mistake] = []
     for setting in settings:
@@ -143,7 +149,10 @@ def _put(node: Any, keys: list[str], value: Any) -> Any:
     if isinstance(node, list):
         if key not in map(str, range(len(node))):
             raise LookupError(f"{shown(key)} is not an index of a list of {len(node)}")
-        return [_put(item, rest, value) if place == int(key) else item for place, item in enumerate(node)]
+        return [
+            _put(item, rest, value) if place == int(key) else item
+            for place, item in enumerate(node)
+        ]
     if not isinstance(node, dict):
         raise LookupError(f"{shown(key)} cannot be set in {shown(node)}, which is not a table")
     return {**node, key: _put(node.get(key, {} if rest else None), rest, value)}

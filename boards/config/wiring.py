@@ -1,7 +1,9 @@
-"""The wiring of a rack as plain data, made once from its config: the ports of all tasks, and the mailboxes they share.
+"""The wiring of a rack as plain data, made once from its config: the ports of all tasks, and the
+mailboxes they share.
 
-A port's source is a mailbox, or is relative to its board: "above.command", "below.status", "own.plan". The config may
-connect a port to another mailbox. Whether all is right, the rules say (`rack.boards.config.rules`).
+A port's source is a mailbox, or is relative to its board: "above.command", "below.status",
+"own.plan". The config may connect a port to another mailbox. Whether all is right, the rules say
+(`rack.boards.config.rules`).
 """
 
 from __future__ import annotations
@@ -18,7 +20,15 @@ from rack.backplane.errors import ClockError
 from rack.backplane.layout import Protocol, Role
 from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
-from rack.boards.config.schema import LAN, BoardConfig, ExchangeConfig, HostConfig, RackConfig, Sources, TaskPlace
+from rack.boards.config.schema import (
+    LAN,
+    BoardConfig,
+    ExchangeConfig,
+    HostConfig,
+    RackConfig,
+    Sources,
+    TaskPlace,
+)
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 from rack.boards.host.bus_adapter import BusAdapter
@@ -32,7 +42,8 @@ LevelClass = type[Executor] | type[Planner] | type[HostProgram]
 
 
 class Connection(NamedTuple):
-    """How a config connects an input: the key that says so, what it gives there, and the mailboxes that follow."""
+    """How a config connects an input: the key that says so, what it gives there, and the mailboxes
+    that follow."""
 
     port: str
     entry: Input
@@ -50,7 +61,8 @@ class Connection(NamedTuple):
 
     @property
     def source(self) -> Source:
-        """What the port reads: a mailbox, or mailboxes by board, or by their names if one board writes several."""
+        """What the port reads: a mailbox, or mailboxes by board, or by their names if one board
+        writes several."""
         if not self.entry.many:
             return self.mailboxes[0]
         boards = [box.partition(".")[0] for box in self.mailboxes]
@@ -62,9 +74,10 @@ class Connection(NamedTuple):
 class TaskPorts:
     """The class of a task or host board, and the mailbox of each port.
 
-    `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board; `writes` a mailbox by
-    port, `inputs` and `outputs` the declarations of the ports; `exchange` when an executor reads them; `connections`
-    where the inputs that its class declares are connected; not `is_whole` if mistakes keep some ports unknown.
+    `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board;
+    `writes` a mailbox by port, `inputs` and `outputs` the declarations of the ports; `exchange`
+    when an executor reads them; `connections` where the inputs that its class declares are
+    connected; not `is_whole` if mistakes keep some ports unknown.
     """
 
     place: TaskPlace
@@ -85,14 +98,19 @@ class TaskPorts:
     @cached_property
     def sources(self) -> list[tuple[str, str]]:
         """Port and mailbox of everything that the task reads."""
-        return [(port, mailbox) for port, source in self.reads.items() for mailbox in mailboxes_of(source)]
+        return [
+            (port, mailbox)
+            for port, source in self.reads.items()
+            for mailbox in mailboxes_of(source)
+        ]
 
     def rests_on(self, output: str) -> tuple[str, ...]:
         """Return the mailboxes on whose information an output rests."""
         return mailboxes_of(self.reads.get(self.outputs[output].rests_on or output, {}))
 
     def wired_at(self, port: str) -> str:
-        """Return the key of a config under which an input is wired, as in "board.servo.reads.command"."""
+        """Return the key of a config under which an input is wired, as in
+        "board.servo.reads.command"."""
         key = self.kind.wired_by if issubclass(self.kind, Adapter) else key_of(self.place)
         return f"{table_of(self.place)}.{key}.{port}"
 
@@ -123,13 +141,15 @@ def class_key(place: TaskPlace) -> str:
 
 
 def reference(config: RackConfig, place: TaskPlace) -> str:
-    """Return the class that the config names for a task or host board, as "package.module:Class"."""
+    """Return the class that the config names for a task or host board, as
+    "package.module:Class"."""
     found: str = getattr(_own_table(config, place), class_key(place))
     return found
 
 
 def declared_ports(config: RackConfig, place: TaskPlace) -> TaskPorts:
-    """Return the ports that the class of a task or host board declares. Raises `LookupError` if there is none."""
+    """Return the ports that the class of a task or host board declares. Raises `LookupError` if
+    there is none."""
     kind, outputs = _class(reference(config, place), place.role)
     connections = tuple(_connections(config, place, kind.inputs))
     reads = {c.port: c.source for c in connections if c.fits and c.is_there}
@@ -138,7 +158,9 @@ def declared_ports(config: RackConfig, place: TaskPlace) -> TaskPorts:
     return TaskPorts(place, kind, kind.inputs, outputs, reads, writes, exchange, connections)
 
 
-def with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]) -> TaskPorts:
+def with_made_ports(
+    config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]
+) -> TaskPorts:
     """Add the ports that the config makes: their types may be those of other mailboxes."""
     if not issubclass(ports.kind, Executor):
         return ports
@@ -155,19 +177,24 @@ def with_made_ports(config: RackConfig, ports: TaskPorts, types: Mapping[str, Me
 
 
 def with_exchange(ports: TaskPorts) -> TaskPorts:
-    """Add the mailbox of the exchange to a board whose config has one; one of that name of its own stays."""
+    """Add the mailbox of the exchange to a board whose config has one; one of that name of its own
+    stays."""
     if not ports.exchange or not ports.is_whole:
         return ports
     outputs = dict(ports.outputs)
     outputs.setdefault(EXCHANGE, Output(exchange_message(ports.reads)))
-    return replace(ports, outputs=outputs, writes={**ports.writes, EXCHANGE: f"{ports.task}.{EXCHANGE}"})
+    return replace(
+        ports, outputs=outputs, writes={**ports.writes, EXCHANGE: f"{ports.task}.{EXCHANGE}"}
+    )
 
 
 def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
     if role == "host":
         program = find_class(wanted, HostProgram)
         if many := [port for port, entry in program.inputs.items() if entry.many]:
-            raise LookupError(f"port '{many[0]}' reads many mailboxes; permitted on the host side: one")
+            raise LookupError(
+                f"port '{many[0]}' reads many mailboxes; permitted on the host side: one"
+            )
         return program, _outputs(program.outputs)
     if role == "executor":
         executor = find_class(wanted, Executor)
@@ -179,10 +206,14 @@ def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
 
 
 def _outputs(given: Mapping[str, MessageType | Output]) -> dict[str, Output]:
-    return {port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given.items()}
+    return {
+        port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given.items()
+    }
 
 
-def _connections(config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input]) -> Iterator[Connection]:
+def _connections(
+    config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input]
+) -> Iterator[Connection]:
     own = {place.board}
     wired = rewired(config, place)
     table = _own_table(config, place)
@@ -194,19 +225,24 @@ def _connections(config: RackConfig, place: TaskPlace, inputs: Mapping[str, Inpu
             continue
         boards = neighbours.get(start, (start,))
         is_there = start not in ("above", "below") or {*boards} <= config.board.keys() - own
-        yield Connection(port, entry, start, boards, tuple(f"{board}.{rest}" for board in boards), is_there)
+        yield Connection(
+            port, entry, start, boards, tuple(f"{board}.{rest}" for board in boards), is_there
+        )
 
 
 class Wiring:
     """The ports of all tasks and host boards, connected.
 
-    `broken` names the tables that the config lacks since they have mistakes of their own, as in "board.servo".
+    `broken` names the tables that the config lacks since they have mistakes of their own, as in
+    "board.servo".
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
         self.broken = broken
-        self.broken_boards = [place.removeprefix("board.") for place in broken if place.startswith("board.")]
+        self.broken_boards = [
+            place.removeprefix("board.") for place in broken if place.startswith("board.")
+        ]
         self.missing: dict[TaskPlace, str] = {}
         """Why there is no class, of the tasks and host boards without one."""
         self.ports = self._connected()
@@ -233,14 +269,19 @@ class Wiring:
             for port, source in ports.sources
         }
         """The mailboxes that bus adapters write, with those that they pass on."""
-        self.to_host = {mailbox for mailbox, source in self.passed.items() if source not in self.from_host}
+        self.to_host = {
+            mailbox for mailbox, source in self.passed.items() if source not in self.from_host
+        }
         self.of_host = self.from_host | self.to_host
         """The host side. Only a bus adapter reads on one side and writes on the other."""
         self.every = dict(self._periods())
         """The periods of the boards whose rate is on the clock's grid, ticks."""
         whole = {ports.task for ports in self.ports.values() if ports.is_whole}
-        self.unknown = {place.board for place in (*self.missing, *self.ports) if place.name not in whole}
-        """Boards with mistakes of their own: a reader that lacks a mailbox of theirs is not at fault."""
+        self.unknown = {
+            place.board for place in (*self.missing, *self.ports) if place.name not in whole
+        }
+        """Boards with mistakes of their own: a reader that lacks a mailbox of theirs is not at
+        fault."""
         self.unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
         self.unknown |= {LAN} if "adapter" in broken or is_taken(config) else set()
 
@@ -258,8 +299,12 @@ class Wiring:
         # What one board makes another may pass on.
         while len(types) != before:
             before = len(types)
-            types = {box: p.outputs[port].type for p in found.values() for port, box in p.writes.items()}
-            found = {place: with_made_ports(config, ports, types) for place, ports in declared.items()}
+            types = {
+                box: p.outputs[port].type for p in found.values() for port, box in p.writes.items()
+            }
+            found = {
+                place: with_made_ports(config, ports, types) for place, ports in declared.items()
+            }
         return {place: with_exchange(ports) for place, ports in found.items()}
 
     def _periods(self) -> Iterator[tuple[str, int]]:
@@ -271,12 +316,16 @@ class Wiring:
     def params(self) -> Iterable[tuple[str, type[BaseModel]]]:
         """The tables with parameters, as in "board.servo", and their records, each once."""
         found = self.ports.items()
-        return dict.fromkeys((table_of(place), p.kind.params) for place, p in found if p.kind.params is not None)
+        return dict.fromkeys(
+            (table_of(place), p.kind.params) for place, p in found if p.kind.params is not None
+        )
 
     @property
     def programs(self) -> Iterable[type[Program]]:
         """The records of the programs of levels that read `[task]`, each once."""
-        return dict.fromkeys(p.kind.program for p in self.ports.values() if p.kind.program is not None)
+        return dict.fromkeys(
+            p.kind.program for p in self.ports.values() if p.kind.program is not None
+        )
 
     def is_known(self, mailbox: str) -> bool:
         """Say whether a mailbox exists, or may: its board has mistakes of its own."""
@@ -284,7 +333,9 @@ class Wiring:
 
     def type_of(self, mailbox: str) -> MessageType | None:
         """Return the message type of a mailbox; None if it does not exist."""
-        return self.writers[mailbox][1].type if mailbox in self.writers else self.operated.get(mailbox)
+        return (
+            self.writers[mailbox][1].type if mailbox in self.writers else self.operated.get(mailbox)
+        )
 
     def names(self) -> str:
         """Return the names of all mailboxes, as a list to read."""
@@ -303,7 +354,9 @@ class Wiring:
         if mailbox in self.to_host:
             # Host boards read the newest message at once, whatever the protocol.
             return "time-slice"
-        if mailbox in self.from_host or (mailbox in self.writers and self.writers[mailbox][1].queued):
+        if mailbox in self.from_host or (
+            mailbox in self.writers and self.writers[mailbox][1].queued
+        ):
             return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
         if protocol == "interrupt" and (mailbox in self.operated or self.is_of_network(mailbox)):
@@ -314,7 +367,8 @@ class Wiring:
 
 
 def executors(config: RackConfig) -> dict[str, type[Executor] | None]:
-    """Return the class of each board's executor; None where it is missing, which is reported elsewhere."""
+    """Return the class of each board's executor; None where it is missing, which is reported
+    elsewhere."""
     found: dict[str, type[Executor] | None] = dict.fromkeys(config.board)
     for name, board in config.board.items():
         with suppress(LookupError):
@@ -323,15 +377,21 @@ def executors(config: RackConfig) -> dict[str, type[Executor] | None]:
 
 
 def commandable(config: RackConfig) -> dict[str, Commands]:
-    """Return the commands that each level takes from an operator, by board; levels that take none are omitted."""
+    """Return the commands that each level takes from an operator, by board; levels that take none
+    are omitted."""
     return {
         name: executor.commands
         for name, executor in executors(config).items()
-        if executor is not None and any(port.source == OWN_OPERATOR for port in executor.inputs.values())
+        if executor is not None
+        and any(port.source == OWN_OPERATOR for port in executor.inputs.values())
     }
 
 
 def is_taken(config: RackConfig) -> bool:
     """Say whether another board has the name of the network adapter's."""
     # If the others are broken, its own is not there either.
-    return config.adapter.lan is not None and LAN in config.board and config.board[LAN] != config.adapter.lan.board()
+    return (
+        config.adapter.lan is not None
+        and LAN in config.board
+        and config.board[LAN] != config.adapter.lan.board()
+    )

@@ -2,7 +2,8 @@
 
 import gc
 
-# All that is imported and preloaded from here on stays: looking for garbage in it takes a tenth of the launch.
+# All that is imported and preloaded from here on stays: looking for garbage in it takes a tenth of
+# the launch.
 gc.disable()
 
 from rack.boards.crate.crate import main  # noqa: E402

@@ -1,4 +1,5 @@
-"""Alarms of tasks and clock as events: with names and units, as text for people and codes for programs."""
+"""Alarms of tasks and clock as events: with names and units, as text for people and codes for
+programs."""
 
 from __future__ import annotations
 
@@ -54,16 +55,28 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.REJOINED: ("task", "'{subject}' rejoined after {span}"),
     Alarm.LATE: ("task", "'{subject}' missed its deadline: still running at its next release"),
     Alarm.PLAN_LATE: ("task", "'{subject}' missed its deadline: its plan was not finished"),
-    Alarm.STARVED: ("task", "'{subject}' is not getting its core: {releases} missed since tick {since}"),
+    Alarm.STARVED: (
+        "task",
+        "'{subject}' is not getting its core: {releases} missed since tick {since}",
+    ),
     Alarm.FLOWS: ("mailbox", "'{subject}': messages flow again, {span} after a fault"),
-    Alarm.STALE: ("mailbox", "'{subject}' is stale, {span}: its writer '{writer}' is dead or stopped"),
+    Alarm.STALE: (
+        "mailbox",
+        "'{subject}' is stale, {span}: its writer '{writer}' is dead or stopped",
+    ),
     Alarm.MUTE: ("mailbox", "'{subject}' is stale, {span}: '{writer}' is running but not writing"),
     Alarm.GAP: ("mailbox", "'{subject}': {messages} lost, gap in serials"),
     Alarm.HELD_BACK: ("mailbox", "'{subject}': a message was delayed by {span}"),
     Alarm.DISORDER: ("mailbox", "'{subject}': messages out of order, the last one by {span}"),
     Alarm.DAMAGED: ("mailbox", "'{subject}': a message failed its check"),
-    Alarm.BABBLE: ("mailbox", "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1"),
-    Alarm.MASQUERADE: ("mailbox", "'{subject}': a message comes from process {value:.0f}, which is not its writer"),
+    Alarm.BABBLE: (
+        "mailbox",
+        "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1",
+    ),
+    Alarm.MASQUERADE: (
+        "mailbox",
+        "'{subject}': a message comes from process {value:.0f}, which is not its writer",
+    ),
     Alarm.QUEUE_FULL: ("mailbox", "'{subject}' is full: {messages} of '{writer}' refused"),
     Alarm.INBOX_FULL: ("mailbox", "inbox is full: {messages} in '{subject}' lost"),
     Alarm.LOCKED: ("mailbox", "'{subject}': a dead or stopped process holds the lock"),
@@ -71,23 +84,41 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
     Alarm.CLOCK_SKIPPED: ("nothing", "clock skipped {ticks}"),
     Alarm.CLOCK_LATE: ("nothing", "clock late: tick {late_ms:.3f} ms late"),
     Alarm.SENSOR_RANGE: ("joint", "sensor {subject} out of range: {value:g} rad"),
-    Alarm.SENSOR_STUCK: ("joint", "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven"),
+    Alarm.SENSOR_STUCK: (
+        "joint",
+        "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven",
+    ),
     Alarm.SENSOR_SILENT: ("nothing", "sensors silent: no new sample for {span}"),
     Alarm.SENSOR_MODEL: ("joint", "sensor {subject} disagrees with the model: off by {value:.3g}"),
-    Alarm.ACTUATOR: ("joint", "actuator {subject} does not produce its commanded torque: off by {value:.3g}"),
+    Alarm.ACTUATOR: (
+        "joint",
+        "actuator {subject} does not produce its commanded torque: off by {value:.3g}",
+    ),
     Alarm.COMMAND_INVALID: ("joint", "rejected: torque of {subject} is NaN"),
-    Alarm.COMMAND_LIMIT: ("joint", "torque of {subject} cut to its limit: {value:.3g} N m was commanded"),
+    Alarm.COMMAND_LIMIT: (
+        "joint",
+        "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
+    ),
     Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
-    Alarm.TENSION_LIMIT: ("joint", "tension of {subject} cut to its limit: {value:.3g} N was commanded"),
+    Alarm.TENSION_LIMIT: (
+        "joint",
+        "tension of {subject} cut to its limit: {value:.3g} N was commanded",
+    ),
     Alarm.TENDON: ("joint", "tendon of {subject} is slack: {value:.3g} N"),
     Alarm.BRAKES_CLOSED: ("brakes", "brakes engaged: {subject}"),
     Alarm.BRAKES_OPENED: ("brakes", "brakes released after {span}"),
-    Alarm.RE_REFERENCED: ("joint", "sensor {subject} trusted again: {value:.3g} rad from its estimate"),
+    Alarm.RE_REFERENCED: (
+        "joint",
+        "sensor {subject} trusted again: {value:.3g} rad from its estimate",
+    ),
     Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
     Alarm.FORCE_LIMIT: ("nothing", "contact too strong: force of {value:.3g} N"),
     Alarm.MOMENT_LIMIT: ("nothing", "contact too strong: torque of {value:.3g} N m"),
     Alarm.MODIFICATION: ("name", "control modification '{subject}' failed and was taken out"),
-    Alarm.PEER_LOST: ("name", "rack '{subject}' is lost: its network adapter ended, or is out of reach"),
+    Alarm.PEER_LOST: (
+        "name",
+        "rack '{subject}' is lost: its network adapter ended, or is out of reach",
+    ),
     Alarm.PEER_BACK: ("name", "rack '{subject}' is back after {span}"),
     Alarm.PEER_RESTARTED: ("name", "rack '{subject}' is back after {span}: it was restarted"),
     Alarm.REMOTE_STOP: ("name", "'{subject}' has set the emergency stop from another machine"),
@@ -107,7 +138,10 @@ class AlarmWatch:
     """Reads all alarm rings of a rack. `lost` counts alarms overwritten before they were read."""
 
     def __init__(self, segment: Segment, config: RackConfig) -> None:
-        self._rings = {name: alarm_ring(segment, name) for name in (CLOCK, *(t.name for t in segment.layout.tasks))}
+        self._rings = {
+            name: alarm_ring(segment, name)
+            for name in (CLOCK, *(t.name for t in segment.layout.tasks))
+        }
         robot = config.robot
         name = partial(setting_name, config)
         if robot is None:
@@ -126,14 +160,18 @@ class AlarmWatch:
                 continue
             rows, lost = ring.drain()
             self.lost += lost
-            found += [RungAlarm(Alarm(row["code"]), int(row["subject"]), self._events.of(row, owner)) for row in rows]
+            found += [
+                RungAlarm(Alarm(row["code"]), int(row["subject"]), self._events.of(row, owner))
+                for row in rows
+            ]
         return sorted(found, key=lambda one: one.event.time_ns)
 
 
 class AlarmEvents:
     """Turns a rack's alarms into events.
 
-    `joints` are the robot's; `geom` returns the name of a geom of the cell, `name` one of `Executor.names` of a board.
+    `joints` are the robot's; `geom` returns the name of a geom of the cell, `name` one of
+    `Executor.names` of a board.
     """
 
     def __init__(
@@ -151,9 +189,11 @@ class AlarmEvents:
         self._name = name
 
     def of(self, row: np.void, owner: str) -> Event:
-        """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring of task `owner`.
+        """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring
+        of task `owner`.
 
-        The event's board is the one that raised the alarm; for a fault, restart or command, the one affected.
+        The event's board is the one that raised the alarm; for a fault, restart or command, the one
+        affected.
         """
         alarm = Alarm(row["code"])
         number = int(row["subject"])
@@ -189,7 +229,18 @@ class AlarmEvents:
             text += f" for {self._span(value)}" if alarm == Alarm.BRAKES_CLOSED and value else ""
             board = subject if alarm == Alarm.REJOINED else owner
         realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
-        return Event(realtime_ns, int(row["tick"]), kind, board, text, code, fault, subject, value, int(since))
+        return Event(
+            realtime_ns,
+            int(row["tick"]),
+            kind,
+            board,
+            text,
+            code,
+            fault,
+            subject,
+            value,
+            int(since),
+        )
 
     def _described(self, alarm: Alarm, row: np.void, owner: str) -> tuple[str, str]:
         """Return the name of the subject of an alarm from `owner`, and its text."""
@@ -214,7 +265,9 @@ class AlarmEvents:
             writer = layout.mailboxes[number].writer
         counted = {f"{noun}s": counting(value, noun) for noun in ("release", "message", "tick")}
         named = {"subject": subject, "writer": writer, "since": int(row["since"]), **counted}
-        return subject, text.format(**named, value=value, span=self._span(value), late_ms=value * 1e-6)
+        return subject, text.format(
+            **named, value=value, span=self._span(value), late_ms=value * 1e-6
+        )
 
     def _duration(self, entry: FaultEntry, code: str) -> str:
         """Return the duration of a fault that begins, or how often a fault that ends has acted."""
@@ -238,6 +291,12 @@ def counting(number: float, noun: str) -> str:
 def _demand(demand: Demand, subject: str) -> str:
     if demand == Demand.NONE:
         return "arm released: no stop is requested"
-    named = {EMERGENCY_STOP: "the emergency stop is latched", ANOTHER_RACK: "a rack that it works with is lost"}
+    named = {
+        EMERGENCY_STOP: "the emergency stop is latched",
+        ANOTHER_RACK: "a rack that it works with is lost",
+    }
     why = named.get(subject, f"'{subject}' is lost")
-    return f"the arm must {'ramp to rest, then brake' if demand == Demand.STOP else 'brake at once'}: {why}"
+    return (
+        f"the arm must {'ramp to rest, then brake' if demand == Demand.STOP else 'brake at once'}:"
+        f" {why}"
+    )

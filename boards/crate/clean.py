@@ -38,12 +38,13 @@ def _remove(segment: Segment) -> bool:
     rack = segment.rack
     if segment.launcher_is_alive:
         raise SegmentError(
-            f"rack '{rack}' is already running, launched by process {segment.launcher}; stop it, or choose another name"
+            f"rack '{rack}' is already running, launched by process {segment.launcher}; stop it, or"
+            " choose another name"
         )
     removal = ByteLock(segment.fd, 8 * Head.MAGIC)
     try:
-        # If two programs find the same dead rack, only one removes it. Otherwise the slower one would remove the rack
-        # that the faster one has meanwhile launched under the same name.
+        # If two programs find the same dead rack, only one removes it. Otherwise the slower one
+        # would remove the rack that the faster one has meanwhile launched under the same name.
         if not removal.take() or not segment.has_its_name:
             return False
         semaphores.unlink_all(rack)
@@ -54,18 +55,22 @@ def _remove(segment: Segment) -> bool:
 
 
 def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
-    """Remove the racks launched by this process or by one that it has `killed`, or one of them, in any state."""
+    """Remove the racks launched by this process or by one that it has `killed`, or one of them, in
+    any state."""
     for name in racks() if rack is None else [rack]:
         with suppress(SegmentError):
             segment = Segment.open(name)
-            if segment.launcher in killed or (segment.launcher_is_alive and segment.launcher == os.getpid()):
+            if segment.launcher in killed or (
+                segment.launcher_is_alive and segment.launcher == os.getpid()
+            ):
                 semaphores.unlink_all(name)
                 unlink(name)
             segment.close()
 
 
 def clean() -> tuple[list[str], list[str], list[str]]:
-    """Remove every rack that is not running; return names removed, names in use, and a line per foreign entry."""
+    """Remove every rack that is not running; return names removed, names in use, and a line per
+    foreign entry."""
     removed = []
     in_use = []
     strange = []

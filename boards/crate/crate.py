@@ -1,10 +1,11 @@
-"""The crate: a small process that imports and preloads the boards' levels, then forks every board from itself.
+"""The crate: a small process that imports and preloads the boards' levels, then forks every board
+from itself.
 
-Importing numpy, MuJoCo and the planning libraries takes half a second, and loading compiled code as long again; forked
-boards share the result, and with it one compiled cell. The crate stays
-single-threaded, so that forking is safe at any time. As the boards' parent it reaps them, and the kernel kills them if
-it ends. It is started as `python -m rack.boards.crate LINE ATTENTION`: the descriptors of the line and of the eventfd
-to which boards write.
+Importing numpy, MuJoCo and the planning libraries takes half a second, and loading compiled code as
+long again; forked boards share the result, and with it one compiled cell. The crate stays
+single-threaded, so that forking is safe at any time. As the boards' parent it reaps them, and the
+kernel kills them if it ends. It is started as `python -m rack.boards.crate LINE ATTENTION`: the
+descriptors of the line and of the eventfd to which boards write.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ from rack.levels.level import Executor, Planner
 HOST_PROCESSES = 4
 """Processes beside those of the layout: Rack, crate, clock, recorder."""
 REST_MS = 10
-"""Time between two reads of what host boards print: one that prints without end waits, and delays no other."""
+"""Time between two reads of what host boards print: one that prints without end waits, and delays
+no other."""
 ORPHANS_S = 1.0
 """Longest wait for the end of what a host board has started."""
 LEAVE_S = 0.5
@@ -75,7 +77,8 @@ class Crate:
         self._resting: list[HostOutput] = []
         self._poll = select.poll()
         self._poll.register(line, select.POLLIN)
-        # The line alone does not show that the launcher is gone: a process that it forked may hold its end open.
+        # The line alone does not show that the launcher is gone: a process that it forked may hold
+        # its end open.
         self._launcher = os.pidfd_open(os.getppid())
         self._poll.register(self._launcher, select.POLLIN)
 
@@ -115,14 +118,18 @@ class Crate:
                 self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
             case PowerOn(name, HostWiring() as host):
                 output = self._output(name)
-                self._fork(name, lambda segment: run_host_board(segment, host, self._attention, output.writer))
+                self._fork(
+                    name,
+                    lambda segment: run_host_board(segment, host, self._attention, output.writer),
+                )
             case PowerOn(name, HogWiring(entry)):
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
                 self._kill(name)
 
     def _preload(self, wanted: Preload) -> None:
-        """Load what boards share with the crate. Mistakes in the config are left for the Rack to report."""
+        """Load what boards share with the crate. Mistakes in the config are left for the Rack to
+        report."""
         sys.path[:] = wanted.path
         compiled.NEWS[:] = [lambda function: self._line.send(Compiling(function))]
         for reference in wanted.classes:
@@ -165,7 +172,9 @@ class Crate:
             end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
             needed = f"the rack needs {len(self._segment.layout.processes) + HOST_PROCESSES}"
             with suppress(OSError):
-                self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {refusal(error)}; {needed}"))
+                self._line.send(
+                    ForkFailed(end, f"board '{name}' cannot be forked: {refusal(error)}; {needed}")
+                )
             return
         if pid == 0:
             self._line.close()
@@ -196,7 +205,8 @@ class Crate:
             self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
 
     def _end_orphans(self) -> None:
-        """End whatever a host board has started, in any session: with its end it has become a child of the crate."""
+        """End whatever a host board has started, in any session: with its end it has become a child
+        of the crate."""
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
             orphans = children_of(os.getpid()) - {pid for _, pid in self._boards.values()}
@@ -207,7 +217,8 @@ class Crate:
                 os.waitpid(pid, os.WNOHANG)
 
     def _mark_lost(self, name: str) -> int:
-        """Mark a board as lost on the backplane, for the clock and the other boards; return the tick."""
+        """Mark a board as lost on the backplane, for the clock and the other boards; return the
+        tick."""
         assert self._segment is not None, "boards are forked after the segment is open"
         words = self._segment.words
         tick = words[System.TICK]
@@ -237,7 +248,8 @@ class Crate:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave(self) -> None:
-        """End after the Rack: boards notice that it is gone and end; those that take too long are killed."""
+        """End after the Rack: boards notice that it is gone and end; those that take too long are
+        killed."""
         self._poll.unregister(self._line)
         self._poll.unregister(self._launcher)
         for output in self._outputs.values():

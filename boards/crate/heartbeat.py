@@ -1,6 +1,8 @@
-"""The Rack's check for hanging processes: those that make no progress for much longer than their period.
+"""The Rack's check for hanging processes: those that make no progress for much longer than their
+period.
 
-In real time it checks the clock alone, since the clock's watchdog checks the tasks. In lockstep it checks all.
+In real time it checks the clock alone, since the clock's watchdog checks the tasks. In lockstep it
+checks all.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from rack.backplane.words import Block, Run, System
 HEARTBEATS_MISSED = 4
 """Cycles without progress that count as hanging: three gave one false alarm in 24,000 at 400 Hz."""
 LEAST_S = 2.0
-"""Smallest bound: the launcher is an ordinary process among real-time ones and may itself be late."""
+"""Smallest bound: the launcher is an ordinary process among real-time ones and may itself be
+late."""
 LOCKSTEP_S = 60.0
 """Bound in lockstep, where time stands still during planning."""
 
@@ -28,7 +31,10 @@ class Heartbeat:
         watched = segment.layout.tasks if self._words[System.LOCKSTEP] else ()
         self._blocks = {task.name: segment.block(task.name) for task in watched}
         bound_s = max(LEAST_S, HEARTBEATS_MISSED * self._words[System.PERIOD_NS] * 1e-9)
-        self._bounds = {**dict.fromkeys(self._blocks, LOCKSTEP_S), CLOCK: LOCKSTEP_S if watched else bound_s}
+        self._bounds = {
+            **dict.fromkeys(self._blocks, LOCKSTEP_S),
+            CLOCK: LOCKSTEP_S if watched else bound_s,
+        }
         self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
         self._reported: set[str] = set()
         self._waited_at = -1
@@ -39,9 +45,13 @@ class Heartbeat:
             return []
         now = time.monotonic()
         for name, block in self._blocks.items():
-            # An idle task, whose newest release is done, is alive; a lost one is already known. One may wait for as
-            # long as another rack wants.
-            idle = block[Block.DONE] == block[Block.RELEASED] or block[Block.LOST] or block[Block.AWAITS]
+            # An idle task, whose newest release is done, is alive; a lost one is already known. One
+            # may wait for as long as another rack wants.
+            idle = (
+                block[Block.DONE] == block[Block.RELEASED]
+                or block[Block.LOST]
+                or block[Block.AWAITS]
+            )
             if block[Block.DONE] != self._seen[name][0] or idle:
                 self._seen[name] = block[Block.DONE], now
                 self._reported.discard(name)
@@ -49,13 +59,18 @@ class Heartbeat:
         if self._words[System.TICK] != self._seen[CLOCK][0] or self._words[System.HELD] or awaits:
             self._seen[CLOCK] = self._words[System.TICK], now
             self._reported.discard(CLOCK)
-        late = [n for n, (_, at) in self._seen.items() if now - at > self._bounds[n] and n not in self._reported]
+        late = [
+            n
+            for n, (_, at) in self._seen.items()
+            if now - at > self._bounds[n] and n not in self._reported
+        ]
         found = [name for name in late if name != CLOCK or self._clock_is_stuck()]
         self._reported.update(found)
         return found
 
     def _clock_is_stuck(self) -> bool:
-        """Say whether a silent clock is stopped, dead or waiting; one that is runnable is merely starved."""
+        """Say whether a silent clock is stopped, dead or waiting; one that is runnable is merely
+        starved."""
         state = state_of(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]
         # Must be seen twice: after a pause of the whole machine the clock is about to be woken.

@@ -1,6 +1,8 @@
-"""The host boards of a run: started with it, restarted by the rack's policy, in real time never waited for.
+"""The host boards of a run: started with it, restarted by the rack's policy, in real time never
+waited for.
 
-Their loss demands nothing of the arm. The clock admits their return, as it does that of other boards.
+Their loss demands nothing of the arm. The clock admits their return, as it does that of other
+boards.
 """
 
 from __future__ import annotations
@@ -44,11 +46,14 @@ class HostBoards:
         return name in self._wirings
 
     def lose(self, end: Ended, why: str) -> bool:
-        """Record the end of a host board, and restart it unless its program is done; return False if it is given up."""
+        """Record the end of a host board, and restart it unless its program is done; return False
+        if it is given up."""
         block = self._segment.block(end.name)
         self._stopped.discard(end.name)
         if block[Block.STATE] == TaskState.ENDED:
-            self._journal.add("done", end.name, f"host board '{end.name}': its program is done", "done")
+            self._journal.add(
+                "done", end.name, f"host board '{end.name}': its program is done", "done"
+            )
             return True
         text = f"host board '{end.name}' ended: {why}"
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)

@@ -1,8 +1,9 @@
 """The line between the Rack and its crate: the Rack's end.
 
-The crate starts with this object and imports what boards need while its owner still reads the config, so this module
-imports next to nothing. The line is a `multiprocessing.connection` on a socket pair. Both ends are processes of this
-program, one started by the other. Nothing else can reach the sockets, so pickles are safe.
+The crate starts with this object and imports what boards need while its owner still reads the
+config, so this module imports next to nothing. The line is a `multiprocessing.connection` on a
+socket pair. Both ends are processes of this program, one started by the other. Nothing else can
+reach the sockets, so pickles are safe.
 """
 
 from __future__ import annotations
@@ -20,20 +21,25 @@ from rack.boards.crate.output import lines_of
 from rack.boards.errors import LaunchError
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""No threads in numerical libraries: the crate must have none when it forks, and a board has only its own core."""
+"""No threads in numerical libraries: the crate must have none when it forks, and a board has only
+its own core."""
 TUNABLES = "GLIBC_TUNABLES"
 SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
-"""The C library has two versions of `sin`, `exp` and others, with and without fused multiply-add. It selects one by
-processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's `math` call them. Boards use the version
-without, which runs on every processor. The choice is made at process start, so it must be in the environment."""
+"""The C library has two versions of `sin`, `exp` and others, with and without fused multiply-add.
+It selects one by processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's
+`math` call them. Boards use the version without, which runs on every processor. The choice is made
+at process start, so it must be in the environment."""
 NO_WINDOWS = {"MUJOCO_GL": "disable"}
-"""Neither boards nor Rack draw: without this, importing MuJoCo also starts a process that looks for OpenGL."""
+"""Neither boards nor Rack draw: without this, importing MuJoCo also starts a process that looks for
+OpenGL."""
 
 
 class CrateLine:
-    """A running crate: the line to it, the eventfd `attention` to which its boards write, and their output.
+    """A running crate: the line to it, the eventfd `attention` to which its boards write, and their
+    output.
 
-    A `Rack` closes the line that it is given. As a context it is closed, too, if no Rack came to that.
+    A `Rack` closes the line that it is given. As a context it is closed, too, if no Rack came to
+    that.
     """
 
     def __init__(self) -> None:
@@ -44,7 +50,14 @@ class CrateLine:
         self._read_to = 0
         self._process = subprocess.Popen(
             # Unbuffered: a board ends by `os._exit`, which flushes no buffer.
-            [sys.executable, "-u", "-m", "rack.boards.crate", str(theirs.fileno()), str(self.attention)],
+            [
+                sys.executable,
+                "-u",
+                "-m",
+                "rack.boards.crate",
+                str(theirs.fileno()),
+                str(self.attention),
+            ],
             pass_fds=(theirs.fileno(), self.attention),
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
@@ -57,7 +70,12 @@ class CrateLine:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self.close(0)
 
     @property
@@ -89,7 +107,8 @@ class CrateLine:
         return received(self.line)
 
     def close(self, timeout_s: float) -> None:
-        """Close the line, which makes the crate end its boards and itself; kill it after the timeout."""
+        """Close the line, which makes the crate end its boards and itself; kill it after the
+        timeout."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -104,9 +123,16 @@ class CrateLine:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of the crate and its boards: the Rack's own, with settings that make runs repeatable."""
+    """Return the environment of the crate and its boards: the Rack's own, with settings that make
+    runs repeatable."""
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
-    return {**os.environ, **SINGLE_THREADED, **NO_WINDOWS, TUNABLES: tunables, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return {
+        **os.environ,
+        **SINGLE_THREADED,
+        **NO_WINDOWS,
+        TUNABLES: tunables,
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
 
 
 def received(line: Connection) -> object:

@@ -1,7 +1,7 @@
 """Other racks on this machine, and the cores occupied by their real-time boards.
 
-Two real-time boards on one core starve each other, and each rack sees only its own lateness. Racks in lockstep and
-tasks at ordinary priority occupy no core: they can wait.
+Two real-time boards on one core starve each other, and each rack sees only its own lateness. Racks
+in lockstep and tasks at ordinary priority occupy no core: they can wait.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from rack.boards.config.schema import RackConfig
 
 @dataclass(frozen=True)
 class Holder:
-    """A rack that occupies a core, and its tasks there. Of another user's `launcher` is one of the boards."""
+    """A rack that occupies a core, and its tasks there. Of another user's `launcher` is one of the
+    boards."""
 
     rack: str
     launcher: int
@@ -31,7 +32,10 @@ class Holder:
 
     def __str__(self) -> str:
         """Return the holder as text."""
-        return f"rack '{self.rack}' (process {self.launcher}) runs {', '.join(self.tasks)} on it at real-time priority"
+        return (
+            f"rack '{self.rack}' (process {self.launcher}) runs {', '.join(self.tasks)} on it at"
+            " real-time priority"
+        )
 
 
 def holders(own: str) -> dict[int, Holder]:
@@ -74,7 +78,8 @@ def _held(segment: Segment) -> dict[int, list[str]]:
     for task in segment.layout.tasks:
         if segment.block(task.name)[Block.PRIORITY]:
             held.setdefault(task.core, []).append(task.name)
-    # Another version of this program may have created the segment, so its config is not validated here.
+    # Another version of this program may have created the segment, so its config is not validated
+    # here.
     clock = tomllib.loads(segment.config).get("clock", {})
     # If the boards were refused their priority, so was the clock.
     if held and clock.get("priority"):
@@ -83,23 +88,33 @@ def _held(segment: Segment) -> dict[int, list[str]]:
 
 
 def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Return the config with boards moved off occupied cores, unless it names their core, and a note on each move."""
+    """Return the config with boards moved off occupied cores, unless it names their core, and a
+    note on each move."""
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
     if not free or config.clock.mode == "lockstep":
         return config, []
     moved = {
         name: board
         for name, board in config.board.items()
-        if board.priority and "core" not in board.model_fields_set and obtained_core(board.core) in held
+        if board.priority
+        and "core" not in board.model_fields_set
+        and obtained_core(board.core) in held
     }
     boards = {name: board.model_copy(update={"core": free[0]}) for name, board in moved.items()}
-    notes = [f"{name} on core {free[0]}: {held[obtained_core(board.core)]}" for name, board in moved.items()]
+    notes = [
+        f"{name} on core {free[0]}: {held[obtained_core(board.core)]}"
+        for name, board in moved.items()
+    ]
     return config.model_copy(update={"board": {**config.board, **boards}}), notes
 
 
 def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
-    """Return a line for every core that another rack occupies and a real-time task of this config requests."""
-    tasks = [(CLOCK, config.clock.core, config.clock.priority), *((t.name, t.core, t.priority) for t in config.tasks())]
+    """Return a line for every core that another rack occupies and a real-time task of this config
+    requests."""
+    tasks = [
+        (CLOCK, config.clock.core, config.clock.priority),
+        *((t.name, t.core, t.priority) for t in config.tasks()),
+    ]
     wanted: dict[int, list[str]] = {}
     for task, core, priority in tasks:
         if priority:

@@ -1,4 +1,5 @@
-"""What host boards print: lines of bounded length, of each board as many as a run keeps; the others are counted."""
+"""What host boards print: lines of bounded length, of each board as many as a run keeps; the others
+are counted."""
 
 from __future__ import annotations
 
@@ -15,12 +16,14 @@ _LINE = re.compile(rb"[^\n]{%d}\n?|[^\n]*\n" % LONGEST_LINE)
 
 
 def lines_of(data: bytes) -> list[bytes]:
-    """Return the lines that are whole or cut, with their ends; the rest is a line that has not ended."""
+    """Return the lines that are whole or cut, with their ends; the rest is a line that has not
+    ended."""
     return _LINE.findall(data)
 
 
 class HostOutput:
-    """The pipe into which all processes of one host board print. The crate empties it to its own stdout."""
+    """The pipe into which all processes of one host board print. The crate empties it to its own
+    stdout."""
 
     def __init__(self, board: str) -> None:
         self._board = board
@@ -31,7 +34,8 @@ class HostOutput:
         os.set_blocking(self.reader, False)
 
     def pass_on(self, is_over: bool = False) -> None:
-        """Pass on what has come; say what was dropped each time that it has doubled, and when the board `is_over`."""
+        """Pass on what has come; say what was dropped each time that it has doubled, and when the
+        board `is_over`."""
         with suppress(BlockingIOError):
             self._rest += os.read(self.reader, MOST_READ)
         if is_over and self._rest[-1:] not in b"\n":
@@ -45,5 +49,8 @@ class HostOutput:
         if self._lines >= self._next or (is_over and self._lines > MOST_LINES):
             self._next = 2 * self._lines
             dropped = self._lines - MOST_LINES
-            text = f"host board '{self._board}': {dropped} lines dropped so far; a run keeps the first {MOST_LINES}\n"
+            text = (
+                f"host board '{self._board}': {dropped} lines dropped so far; a run keeps the first"
+                f" {MOST_LINES}\n"
+            )
             os.write(1, text.encode())

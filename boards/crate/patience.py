@@ -1,4 +1,5 @@
-"""Waits, with a line to the user when they take long: during a launch, and in lockstep for another rack."""
+"""Waits, with a line to the user when they take long: during a launch, and in lockstep for another
+rack."""
 
 from __future__ import annotations
 
@@ -13,9 +14,11 @@ from rack.boards.events import Journal
 from rack.boards.lan.awaited import awaited
 
 COMPILE_S = 300.0
-"""Time limit of the compilation of one function: thirty times what the longest takes, for a machine under load."""
+"""Time limit of the compilation of one function: thirty times what the longest takes, for a machine
+under load."""
 PATIENCE_S = 2.0
-"""Time after which a launch reports what it waits for; it does so again each time the wait has doubled."""
+"""Time after which a launch reports what it waits for; it does so again each time the wait has
+doubled."""
 
 
 class Patience:
@@ -54,7 +57,8 @@ class Patience:
 
 
 class RackAwaited:
-    """Reports for which other rack an adapter waits in lockstep, which may take as long as it wants."""
+    """Reports for which other rack an adapter waits in lockstep, which may take as long as it
+    wants."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment
@@ -73,7 +77,8 @@ class RackAwaited:
 
 
 def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
-    """Wait until the crate has preloaded the levels and opened the segment; `limit_s` is for each class.
+    """Wait until the crate has preloaded the levels and opened the segment; `limit_s` is for each
+    class.
 
     Raises `LaunchError` if a class cannot be preloaded, and when the time limit is exceeded.
     """
@@ -96,4 +101,6 @@ def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
                 raise LaunchError(f"'{kind}' cannot be preloaded: {why}")
             case None:
                 raise LaunchError("\n".join(crate.printed()) or "the crate has ended")
-    raise LaunchError("\n".join(crate.printed()) or f"{doing}: not done within {patience.limit_s:g} s")
+    raise LaunchError(
+        "\n".join(crate.printed()) or f"{doing}: not done within {patience.limit_s:g} s"
+    )

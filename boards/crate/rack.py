@@ -51,7 +51,8 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import Entries
 
 LAUNCH_S = 60.0
-"""Time limit of each step of the launch: to preload one class, which may compile code, or to ready all boards."""
+"""Time limit of each step of the launch: to preload one class, which may compile code, or to ready
+all boards."""
 UP = (TaskState.READY, TaskState.RUNNING)
 TO_SHARE = "stop that rack, choose other cores, or use --share"
 LEAVE_S = 2.0
@@ -61,11 +62,13 @@ STOP_S = 0.8
 
 
 class Rack:
-    """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
+    """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack:
+    rack.run(seconds=10)`.
 
-    `on_event` is called with every `Event`, in the caller's process. Without `share`, a launch is refused if another
-    rack's real-time boards occupy a core that this one requests. A `crate` that was started earlier saves time. With
-    `entries`, by bus adapter and port, host boards are not started: what a recorded run wrote there enters instead.
+    `on_event` is called with every `Event`, in the caller's process. Without `share`, a launch is
+    refused if another rack's real-time boards occupy a core that this one requests. A `crate` that
+    was started earlier saves time. With `entries`, by bus adapter and port, host boards are not
+    started: what a recorded run wrote there enters instead.
     """
 
     def __init__(
@@ -105,14 +108,19 @@ class Rack:
         self.launch()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self.close()
 
     def launch(self) -> None:
         """Power on every board except the clock, and wait until all have passed their self-tests.
 
-        Raises `ConfigError` for an invalid config or occupied cores, `SegmentError` if the name is in use, and
-        `LaunchError` if a board fails; in each case nothing is left behind.
+        Raises `ConfigError` for an invalid config or occupied cores, `SegmentError` if the name is
+        in use, and `LaunchError` if a board fails; in each case nothing is left behind.
         """
         try:
             self._power_on()
@@ -137,9 +145,12 @@ class Rack:
         self._set_words()
         semaphores.create(plan.layout)
         crate.send(Open(self.config.name, plan.crate_priority))
-        self._journal.add("launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes")
+        self._journal.add(
+            "launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes"
+        )
         await_opened(crate, self._journal, LAUNCH_S)
-        # The crate has them open and every board inherits them. Without names nothing can be left behind.
+        # The crate has them open and every board inherits them. Without names nothing can be left
+        # behind.
         semaphores.unlink(plan.layout, kept=[host.board for host in plan.hosts if host.is_external])
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
@@ -168,7 +179,8 @@ class Rack:
             patience.report(f"boards {', '.join(absent)} are starting")
 
     def _inject(self) -> None:
-        """Fill the tables with the config's faults and commands; start the faults that are processes."""
+        """Fill the tables with the config's faults and commands; start the faults that are
+        processes."""
         table = FaultTable(self.segment)
         for injection in self._plan.faults:
             entry = table.add(injection)
@@ -179,13 +191,16 @@ class Rack:
             desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
-        """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until the task ends."""
+        """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until
+        the task ends."""
         clock = self._plan.clock(seconds)
         self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
-        self._hosts = HostBoards(self.segment, self._plan.hosts, supervision, self._line, self._journal)
+        self._hosts = HostBoards(
+            self.segment, self._plan.hosts, supervision, self._line, self._journal
+        )
         self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
         self._awaited = RackAwaited(self.segment, self._journal)
@@ -209,7 +224,8 @@ class Rack:
         return self.outcome
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for `timeout_s` or until the run is over; return False when it is over."""
+        """Supervise the boards for `timeout_s` or until the run is over; return False when it is
+        over."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
@@ -218,7 +234,9 @@ class Rack:
             for rung in self._alarms.drain():
                 self._act_on(rung)
             for board in self._heartbeat.hanging():
-                self._journal.add("detection", "rack", f"'{board}' is not responding", "hang", subject=board)
+                self._journal.add(
+                    "detection", "rack", f"'{board}' is not responding", "hang", subject=board
+                )
                 self._recovery.end_hanging(board)
             self._awaited.look()
             self._recovery.advance()
@@ -248,11 +266,15 @@ class Rack:
             self._stop_by = time.monotonic() + STOP_S
             self._journal.add("stop", "", self._why_stopped)
 
-    def command(self, level: str, what: str, tick: int | None = None, **goal: object) -> RequestEntry:
-        """Issue an operator command to a level, at `tick` or at once; return its entry in the operator table.
+    def command(
+        self, level: str, what: str, tick: int | None = None, **goal: object
+    ) -> RequestEntry:
+        """Issue an operator command to a level, at `tick` or at once; return its entry in the
+        operator table.
 
-        `what` and `goal` are as in a `[[command]]` table: `rack.command("servo", "setpoint", joints=(...))`. Raises
-        `ConfigError` with every mistake, `OperatorTableError` if too many are pending.
+        `what` and `goal` are as in a `[[command]]` table: `rack.command("servo", "setpoint",
+        joints=(...))`. Raises `ConfigError` with every mistake, `OperatorTableError` if too many
+        are pending.
         """
         wanted = asked({"level": level, "what": what, "tick": tick, **goal})
         return OperatorTable(self.segment).add(request(wanted, self.config, self._plan.layout))
@@ -302,7 +324,9 @@ class Rack:
         """Record the end of a board, and restart it or give it up."""
         if hasattr(self, "_hosts") and end.name in self._hosts:
             if not self._hosts.lose(end, _status(end.status)):
-                self._faults.append(f"host board '{end.name}' ended: {_status(end.status)}; no restarts left")
+                self._faults.append(
+                    f"host board '{end.name}' ended: {_status(end.status)}; no restarts left"
+                )
             return
         text = f"board '{end.name}' ended: {_status(end.status)}"
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
@@ -313,7 +337,14 @@ class Rack:
         if is_final:
             # It has printed the reason.
             self._record_printed()
-            text = next((e.text for e in reversed(self.events) if e.text.startswith(f"board '{end.name}': ")), text)
+            text = next(
+                (
+                    e.text
+                    for e in reversed(self.events)
+                    if e.text.startswith(f"board '{end.name}': ")
+                ),
+                text,
+            )
         restart = self._recovery.lose(end.name, end.tick, is_final)
         if restart is None:
             self._is_beyond_help = end.name == CLOCK
@@ -379,7 +410,9 @@ class Rack:
 
     def _has_lost(self) -> bool:
         """Say whether a board is lost, and so may not end by itself."""
-        return hasattr(self, "segment") and any(self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks)
+        return hasattr(self, "segment") and any(
+            self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks
+        )
 
     def _end_boards(self) -> None:
         """Declare the run over, to the clock and the boards."""

@@ -28,7 +28,8 @@ class Restart(NamedTuple):
 
 
 class Supervision:
-    """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have the same outcome."""
+    """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have
+    the same outcome."""
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self._config = config
@@ -38,10 +39,13 @@ class Supervision:
         for task in layout.tasks:
             below = _all_below(config, task.board)
             needed = {other.name for other in layout.tasks if other.board in below}
-            self._needs[task.name] = {CLOCK, *needed} | ({task.board} if task.role == "planner" else set())
+            self._needs[task.name] = {CLOCK, *needed} | (
+                {task.board} if task.role == "planner" else set()
+            )
 
     def admit(self, task: str, tick: int) -> Restart | None:
-        """Count one more restart of a task, lost at `tick`; return None if no more are permitted."""
+        """Count one more restart of a task, lost at `tick`; return None if no more are
+        permitted."""
         most, within_s = self._policy(task)
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
@@ -51,12 +55,14 @@ class Supervision:
         return Restart(len(recent) + 1, most, within_s)
 
     def in_order(self, tasks: list[str]) -> list[str]:
-        """Return the tasks in order of restart: the clock, then lower levels before higher, executor before planner."""
+        """Return the tasks in order of restart: the clock, then lower levels before higher,
+        executor before planner."""
         # What a task needs, needs less than it does.
         return sorted(tasks, key=lambda task: len(self._needs[task]))
 
     def must_wait(self, task: str, absent: list[str]) -> bool:
-        """Say whether a task on which this one depends is still absent: any below it, or a planner's executor."""
+        """Say whether a task on which this one depends is still absent: any below it, or a
+        planner's executor."""
         return not self._needs[task].isdisjoint(absent)
 
     def _policy(self, task: str) -> tuple[int, float]:
@@ -79,7 +85,8 @@ def _all_below(config: RackConfig, board: str) -> set[str]:
 class Recovery:
     """The lost boards of a run, from loss to return.
 
-    A board is powered on again once everything on which it depends is present; it rejoins on the clock's grid.
+    A board is powered on again once everything on which it depends is present; it rejoins on the
+    clock's grid.
     """
 
     def __init__(
@@ -97,7 +104,8 @@ class Recovery:
         self._starting: list[str] = []
 
     def lose(self, board: str, tick: int, is_final: bool = False) -> Restart | None:
-        """Schedule the restart of a board whose process has ended; return None if it is given up, as one `is_final`."""
+        """Schedule the restart of a board whose process has ended; return None if it is given up,
+        as one `is_final`."""
         self._starting = [name for name in self._starting if name != board]
         restart = None if is_final else self._supervision.admit(board, tick)
         if restart is not None:
@@ -108,7 +116,8 @@ class Recovery:
         return restart
 
     def end_hanging(self, board: str) -> None:
-        """Kill a hanging board, which is then lost like any other; one that is being restarted is left alone."""
+        """Kill a hanging board, which is then lost like any other; one that is being restarted is
+        left alone."""
         if board not in (*self._waiting, *self._starting):
             self._crate.ask(PowerOff(board))
 

@@ -1,6 +1,7 @@
 """Messages between the Rack and its crate: requests, and the crate's answers.
 
-This module imports nothing heavy: the first request is sent before the libraries that read a config are loaded.
+This module imports nothing heavy: the first request is sent before the libraries that read a config
+are loaded.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ class CellConfig:
 
 @dataclass(frozen=True)
 class Preload:
-    """Import and preload these classes of levels, as "package.module:Class", with `path` as import path.
+    """Import and preload these classes of levels, as "package.module:Class", with `path` as import
+    path.
 
-    With a cell, compile its cell, too. Boards forked later share all of it. What is loaded already costs nothing.
+    With a cell, compile its cell, too. Boards forked later share all of it. What is loaded already
+    costs nothing.
     """
 
     classes: tuple[str, ...]
@@ -36,9 +39,11 @@ class Preload:
 
 @dataclass(frozen=True)
 class Open:
-    """Attach to a rack's segment and open its semaphores; take this SCHED_FIFO priority, if permitted.
+    """Attach to a rack's segment and open its semaphores; take this SCHED_FIFO priority, if
+    permitted.
 
-    The crate must notice deaths without waiting for planners to finish; no board waits for the crate.
+    The crate must notice deaths without waiting for planners to finish; no board waits for the
+    crate.
     """
 
     rack: str

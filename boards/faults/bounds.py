@@ -1,11 +1,13 @@
-"""Detection bounds: the ticks within which a fault must be detected, counted from the tick at which it first shows.
+"""Detection bounds: the ticks within which a fault must be detected, counted from the tick at which
+it first shows.
 
-Most faults show as soon as they act. One of the arm may act at first by less than friction, a contact or a creeping
-joint hides: no detector can tell it from a sound arm, so until then no bound runs.
+Most faults show as soon as they act. One of the arm may act at first by less than friction, a
+contact or a creeping joint hides: no detector can tell it from a sound arm, so until then no bound
+runs.
 
-A bound is a sum of terms. Each term has a text and computes its ticks: one source for help, judgement and tests.
-A cycle is that of the affected task; a planner's is its time slice. A message is delivered at its reader's first read
-after it becomes visible.
+A bound is a sum of terms. Each term has a text and computes its ticks: one source for help,
+judgement and tests. A cycle is that of the affected task; a planner's is its time slice. A message
+is delivered at its reader's first read after it becomes visible.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from rack.backplane.mailbox.protocols import LOCK_WAIT_S
 RACK_NS = 5_000_000
 """The Rack learns of a process's death within this time, from the kernel, by pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may first take to free the memory of a killed process: up to 0.5 ms per megabyte on a busy
-machine, and a planner with its libraries has 80 MB."""
+"""Real time that the kernel may first take to free the memory of a killed process: up to 0.5 ms per
+megabyte on a busy machine, and a planner with its libraries has 80 MB."""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
@@ -36,13 +38,18 @@ def cycle_ticks(layout: Layout, board: str) -> int:
 
 
 def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the ticks from the last message in any of these mailboxes until its slowest reader has read it."""
+    """Return the ticks from the last message in any of these mailboxes until its slowest reader has
+    read it."""
     boxes = [layout.mailbox(name) for name in mailboxes]
-    return max((box.delay + between_reads(layout, box, reader) for box in boxes for reader in box.readers), default=0)
+    return max(
+        (box.delay + between_reads(layout, box, reader) for box in boxes for reader in box.readers),
+        default=0,
+    )
 
 
 def struck_mailboxes(layout: Layout, at: int, board: str) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes that a fault of a task concerns: that with index `at`; -1: all that it writes."""
+    """Return the mailboxes that a fault of a task concerns: that with index `at`; -1: all that it
+    writes."""
     chosen = layout.mailboxes if at < 0 else layout.mailboxes[at : at + 1]
     return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
 
@@ -54,7 +61,8 @@ def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
 
 @dataclass(frozen=True)
 class BoundCase:
-    """The facts about a fault that decide its bound. `reader` is the task that detects it; None: the first to do so."""
+    """The facts about a fault that decide its bound. `reader` is the task that detects it; None:
+    the first to do so."""
 
     layout: Layout
     injection: Injection
@@ -68,7 +76,8 @@ class BoundCase:
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """The affected mailboxes that the reader reads; without a `reader`, those that any task reads."""
+        """The affected mailboxes that the reader reads; without a `reader`, those that any task
+        reads."""
         struck = struck_mailboxes(self.layout, self.injection.mailbox, self.board)
         reader = self.reader
         return tuple(m for m in struck if (reader in m.readers if reader else m.readers))
@@ -90,7 +99,8 @@ class BoundCase:
 
     @property
     def period(self) -> int:
-        """Ticks from one release of the task to the next; a planner has several in its time slice."""
+        """Ticks from one release of the task to the next; a planner has several in its time
+        slice."""
         return self.layout.task(self.board).every
 
     @property
@@ -105,11 +115,17 @@ class BoundCase:
 
     @property
     def read(self) -> int:
-        """Longest time between reads, ticks: by the reader, or by the fastest reader of each mailbox."""
+        """Longest time between reads, ticks: by the reader, or by the fastest reader of each
+        mailbox."""
         between = partial(between_reads, self.layout)
         if self.reader:
-            return max((between(m, self.reader) for m in self.mailboxes), default=cycle_ticks(self.layout, self.reader))
-        return max((min(between(m, reader) for reader in m.readers) for m in self.mailboxes), default=0)
+            return max(
+                (between(m, self.reader) for m in self.mailboxes),
+                default=cycle_ticks(self.layout, self.reader),
+            )
+        return max(
+            (min(between(m, reader) for reader in m.readers) for m in self.mailboxes), default=0
+        )
 
 
 @dataclass(frozen=True)
@@ -131,13 +147,15 @@ class Bound:
 
 
 def cycles(count: int) -> Bound:
-    """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host board has none."""
+    """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host
+    board has none."""
     text = _counted(count, "cycle") if count else "the same cycle"
     return Bound(text, lambda case: None if case.is_host else count * case.cycle)
 
 
 def cycles_and_time(count: int, time_ns: int) -> Bound:
-    """Return a bound of `count` cycles of the task, but at least a time, in which a controller's gains take effect."""
+    """Return a bound of `count` cycles of the task, but at least a time, in which a controller's
+    gains take effect."""
 
     def ticks(case: BoundCase) -> int:
         return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))
@@ -156,8 +174,11 @@ def writes(count: int) -> Bound:
 
 
 def missing_writes(count: int) -> Bound:
-    """Return a bound of `count` periods without a message; none for a planner, which writes at no fixed period."""
-    return Bound(_counted(count, "write"), lambda case: None if case.is_planner else count * case.write)
+    """Return a bound of `count` periods without a message; none for a planner, which writes at no
+    fixed period."""
+    return Bound(
+        _counted(count, "write"), lambda case: None if case.is_planner else count * case.write
+    )
 
 
 def delayed(parameter: str) -> Bound:
@@ -168,20 +189,28 @@ def delayed(parameter: str) -> Bound:
 def skipped(parameter: str) -> Bound:
     """Return the bound of a skip of as many ticks as the parameter says.
 
-    The fastest boards find it in their next cycle; a release that was skipped comes in the first tick that is not.
+    The fastest boards find it in their next cycle; a release that was skipped comes in the first
+    tick that is not.
     """
 
     return Bound(
         "the next cycle of the fastest boards",
-        lambda case: max(int(case.parameters[parameter]), min(task.every for task in case.layout.tasks) - 1),
+        lambda case: max(
+            int(case.parameters[parameter]), min(task.every for task in case.layout.tasks) - 1
+        ),
     )
 
 
 def by_rack_or(count: int) -> Bound:
-    """Return the bound of a death: seen by the Rack, or by a reader whose message is then `count` cycles old."""
+    """Return the bound of a death: seen by the Rack, or by a reader whose message is then `count`
+    cycles old."""
 
     def ticks(case: BoundCase) -> int:
-        return ceil(RACK_NS / case.layout.clock_ns) if case.reader is None else count * case.cycle + case.read
+        return (
+            ceil(RACK_NS / case.layout.clock_ns)
+            if case.reader is None
+            else count * case.cycle + case.read
+        )
 
     return Bound(f"{RACK_NS * 1e-6:g} ms (Rack), {count} cycles + 1 read (reader)", ticks)
 
@@ -190,7 +219,9 @@ READ = Bound("1 read", lambda case: case.read)
 DELIVERY = Bound("1 delivery", lambda case: case.delivery)
 SLICE = Bound("1 time slice", lambda case: case.cycle)
 RELEASE = Bound("1 cycle", lambda case: case.period)
-LOCK_WAIT = Bound("the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns))
+LOCK_WAIT = Bound(
+    "the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns)
+)
 BY_SIZE = Bound("depends on size", lambda case: None)
 NOT_ARMED = Bound("the launch fails", lambda case: None)
 

@@ -1,6 +1,7 @@
 """Faults as directed by the clock's board: each waits, becomes active and ends, at ticks.
 
-The board itself acts the faults that no task can: signals to processes, forged messages, faults of its own ticks.
+The board itself acts the faults that no task can: signals to processes, forged messages, faults of
+its own ticks.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ LEAST_LATE = 0.6
 class StruckRack:
     """The rack as seen by the steps of the clock's board.
 
-    In lockstep a process is struck between two cycles, once it has finished its release, and the run continues once its
-    end is known. So a run with faults is repeatable.
+    In lockstep a process is struck between two cycles, once it has finished its release, and the
+    run continues once its end is known. So a run with faults is repeatable.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
@@ -48,13 +49,17 @@ class StruckRack:
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
         """Return the task, or host board, that a fault strikes; None: the clock."""
-        return next((task for task in self.driver.processes if task.index == entry[Entry.TASK]), None)
+        return next(
+            (task for task in self.driver.processes if task.index == entry[Entry.TASK]), None
+        )
 
-    def send(self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals) -> bool:
+    def send(
+        self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals
+    ) -> bool:
         """Send a signal to a task's process; return False if there is no such process."""
         pid = task.block[Block.PID]
-        # A host board whose program is done, or given up, or which a replay does without, has no process; the crate may
-        # not have seen yet that one has ended.
+        # A host board whose program is done, or given up, or which a replay does without, has no
+        # process; the crate may not have seen yet that one has ended.
         if task.lost_tick >= 0 or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
             return False
         entry.acted(tick)
@@ -92,11 +97,14 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         entry.acted(tick)
         os.kill(os.getpid(), signal.SIGKILL)
         return
-    # The crate marks the task lost, then counts the loss. The system controller acts on the count: wait for both.
+    # The crate marks the task lost, then counts the loss. The system controller acts on the count:
+    # wait for both.
     words = rack.segment.words
     before = words[System.LOSSES]
     if rack.send(entry, tick, task, signal.SIGKILL):
-        rack.driver.await_state(task, lambda: task.lost_tick >= 0 and words[System.LOSSES] != before)
+        rack.driver.await_state(
+            task, lambda: task.lost_tick >= 0 and words[System.LOSSES] != before
+        )
 
 
 def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
@@ -162,11 +170,13 @@ def _step(entry: FaultEntry) -> ClockStep:
 
 
 class FaultStage:
-    """Begins and ends faults at ticks, before any task of the tick is released; sees messages flow again after them.
+    """Begins and ends faults at ticks, before any task of the tick is released; sees messages flow
+    again after them.
 
-    In real time a fault with a phase strikes within its tick, after the releases. There is nothing to do in a tick if
-    no fault is `open` (waiting or active), none but the first `injected` ones have come, and no messages are `awaited`:
-    by mailbox, as an index, the tick from which one must be.
+    In real time a fault with a phase strikes within its tick, after the releases. There is nothing
+    to do in a tick if no fault is `open` (waiting or active), none but the first `injected` ones
+    have come, and no messages are `awaited`: by mailbox, as an index, the tick from which one must
+    be.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
@@ -175,7 +185,9 @@ class FaultStage:
         self._rack = StruckRack(segment, driver)
         self._table = FaultTable(segment)
         self._alarms = driver.alarms
-        self._observer = cache(lambda box: open_observer(segment, segment.layout.mailboxes[box].name))
+        self._observer = cache(
+            lambda box: open_observer(segment, segment.layout.mailboxes[box].name)
+        )
         self.injected = 0
         self.awaited: dict[int, int] = {}
         for entry in self._table.staged((Stage.OVER,)):
@@ -188,8 +200,16 @@ class FaultStage:
         """Begin the faults due at `tick`, and end those that are over."""
         self.injected = self._words[System.INJECTED]
         self.open = self._table.staged(OPEN)
-        over = [entry for entry in self.open if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)]
-        due = [entry for entry in self.open if entry.stage == Stage.WAITING and self._is_due(entry, tick)]
+        over = [
+            entry
+            for entry in self.open
+            if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)
+        ]
+        due = [
+            entry
+            for entry in self.open
+            if entry.stage == Stage.WAITING and self._is_due(entry, tick)
+        ]
         if over or due:
             # A running cycle finishes with the faults with which it began.
             self._rack.driver.settle()
@@ -200,7 +220,9 @@ class FaultStage:
         for entry in self.open:
             if entry.stage == Stage.ACTIVE:
                 _step(entry).during(self._rack, entry, tick)
-        acting = [KINDS[entry[Entry.KIND]].step for entry in self.open if entry.stage == Stage.ACTIVE]
+        acting = [
+            KINDS[entry[Entry.KIND]].step for entry in self.open if entry.stage == Stage.ACTIVE
+        ]
         self._rack.driver.is_flooded = Babble in acting
         for box, since in list(self.awaited.items()):
             observer = self._observer(box)
@@ -209,7 +231,8 @@ class FaultStage:
                 self._alarms.ring(tick, Alarm.FLOWS, box, tick - since, since)
 
     def within(self, tick: int) -> None:
-        """Let the faults with a phase in `tick` strike at their times; call it after the releases."""
+        """Let the faults with a phase in `tick` strike at their times; call it after the
+        releases."""
         if not self._phased:
             return
         clock = self._rack.clock
@@ -225,9 +248,11 @@ class FaultStage:
         return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
-        """Say whether a fault begins. Its condition is read in every tick, so that no message is missed.
+        """Say whether a fault begins. Its condition is read in every tick, so that no message is
+        missed.
 
-        It is read as of the tick before: the clock works ahead of the grid, where messages of `tick` may be missing.
+        It is read as of the tick before: the clock works ahead of the grid, where messages of
+        `tick` may be missing.
         """
         if entry[Entry.WHEN_BOX] < 0:
             return entry[Entry.FROM] <= tick

@@ -41,7 +41,9 @@ class FaultConfig(Table):
     __pydantic_extra__: dict[str, Parameter]
 
     kind: str = Field(description="kind of fault; 'rack inject --help' lists the kinds")
-    board: str = Field(description="task to strike: a board (servo), its planner (servo.planner), or clock")
+    board: str = Field(
+        description="task to strike: a board (servo), its planner (servo.planner), or clock"
+    )
     tick: int | None = Field(
         None,
         ge=0,
@@ -49,26 +51,46 @@ class FaultConfig(Table):
         description="first tick; give at most one of tick, at, when; default: the first of the run",
     )
     at: float | None = Field(
-        None, ge=0, le=1e9, allow_inf_nan=False, description="instead of tick: start in simulated time, s"
+        None,
+        ge=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="instead of tick: start in simulated time, s",
     )
     when: str | None = Field(
-        None, description='instead of tick: start once this holds, as in "elemental_move.status.verb == grasp"'
+        None,
+        description=(
+            'instead of tick: start once this holds, as in "elemental_move.status.verb == grasp"'
+        ),
     )
     lasts: Seconds | None = Field(
-        None, alias="for", description='duration in simulated time, as in "0.5s", "20ms" or 0.5 (s); or give cycles'
+        None,
+        alias="for",
+        description='duration in simulated time, as in "0.5s", "20ms" or 0.5 (s); or give cycles',
     )
-    cycles: int | None = Field(None, ge=1, le=10**6, description="instead of for: duration in cycles of the task")
+    cycles: int | None = Field(
+        None, ge=1, le=10**6, description="instead of for: duration in cycles of the task"
+    )
     phase: float = Field(
-        0.0, ge=0, lt=1, description="fraction of the first tick that passes before it strikes; real time only"
+        0.0,
+        ge=0,
+        lt=1,
+        description="fraction of the first tick that passes before it strikes; real time only",
     )
     mailbox: str | None = Field(
-        None, description="mailbox to affect; default: all that the task writes; for masquerade, the first"
+        None,
+        description=(
+            "mailbox to affect; default: all that the task writes; for masquerade, the first"
+        ),
     )
     seed: int | None = Field(
         None,
         ge=0,
         le=2**31 - 1,
-        description="seed of its random choices; default: derived from the rack's seed and the fault's place",
+        description=(
+            "seed of its random choices; default: derived from the rack's seed and the fault's"
+            " place"
+        ),
     )
 
     @property
@@ -78,10 +100,13 @@ class FaultConfig(Table):
 
 
 def condition(text: str, layout: Layout) -> tuple[int, int, int]:
-    """Return a condition as indices of mailbox and field, and a number. Raises `LookupError` with a reason."""
+    """Return a condition as indices of mailbox and field, and a number. Raises `LookupError` with a
+    reason."""
     found = CONDITION.fullmatch(text)
     if found is None:
-        raise LookupError('must be mailbox.field == value, as in "elemental_move.status.verb == grasp"')
+        raise LookupError(
+            'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"'
+        )
     mailboxes = {mailbox.name: at for at, mailbox in enumerate(layout.mailboxes)}
     if found[1] not in mailboxes:
         raise LookupError(f"no mailbox '{found[1]}'; mailboxes: {', '.join(mailboxes)}")
@@ -89,7 +114,8 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
     fields = _integers(mailbox)
     if found[2] not in fields:
         raise LookupError(
-            f"'{mailbox.name}' has no integer field '{found[2]}'; integer fields: {', '.join(fields) or 'none'}"
+            f"'{mailbox.name}' has no integer field '{found[2]}'; integer fields:"
+            f" {', '.join(fields) or 'none'}"
         )
     field = fields[found[2]]
     return mailboxes[mailbox.name], mailbox.fields.index(field), _value(found[3], field)
@@ -105,7 +131,11 @@ def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
 
 def _integers(mailbox: MailboxSpec) -> dict[str, FieldSpec]:
     """Return the fields that a condition may test: scalar integers."""
-    return {f.name: f for f in mailbox.fields if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"}
+    return {
+        f.name: f
+        for f in mailbox.fields
+        if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"
+    }
 
 
 def _value(text: str, field: FieldSpec) -> int:

@@ -54,7 +54,9 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     }
 
 
-def describe(entry: FaultEntry, layout: Layout, joints: Sequence[str], with_board: bool = True) -> str:
+def describe(
+    entry: FaultEntry, layout: Layout, joints: Sequence[str], with_board: bool = True
+) -> str:
     """Return a fault as one line: its kind, board and parameters."""
     kind = KINDS[entry[Entry.KIND]]
     target = f" of {board_of(entry, layout)}" if with_board else ""

@@ -1,6 +1,7 @@
 """Random faults: duration and strength, drawn so that the fault is detectable.
 
-A kind's record holds draws made by the functions here; a campaign calls them. The same generator draws the same fault.
+A kind's record holds draws made by the functions here; a campaign calls them. The same generator
+draws the same fault.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""A kind of fault is one record, `Kind`: help, checks, injection, judgement and campaigns use nothing else.
+"""A kind of fault is one record, `Kind`: help, checks, injection, judgement and campaigns use
+nothing else.
 
-The project's own kinds are in `rack.boards.faults.kinds`. A level's author adds one next to the level:
+The project's own kinds are in `rack.boards.faults.kinds`. A level's author adds one next to the
+level:
 
     KINDS.add(Kind(name="gauge-stuck", where="writer", ...))
 
@@ -24,9 +26,9 @@ from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, 
 from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
-"""The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a tick. `load`, `writer`,
-`lock`: the task itself. `core`: another process on the task's core. `arm`: the level that drives the arm. `start`: the
-board, as it starts."""
+"""The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a
+tick. `load`, `writer`, `lock`: the task itself. `core`: another process on the task's core. `arm`:
+the level that drives the arm. `start`: the board, as it starts."""
 Struck = Literal["executor", "planner", "clock", "host"]
 Died = Literal["died"]
 DIED: Died = "died"
@@ -39,8 +41,8 @@ RECOVERY_S = 0.25
 class Parameter:
     """A numeric parameter of a kind: unit, range and meaning. `default` None: it must be given.
 
-    Its name must not be a key of every fault: see `rack.boards.faults.config.FaultConfig`. A campaign
-    draws its value with `drawn`; None: it keeps the default.
+    Its name must not be a key of every fault: see `rack.boards.faults.config.FaultConfig`. A
+    campaign draws its value with `drawn`; None: it keeps the default.
     """
 
     name: str
@@ -59,12 +61,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Consequence:
-    """The effects of a kind besides its detection. Any alarm that these do not explain is a false alarm.
+    """The effects of a kind besides its detection. Any alarm that these do not explain is a false
+    alarm.
 
-    `own`: further alarms about the fault's task, mailboxes or joint. `arm`: alarms about any joint. `reactions`: codes
-    of events that must all follow. `recovery_s`: simulated time from the end of the fault, or its detection, within
-    which every reaction is undone. `ends_process`: the task's process ends; recovery includes its restart. `latches`:
-    the task may end with an error instead of recovering.
+    `own`: further alarms about the fault's task, mailboxes or joint. `arm`: alarms about any joint.
+    `reactions`: codes of events that must all follow. `recovery_s`: simulated time from the end of
+    the fault, or its detection, within which every reaction is undone. `ends_process`: the task's
+    process ends; recovery includes its restart. `latches`: the task may end with an error instead
+    of recovering.
     """
 
     own: tuple[Alarm, ...] = ()
@@ -79,15 +83,16 @@ class Consequence:
 class Kind:
     """One kind of fault.
 
-    `step` does the damage. Its type depends on `where`: a `ClockStep`, a subclass of `MessageStep`, a `LoadStep`, a
-    function run by a separate process (`core`), a step of `rack.levels.faults` (`arm`); `start` needs none. `tasks`
-    lists the roles that can be struck. `detected_as`: alarms, or "died", that count as its detection, within `bound`.
-    `lasts` draws its duration in a campaign, ticks.
+    `step` does the damage. Its type depends on `where`: a `ClockStep`, a subclass of `MessageStep`,
+    a `LoadStep`, a function run by a separate process (`core`), a step of `rack.levels.faults`
+    (`arm`); `start` needs none. `tasks` lists the roles that can be struck. `detected_as`: alarms,
+    or "died", that count as its detection, within `bound`. `lasts` draws its duration in a
+    campaign, ticks.
 
-    `realtime`: impossible in lockstep, where time waits for every task. `once`: it strikes once; other kinds last for a
-    time or until the run ends. `within_tick`: it can strike within a tick; other kinds begin with a cycle.
-    `visible_from`: the smallest value of its parameter `size` that must be detected. `not_queued`: why it does not
-    strike queues; empty if it does.
+    `realtime`: impossible in lockstep, where time waits for every task. `once`: it strikes once;
+    other kinds last for a time or until the run ends. `within_tick`: it can strike within a tick;
+    other kinds begin with a cycle. `visible_from`: the smallest value of its parameter `size` that
+    must be detected. `not_queued`: why it does not strike queues; empty if it does.
     """
 
     name: str
@@ -108,7 +113,8 @@ class Kind:
 
     @property
     def number(self) -> int:
-        """Number of the kind in the fault table, derived from its name so that all processes agree."""
+        """Number of the kind in the fault table, derived from its name so that all processes
+        agree."""
         return crc32(self.name.encode())
 
     @property
@@ -134,42 +140,61 @@ class Kind:
     @cached_property
     def codes(self) -> tuple[str, ...]:
         """The codes of events that count as its detection."""
-        return tuple(found if isinstance(found, str) else found.name.lower() for found in self.detected_as)
+        return tuple(
+            found if isinstance(found, str) else found.name.lower() for found in self.detected_as
+        )
 
     @property
     def size(self) -> Parameter | None:
         """The parameter that decides whether the fault is detectable; None if it always is."""
-        return None if self.visible_from is None else next(p for p in self.parameters if p.name == "size")
+        return (
+            None
+            if self.visible_from is None
+            else next(p for p in self.parameters if p.name == "size")
+        )
 
     def values(self, entry: FaultEntry) -> dict[str, float]:
         """Return the parameters that an entry of the fault table holds, by name."""
         return {p.name: value for p, value in zip(self.parameters, entry.parameters, strict=False)}
 
-    def bound_ticks(self, injection: Injection, layout: Layout, reader: str | None = None) -> int | None:
-        """Return the bound from the tick at which a fault first shows to its detection, ticks; None: no bound.
+    def bound_ticks(
+        self, injection: Injection, layout: Layout, reader: str | None = None
+    ) -> int | None:
+        """Return the bound from the tick at which a fault first shows to its detection, ticks;
+        None: no bound.
 
-        `reader` is the task that detects it; None: the first to do so, for a death the Rack. A mailbox without readers
-        has no bound.
+        `reader` is the task that detects it; None: the first to do so, for a death the Rack. A
+        mailbox without readers has no bound.
         """
-        given = {p.name: value for p, value in zip(self.parameters, injection.parameters, strict=False)}
+        given = {
+            p.name: value for p, value in zip(self.parameters, injection.parameters, strict=False)
+        }
         case = BoundCase(layout, injection, given, reader)
         needs_reader = self.takes_mailbox or (self.detected_as == (DIED,) and reader is not None)
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
     def recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
-        """Return the time from the end of a fault, or its detection, within which all is well again, ticks.
+        """Return the time from the end of a fault, or its detection, within which all is well
+        again, ticks.
 
-        `restart_s`: simulated time that a restart may take. A restarted board rejoins at its next release; the executor
-        of a restarted planner continues with its first plan. Messages flow again with the next one of each mailbox.
+        `restart_s`: simulated time that a restart may take. A restarted board rejoins at its next
+        release; the executor of a restarted planner continues with its first plan. Messages flow
+        again with the next one of each mailbox.
         """
         ends = self.consequence.ends_process
         cycle = cycle_ticks(layout, board) if ends and board != CLOCK else 0
         if self.takes_mailbox:
-            cycle += max((box.every + box.delay for box in struck_mailboxes(layout, -1, board)), default=0)
-        return cycle + ceil((self.consequence.recovery_s + ends * restart_s) * 1e9 / layout.clock_ns)
+            cycle += max(
+                (box.every + box.delay for box in struck_mailboxes(layout, -1, board)), default=0
+            )
+        return cycle + ceil(
+            (self.consequence.recovery_s + ends * restart_s) * 1e9 / layout.clock_ns
+        )
 
 
-UNKNOWN = Kind("unknown fault", "process", "added by a module that is not imported here", (), NOT_ARMED)
+UNKNOWN = Kind(
+    "unknown fault", "process", "added by a module that is not imported here", (), NOT_ARMED
+)
 
 
 class Kinds:
@@ -180,12 +205,18 @@ class Kinds:
         self._by_number: dict[int, Kind] = {}
 
     def add(self, *kinds: Kind) -> None:
-        """Add kinds. Raises `ValueError` for a name or number in use, or for too many parameters."""
+        """Add kinds. Raises `ValueError` for a name or number in use, or for too many
+        parameters."""
         for kind in kinds:
             if kind.number in self._by_number:
-                raise ValueError(f"kind '{kind.name}': already taken by '{self._by_number[kind.number].name}'")
+                raise ValueError(
+                    f"kind '{kind.name}': already taken by '{self._by_number[kind.number].name}'"
+                )
             if len(kind.parameters) > PARAMETERS:
-                raise ValueError(f"kind '{kind.name}': {len(kind.parameters)} parameters; permitted: {PARAMETERS}")
+                raise ValueError(
+                    f"kind '{kind.name}': {len(kind.parameters)} parameters; permitted:"
+                    f" {PARAMETERS}"
+                )
             self._by_name[kind.name] = self._by_number[kind.number] = kind
 
     def __iter__(self) -> Iterator[Kind]:
@@ -198,7 +229,8 @@ class Kinds:
         return name in self._by_name
 
     def __getitem__(self, key: str | int) -> Kind:
-        """Return the kind of a name, or of a number in the fault table. Raises `KeyError` for an unknown name."""
+        """Return the kind of a name, or of a number in the fault table. Raises `KeyError` for an
+        unknown name."""
         return self._by_name[key] if isinstance(key, str) else self._by_number.get(key, UNKNOWN)
 
     @property

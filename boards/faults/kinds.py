@@ -1,4 +1,5 @@
-"""The project's own kinds of faults, one record each, in the order in which `rack inject --list` shows them."""
+"""The project's own kinds of faults, one record each, in the order in which `rack inject --list`
+shows them."""
 
 from __future__ import annotations
 
@@ -11,15 +12,17 @@ from rack.boards.faults.kind import DIED, KINDS, Consequence, Kind, Parameter
 from rack.levels import faults as arm
 
 BRAKED = ("brakes_closed",)
-DEATH = Consequence(own=(Alarm.STALE, Alarm.MUTE, Alarm.CLOCK_STOPPED), reactions=("restart",), ends_process=True)
+DEATH = Consequence(
+    own=(Alarm.STALE, Alarm.MUTE, Alarm.CLOCK_STOPPED), reactions=("restart",), ends_process=True
+)
 SENSOR = Consequence(
     arm=(Alarm.SENSOR_RANGE, Alarm.SENSOR_STUCK, Alarm.SENSOR_SILENT, Alarm.SENSOR_MODEL),
     reactions=BRAKED,
     recovery_s=1.0,
     latches=True,
 )
-# A failed motor is retried every 0.5 s: the brakes are released, and engage again within 12 cycles if it still fails.
-# An alarm about any other motor is a false one.
+# A failed motor is retried every 0.5 s: the brakes are released, and engage again within 12 cycles
+# if it still fails. An alarm about any other motor is a false one.
 MOTOR = Consequence(reactions=BRAKED, recovery_s=0.6, latches=True)
 COMMAND = Consequence(reactions=BRAKED)
 # Any word of the message's head may be damaged: its serial, its ticks, its writer.
@@ -35,16 +38,26 @@ _message = partial(Kind, where="writer")
 _sensor = partial(Kind, where="arm", consequence=SENSOR)
 _motor = partial(Kind, where="arm", consequence=MOTOR)
 # The limit gate finds a bad torque in the same cycle: it never reaches the arm.
-_torque = partial(Kind, where="arm", consequence=COMMAND, bound=bounds.cycles(0), lasts=draw.seconds(0.01, 0.2))
+_torque = partial(
+    Kind, where="arm", consequence=COMMAND, bound=bounds.cycles(0), lasts=draw.seconds(0.01, 0.2)
+)
 
 
 def _joint(drawn: draw.Draw = draw.joint, default: float = 0) -> Parameter:
-    return Parameter("joint", "1", "joint, counted from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn)
+    return Parameter(
+        "joint", "1", "joint, counted from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn
+    )
 
 
 def _probability(default: float, most: float) -> Parameter:
     return Parameter(
-        "probability", "1", "probability that a message is affected", default, 0.001, 1.0, drawn=draw.number(0.5, most)
+        "probability",
+        "1",
+        "probability that a message is affected",
+        default,
+        0.001,
+        1.0,
+        drawn=draw.number(0.5, most),
     )
 
 
@@ -85,8 +98,12 @@ KINDS.add(
         step=tasks.overrun,
         tasks=("executor",),
         parameters=(
-            Parameter("by", "cycles", "extra computing time", 1.5, 0.0, 100.0, drawn=draw.number(1.2, 2.5)),
-            Parameter("random", "1", "1: uniform between 0 and by; 0: always by", 0, 0, 1, is_whole=True),
+            Parameter(
+                "by", "cycles", "extra computing time", 1.5, 0.0, 100.0, drawn=draw.number(1.2, 2.5)
+            ),
+            Parameter(
+                "random", "1", "1: uniform between 0 and by; 0: always by", 0, 0, 1, is_whole=True
+            ),
         ),
         detected_as=(Alarm.LATE, Alarm.STARVED),
         # The cycle is still running at its next release.
@@ -100,7 +117,17 @@ KINDS.add(
         means="the planner exceeds its time slice",
         step=tasks.slow_plan,
         tasks=("planner",),
-        parameters=(Parameter("by", "cycles", "time beyond its slice", 2.0, 0.5, 100.0, drawn=draw.number(1.5, 4.0)),),
+        parameters=(
+            Parameter(
+                "by",
+                "cycles",
+                "time beyond its slice",
+                2.0,
+                0.5,
+                100.0,
+                drawn=draw.number(1.5, 4.0),
+            ),
+        ),
         detected_as=(Alarm.PLAN_LATE,),
         bound=bounds.SLICE + bounds.RELEASE,
         lasts=draw.longest(draw.cycles(3, 6), draw.seconds(1.0, 2.0)),
@@ -122,7 +149,8 @@ KINDS.add(
         step=messages.Mute,
         detected_as=(Alarm.MUTE,),
         not_queued="a queue is written on demand: its silence proves nothing",
-        # A message is stale after two periods, but that proves nothing until its writer has finished another release.
+        # A message is stale after two periods, but that proves nothing until its writer has
+        # finished another release.
         bound=bounds.missing_writes(2) + bounds.READ,
         lasts=draw.silence(1.2, 2.0),
     ),
@@ -142,7 +170,16 @@ KINDS.add(
         means="messages are delayed",
         step=messages.Delay,
         parameters=(
-            Parameter("by", "cycles", "delay, in the writer's cycles", 2, 1, 50, is_whole=True, drawn=draw.whole(1, 5)),
+            Parameter(
+                "by",
+                "cycles",
+                "delay, in the writer's cycles",
+                2,
+                1,
+                50,
+                is_whole=True,
+                drawn=draw.whole(1, 5),
+            ),
         ),
         # Until the first delayed message arrives, the mailbox is silent.
         detected_as=(Alarm.HELD_BACK, Alarm.MUTE),
@@ -169,7 +206,16 @@ KINDS.add(
         step=messages.Corrupt,
         parameters=(
             _probability(1.0, 1.0),
-            Parameter("bits", "1", "number of bits flipped", 3, 1, 64, is_whole=True, drawn=draw.whole(1, 16)),
+            Parameter(
+                "bits",
+                "1",
+                "number of bits flipped",
+                3,
+                1,
+                64,
+                is_whole=True,
+                drawn=draw.whole(1, 16),
+            ),
         ),
         detected_as=(Alarm.DAMAGED,),
         bound=bounds.DELIVERY,
@@ -181,10 +227,21 @@ KINDS.add(
         means="the task floods its mailboxes",
         step=messages.Babble,
         parameters=(
-            Parameter("writes", "1", "messages per cycle", 32, 3, 1000, is_whole=True, drawn=draw.whole(8, 64)),
+            Parameter(
+                "writes",
+                "1",
+                "messages per cycle",
+                32,
+                3,
+                1000,
+                is_whole=True,
+                drawn=draw.whole(8, 64),
+            ),
         ),
         detected_as=(Alarm.BABBLE,),
-        not_queued="a queue takes several messages in a cycle, and refuses those that it cannot hold",
+        not_queued=(
+            "a queue takes several messages in a cycle, and refuses those that it cannot hold"
+        ),
         bound=bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
         lasts=draw.cycles(3, 6),
@@ -205,7 +262,18 @@ KINDS.add(
         where="lock",
         means="the task is stopped or killed while it holds a lock",
         step=messages.HoldLock,
-        parameters=(Parameter("killed", "1", "1: killed; 0: stopped", 0, 0, 1, is_whole=True, drawn=draw.whole(0, 1)),),
+        parameters=(
+            Parameter(
+                "killed",
+                "1",
+                "1: killed; 0: stopped",
+                0,
+                0,
+                1,
+                is_whole=True,
+                drawn=draw.whole(0, 1),
+            ),
+        ),
         detected_as=(Alarm.LOCKED, DIED),
         bound=bounds.LOCK_WAIT + bounds.READ,
         consequence=Consequence(own=(Alarm.STALE, Alarm.MUTE, Alarm.HANG), ends_process=True),
@@ -229,7 +297,16 @@ KINDS.add(
         means="the clock skips ticks",
         step=clock_board.CLOCK_SKIP,
         parameters=(
-            Parameter("ticks", "ticks", "number of ticks skipped", 1, 1, 20, is_whole=True, drawn=draw.whole(1, 20)),
+            Parameter(
+                "ticks",
+                "ticks",
+                "number of ticks skipped",
+                1,
+                1,
+                20,
+                is_whole=True,
+                drawn=draw.whole(1, 20),
+            ),
         ),
         detected_as=(Alarm.CLOCK_SKIPPED,),
         bound=bounds.skipped("ticks"),
@@ -268,9 +345,11 @@ KINDS.add(
         name="sensor-stuck",
         means="joint position and velocity freeze",
         step=arm.SensorStep(arm.sample_stuck),
-        # A stuck sensor does not show on a joint at rest, so some draws freeze all joints for long enough.
+        # A stuck sensor does not show on a joint at rest, so some draws freeze all joints for long
+        # enough.
         parameters=(_joint(draw.joint_or_all),),
-        # A joint that is driven but shows no velocity looks like one whose motor produces no torque.
+        # A joint that is driven but shows no velocity looks like one whose motor produces no
+        # torque.
         detected_as=(Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
         bound=bounds.cycles(20),
         lasts=draw.seconds(0.5, 1.5),
@@ -309,7 +388,8 @@ KINDS.add(
         step=arm.MotorStep(lambda fault: 0.0),
         parameters=(_joint(default=1),),
         detected_as=(Alarm.ACTUATOR,),
-        # In shorter cycles dry friction, which changes with the velocity, hides it for more of them.
+        # In shorter cycles dry friction, which changes with the velocity, hides it for more of
+        # them.
         bound=bounds.cycles_and_time(5, 12_500_000),
         lasts=draw.seconds(0.05, 0.4),
     ),
@@ -319,13 +399,22 @@ KINDS.add(
         step=arm.MotorStep(lambda fault: fault["part"]),
         parameters=(
             _joint(default=1),
-            Parameter("part", "1", "fraction of its maximum torque", 0.1, 0.0, 0.9, drawn=draw.number(0.0, 0.05)),
+            Parameter(
+                "part",
+                "1",
+                "fraction of its maximum torque",
+                0.1,
+                0.0,
+                0.9,
+                drawn=draw.number(0.0, 0.05),
+            ),
         ),
         detected_as=(Alarm.ACTUATOR,),
-        # At first this looks like an external load; it shows once the commanded torque rises and the motor's does not.
-        # Each cycle the joint loop commands 0.3 of the missing torque more (twice its bandwidth, 60 rad/s, times the
-        # cycle), of which a sound motor delivers at least 0.3. In the worst case reversing dry friction hides all of
-        # the missing torque at first: 1 / (0.3 * 0.3) cycles. In shorter cycles the command rises by less in each.
+        # At first this looks like an external load; it shows once the commanded torque rises and
+        # the motor's does not. Each cycle the joint loop commands 0.3 of the missing torque more
+        # (twice its bandwidth, 60 rad/s, times the cycle), of which a sound motor delivers at least
+        # 0.3. In the worst case reversing dry friction hides all of the missing torque at first: 1
+        # / (0.3 * 0.3) cycles. In shorter cycles the command rises by less in each.
         bound=bounds.cycles_and_time(12, 30_000_000),
         lasts=draw.seconds(0.05, 0.4),
     ),
@@ -356,7 +445,15 @@ KINDS.add(
         step=arm.CommandStep(arm.torque_excessive),
         parameters=(
             _joint(),
-            Parameter("factor", "1", "multiple of the torque limit", 5.0, 1.1, 1e6, drawn=draw.magnitude(3.0, 1000.0)),
+            Parameter(
+                "factor",
+                "1",
+                "multiple of the torque limit",
+                5.0,
+                1.1,
+                1e6,
+                drawn=draw.magnitude(3.0, 1000.0),
+            ),
         ),
         detected_as=(Alarm.COMMAND_LIMIT,),
     ),

@@ -1,7 +1,9 @@
-"""Faults of a task's messages: each message passes through one step per fault on its way to the mailbox.
+"""Faults of a task's messages: each message passes through one step per fault on its way to the
+mailbox.
 
-Faults compose: each step passes any number of messages on to the next, at once or in a later cycle. The content is in
-the writer's own message. Random choices depend only on the fault's seed and the message's release tick, so they repeat.
+Faults compose: each step passes any number of messages on to the next, at once or in a later cycle.
+The content is in the writer's own message. Random choices depend only on the fault's seed and the
+message's release tick, so they repeat.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from rack.boards.faults.kind import KINDS
 
 
 class Outgoing(NamedTuple):
-    """A message in transit: written in the cycle of tick `at`, made in that of `released`; `damage`: bits to flip."""
+    """A message in transit: written in the cycle of tick `at`, made in that of `released`;
+    `damage`: bits to flip."""
 
     at: int
     released: int
@@ -41,7 +44,8 @@ class Held(NamedTuple):
     content: bytes
 
     def send(self, writer: Writer, at: int, visible_at: int, onward: Send) -> None:
-        """Pass it on in the cycle of tick `at`; the writer's own message keeps the level's content."""
+        """Pass it on in the cycle of tick `at`; the writer's own message keeps the level's
+        content."""
         present = bytes(writer.message.raw)
         writer.message.raw[:] = self.content
         onward(self.message._replace(at=at, visible_at=visible_at))
@@ -49,7 +53,8 @@ class Held(NamedTuple):
 
 
 class MessageStep:
-    """One fault on one mailbox, at `index` in the layout; this base class changes nothing. `held`: delayed messages."""
+    """One fault on one mailbox, at `index` in the layout; this base class changes nothing. `held`:
+    delayed messages."""
 
     def __init__(self, entry: FaultEntry, writer: Writer, index: int) -> None:
         self.entry = entry
@@ -141,7 +146,9 @@ class Corrupt(MessageStep):
         if chance.random() < probability:
             self.acts(message)
             # Each bit at most once: a second flip would restore it.
-            message = message._replace(damage=tuple(chance.sample(range(size), min(size, round(bits)))))
+            message = message._replace(
+                damage=tuple(chance.sample(range(size), min(size, round(bits))))
+            )
         self.onward(message)
 
 
@@ -181,8 +188,12 @@ class FaultyWriter:
         self._written = True
 
     def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Apply these faults, by kind, from now on; those that continue keep their delayed messages."""
-        steps = {entry.index: self._steps.get(entry.index) or self._step(kind, entry) for kind, entry in faults}
+        """Apply these faults, by kind, from now on; those that continue keep their delayed
+        messages."""
+        steps = {
+            entry.index: self._steps.get(entry.index) or self._step(kind, entry)
+            for kind, entry in faults
+        }
         for index, step in self._steps.items():
             if index not in steps:
                 self._late += step.held
@@ -207,8 +218,8 @@ class FaultyWriter:
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Write the message as its faults leave it; return False if the message itself is too late.
 
-        A delayed message becomes visible together with that of the cycle in which it is written, so that reads depend
-        on ticks alone, even with faults.
+        A delayed message becomes visible together with that of the cycle in which it is written, so
+        that reads depend on ticks alone, even with faults.
         """
         self.flush(tick, now)
         self._written = True
@@ -234,15 +245,18 @@ class FaultyWriter:
         self._writer.show()
 
     def _publish(self, message: Outgoing) -> None:
-        if not self._writer.publish(message.released, message.visible_at, message.basis, message.damage):
+        if not self._writer.publish(
+            message.released, message.visible_at, message.basis, message.damage
+        ):
             self._written = False
 
 
 def forge(segment: Segment, mailbox: str, tick: int) -> None:
-    """Publish a message as a second writer, which has not claimed the mailbox; it is visible at `tick`.
+    """Publish a message as a second writer, which has not claimed the mailbox; it is visible at
+    `tick`.
 
-    Only its writer is wrong. Its content is the newest message with every bit inverted, so that any reader that
-    accepts it is noticed.
+    Only its writer is wrong. Its content is the newest message with every bit inverted, so that any
+    reader that accepts it is noticed.
     """
     slots = Slots(segment, segment.layout.mailbox(mailbox))
     head = slots.box[Box.HEAD]

@@ -51,7 +51,8 @@ class ExtraComputing:
 
 
 LoadStep = Callable[[ExtraComputing, int, int], int]
-"""From the tick and the present time, the time at which computing ends; times are CLOCK_MONOTONIC, ns."""
+"""From the tick and the present time, the time at which computing ends; times are CLOCK_MONOTONIC,
+ns."""
 
 
 def overrun(load: ExtraComputing, tick: int, now: int) -> int:
@@ -77,7 +78,9 @@ class Outputs(Protocol):
 class TaskFaults:
     """Applies a task's active faults. `loads` are those of its computing time."""
 
-    def __init__(self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner) -> None:
+    def __init__(
+        self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner
+    ) -> None:
         self._table = FaultTable(segment)
         self._spec = spec
         self._outputs = outputs
@@ -89,8 +92,8 @@ class TaskFaults:
     def refresh(self, tick: int) -> int:
         """Apply the faults that are active at `tick`; return the generation of the fault table.
 
-        The clock works ahead of the grid: a fault that it has begun for a later tick waits for the next call. The
-        generation is then -1.
+        The clock works ahead of the grid: a fault that it has begun for a later tick waits for the
+        next call. The generation is then -1.
         """
         generation = self._table.generation
         found = [(KINDS[entry[Entry.KIND]], entry) for entry in self._table.active(self._spec.name)]
@@ -100,11 +103,15 @@ class TaskFaults:
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
-        self._outputs.apply([(kind.name, entry) for kind, entry in active if kind.where in ("writer", "lock")])
+        self._outputs.apply(
+            [(kind.name, entry) for kind, entry in active if kind.where in ("writer", "lock")]
+        )
         arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm]
         if self._spec.role == "executor":
-            faults = [Fault(k.name, k.values(e), e[Entry.SEED], e[Entry.FROM], k.step) for k, e in arm]
+            faults = [
+                Fault(k.name, k.values(e), e[Entry.SEED], e[Entry.FROM], k.step) for k, e in arm
+            ]
             cast("Executor", self._level).inject(faults)
         return generation if len(active) == len(found) else -1
 
@@ -120,10 +127,11 @@ class TaskFaults:
 
 
 def take_core(segment: Segment, entry: FaultEntry) -> None:
-    """Wait until the clock begins the fault, then keep the board's core busy until the fault is over: a hog.
+    """Wait until the clock begins the fault, then keep the board's core busy until the fault is
+    over: a hog.
 
-    Call it in a separate process. Raises `PermissionError` where real-time priorities are refused: an ordinary process
-    cannot take a core from a board.
+    Call it in a separate process. Raises `PermissionError` where real-time priorities are refused:
+    an ordinary process cannot take a core from a board.
     """
     task = segment.layout.tasks[entry[Entry.TASK]]
     block = segment.block(task.name)
@@ -132,8 +140,9 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
     while entry.stage == Stage.WAITING and not clock.is_stopped:
         wait_ns = clock.time_of(max(entry[Entry.FROM], clock.tick + 1)) - time.monotonic_ns()
-        # Wake on the clock's grid, at the first tick at which the fault can begin or at the next one. If that tick has
-        # passed, or the run has not started, sleep briefly: at this priority a busy wait would starve all others.
+        # Wake on the clock's grid, at the first tick at which the fault can begin or at the next
+        # one. If that tick has passed, or the run has not started, sleep briefly: at this priority
+        # a busy wait would starve all others.
         time.sleep(min(wait_ns * 1e-9 if wait_ns > 0 else LEAST_S, LOOK_S))
     end = clock.time_of(entry[Entry.UNTIL])
     entry.acted(clock.now())
@@ -150,6 +159,7 @@ def act_on_core(segment: Segment, entry: FaultEntry) -> None:
 
 
 def hog(segment: Segment, index: int) -> int:
-    """Act the fault at `index` of the fault table, in a process forked by the crate; return the exit status."""
+    """Act the fault at `index` of the fault table, in a process forked by the crate; return the
+    exit status."""
     act_on_core(segment, FaultTable(segment).entries[index])
     return 0

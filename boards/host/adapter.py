@@ -1,4 +1,5 @@
-"""What bus adapters have in common: they see the segment itself, and may open something outside the rack."""
+"""What bus adapters have in common: they see the segment itself, and may open something outside the
+rack."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ class Adapter(Executor):
     """Key of its board under which its ports are listed."""
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
-        """Take the segment, before the self-test; in a replay with what was recorded in place of what is out."""
+        """Take the segment, before the self-test; in a replay with what was recorded in place of
+        what is out."""
 
     def open(self) -> None:
-        """Open the way outside. The board has its core and priority by now: threads that this starts inherit both."""
+        """Open the way outside. The board has its core and priority by now: threads that this
+        starts inherit both."""

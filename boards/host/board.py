@@ -1,4 +1,5 @@
-"""A host board: one process under ordinary scheduling, which runs a program until that returns or the rack ends it."""
+"""A host board: one process under ordinary scheduling, which runs a program until that returns or
+the rack ends it."""
 
 from __future__ import annotations
 
@@ -29,20 +30,22 @@ FAILED = 1
 def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output: int) -> int:
     """Run a host board's program, which prints to `output`; return the exit status of its process.
 
-    The process leads a session of its own, and what its children leave behind becomes its own child, then the crate's,
-    which ends it. `attention` is an eventfd on which the Rack waits.
+    The process leads a session of its own, and what its children leave behind becomes its own
+    child, then the crate's, which ends it. `attention` is an eventfd on which the Rack waits.
     """
     os.setsid()
     adopt_orphans()
     os.dup2(output, 1)
     os.dup2(output, 2)
-    # The crate ignores it. A program that is ended leaves its `with` and `finally` blocks, as at sys.exit.
+    # The crate ignores it. A program that is ended leaves its `with` and `finally` blocks, as at
+    # sys.exit.
     signal.signal(signal.SIGTERM, _leave)
     bus = _opened(segment, wiring)
     os.eventfd_write(attention, 1)
     try:
         bus.await_turn()
-        # Imported here, not in the crate: a program may import anything, and the crate must stay single-threaded.
+        # Imported here, not in the crate: a program may import anything, and the crate must stay
+        # single-threaded.
         find_class(wiring.target, HostProgram)(wiring.context).run(bus)
     except SystemExit as end:
         if end.code and not bus.is_over:
@@ -54,7 +57,8 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
 
 
 def _opened(segment: Segment, wiring: HostWiring) -> HostBus:
-    """Open the bus. What the process before this one has forked is being killed, and may hold the board meanwhile."""
+    """Open the bus. What the process before this one has forked is being killed, and may hold the
+    board meanwhile."""
     deadline = time.monotonic() + RELEASED_S
     while True:
         try:

@@ -25,9 +25,11 @@ _Port = TypeVar("_Port")
 
 
 class HostBus:
-    """The ports of one host board. Opening it claims the board: a second process is refused with `MailboxError`.
+    """The ports of one host board. Opening it claims the board: a second process is refused with
+    `MailboxError`.
 
-    A paced program runs in turns, in lockstep, while its adapter waits: see `rack.boards.host.bus_adapter`.
+    A paced program runs in turns, in lockstep, while its adapter waits: see
+    `rack.boards.host.bus_adapter`.
     """
 
     def __init__(self, segment: Segment, wiring: HostWiring) -> None:
@@ -38,7 +40,9 @@ class HostBus:
         self._is_paced = self._words[System.LOCKSTEP] and layout.pacers(layout.task(wiring.board))
         self.block = segment.block(wiring.board)
         self._claim = _claim(segment, wiring.board)
-        self._inlets = {port: HostInlet(segment, mailbox) for port, mailbox in wiring.inputs.items()}
+        self._inlets = {
+            port: HostInlet(segment, mailbox) for port, mailbox in wiring.inputs.items()
+        }
         self._writers: dict[str, HostWriter] = {}
         try:
             for port, mailbox in wiring.outputs.items():
@@ -67,7 +71,8 @@ class HostBus:
         return self._segment.run_is_over
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a message arrives; False when none has after the timeout, or when the run ends."""
+        """Wait until a message arrives; False when none has after the timeout, or when the run
+        ends."""
         if self._is_paced:
             ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
             self.block[Block.WAITS_UNTIL] = self.tick + max(1, ticks)
@@ -87,7 +92,11 @@ class HostBus:
         """Wait until the program may run, or the run ends. In real time it always may."""
         block = self.block
         # The clock admits the successor of a lost process. Read first: it clears this word last.
-        while self._is_paced and (block[Block.LOST] or block[Block.DONE] == block[Block.RELEASED]) and not self.is_over:
+        while (
+            self._is_paced
+            and (block[Block.LOST] or block[Block.DONE] == block[Block.RELEASED])
+            and not self.is_over
+        ):
             self._semaphore.acquire(CHECK_S)
 
     def _end_turn(self) -> None:
@@ -98,14 +107,15 @@ class HostBus:
         done_semaphore(self._segment.rack, self._wiring.board).release()
 
     def read(self, port: str) -> Reading:
-        """Return the newest message; `earlier` holds the unread ones before it, as far as the mailbox keeps them."""
+        """Return the newest message; `earlier` holds the unread ones before it, as far as the
+        mailbox keeps them."""
         return _of(self._inlets, port).read()
 
     def send(self, port: str, **fields: Any) -> bool:
         """Send a message with these fields, all others 0; False when too many wait at the adapter.
 
-        A command without an `id` gets the number of the message, which rises by one with every message sent. Raises
-        `AttributeError` for an unknown field.
+        A command without an `id` gets the number of the message, which rises by one with every
+        message sent. Raises `AttributeError` for an unknown field.
         """
         writer = _of(self._writers, port)
         message = writer.message
@@ -113,7 +123,8 @@ class HostBus:
         if COMMAND_ID in (message.record.dtype.names or ()):
             message.id = writer.serial + 1
         for name, value in fields.items():
-            # Read first: a slot for any other name would raise an error that does not list the fields.
+            # Read first: a slot for any other name would raise an error that does not list the
+            # fields.
             getattr(message, name)
             setattr(message, name, value)
         return writer.send(self.tick)
@@ -128,7 +139,8 @@ class HostBus:
         return [task.name for task in self._segment.layout.tasks]
 
     def address(self, name: str) -> int:
-        """Return the bus address of a mailbox, or of the control block of a task. Raises `LookupError`."""
+        """Return the bus address of a mailbox, or of the control block of a task. Raises
+        `LookupError`."""
         places = self._segment.map
         found = {**places.blocks, **places.mailboxes}
         if name not in found:
@@ -136,11 +148,15 @@ class HostBus:
         return found[name]
 
     def words(self, address: int, count: int = 1) -> list[int]:
-        """Return words of the crate's memory from a bus address on. Raises `ValueError` for an address without one."""
+        """Return words of the crate's memory from a bus address on. Raises `ValueError` for an
+        address without one."""
         size = self._segment.map.size
         last = address + WORD * count
         if address % WORD or not 0 <= address < last <= size:
-            raise ValueError(f"words of {WORD} bytes at 0x{address:06x} to 0x{last:06x}: the bus has 0 to 0x{size:06x}")
+            raise ValueError(
+                f"words of {WORD} bytes at 0x{address:06x} to 0x{last:06x}: the bus has 0 to"
+                f" 0x{size:06x}"
+            )
         return list(self._words[address // WORD : last // WORD])
 
     def finish(self) -> None:
@@ -157,14 +173,16 @@ class HostBus:
 
 
 class HostInlet:
-    """Reads a mailbox of a bus adapter at any time: the newest whole message, and the unread ones before it."""
+    """Reads a mailbox of a bus adapter at any time: the newest whole message, and the unread ones
+    before it."""
 
     def __init__(self, segment: Segment, mailbox: str) -> None:
         self._reader = DoubleBufferReader(segment, mailbox)
         self._slots = Slots(segment, self._reader.spec)
 
     def read(self) -> Reading:
-        """Return the newest message, and the unread ones before it; the first read returns the newest alone."""
+        """Return the newest message, and the unread ones before it; the first read returns the
+        newest alone."""
         before = self._reader.serial
         reading = self._reader.peek()
         if before and self._reader.serial > before + 1:

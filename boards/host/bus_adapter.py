@@ -1,25 +1,29 @@
 """The bridge: a bus adapter between the real-time side and the boards of the host side.
 
-A bridge is an ordinary board with a rate and a priority. Each entry of its table passes one mailbox across; the side of
-the source is the direction.
+A bridge is an ordinary board with a rate and a priority. Each entry of its table passes one mailbox
+across; the side of the source is the direction.
 
-Into real time, the bridge takes messages from the ring of a host board, checks them, and writes them to its own mailbox
-`<bridge>.<port>`, which levels read by ticks as any other. From there on a run is repeatable. Out of real time it reads
-a level's mailbox by ticks and writes a copy, which host boards read whenever they like.
+Into real time, the bridge takes messages from the ring of a host board, checks them, and writes
+them to its own mailbox `<bridge>.<port>`, which levels read by ticks as any other. From there on a
+run is repeatable. Out of real time it reads a level's mailbox by ticks and writes a copy, which
+host boards read whenever they like.
 
-A hung, dead or flooding host board costs the real-time side nothing: the ring is bounded, a cycle looks at no more than
-`most` messages of an entry, and nothing here waits. The bridge's status shows it, entry by entry.
+A hung, dead or flooding host board costs the real-time side nothing: the ring is bounded, a cycle
+looks at no more than `most` messages of an entry, and nothing here waits. The bridge's status shows
+it, entry by entry.
 
-In lockstep a program runs only within cycles of its bridges, after the exchange, and the cycle waits until it waits. It
-is due when a message has come, when the time has come until which it waits, and at its start. What it sends is taken
-in a later cycle, once its computing is over: that takes the simulated time `[host.x] computing_ms`, however long it
-really took. So it enters at ticks that the config determines. If a program has several bridges, lockstep releases all
-tasks one at a time.
+In lockstep a program runs only within cycles of its bridges, after the exchange, and the cycle
+waits until it waits. It is due when a message has come, when the time has come until which it
+waits, and at its start. What it sends is taken in a later cycle, once its computing is over: that
+takes the simulated time `[host.x] computing_ms`, however long it really took. So it enters at ticks
+that the config determines. If a program has several bridges, lockstep releases all tasks one at a
+time.
 
-Alternative considered: a clock that releases programs as it does tasks. They would need a rate, and a message would
-wait for their next cycle.
+Alternative considered: a clock that releases programs as it does tasks. They would need a rate, and
+a message would wait for their next cycle.
 
-A replay does without host boards: what entered in a recorded run is given out again, each message at its tick.
+A replay does without host boards: what entered in a recorded run is given out again, each message
+at its tick.
 """
 
 from __future__ import annotations
@@ -54,11 +58,13 @@ from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.tables import read_params
 
 LONGEST_S = 30.0
-"""Real time within which a program in lockstep must wait, or end; its start and imports have as long."""
+"""Real time within which a program in lockstep must wait, or end; its start and imports have as
+long."""
 
 
 class BusAdapter(Adapter):
-    """Passes mailboxes between the two sides. Its status is done when the programs of all its host boards are."""
+    """Passes mailboxes between the two sides. Its status is done when the programs of all its host
+    boards are."""
 
     params = AdapterParams
     wired_by = "params.pass"
@@ -78,14 +84,22 @@ class BusAdapter(Adapter):
         """Return a port to read and one to write for each entry, and the status."""
         entries = AdapterParams.entries_of(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
-        inputs = {port: Input(types.get(entry.source, ENTRY), entry.source) for port, entry in entries.items()}
-        # A message that is passed once must not be sampled; to host boards a bridge writes by itself.
-        outputs = {port: Output(types[entry.source], queued=entry.asynchronous) for port, entry in known.items()}
+        inputs = {
+            port: Input(types.get(entry.source, ENTRY), entry.source)
+            for port, entry in entries.items()
+        }
+        # A message that is passed once must not be sampled; to host boards a bridge writes by
+        # itself.
+        outputs = {
+            port: Output(types[entry.source], queued=entry.asynchronous)
+            for port, entry in known.items()
+        }
         is_whole = bool(entries) and known == entries
         return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))}, is_whole)
 
     def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
-        """Open the host side; in a replay, take over what the recorded run wrote, by port, instead."""
+        """Open the host side; in a replay, take over what the recorded run wrote, by port,
+        instead."""
         layout = segment.layout
         hosts = {host.name for host in layout.hosts}
         self._resume_counts(open_observer(segment, f"{self.context.board}.{STATUS}"))
@@ -109,7 +123,9 @@ class BusAdapter(Adapter):
             self._entries.append((table, entry))
         if segment.words[System.LOCKSTEP] and entries is None:
             board = self.context.board
-            self._turns = [HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)]
+            self._turns = [
+                HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)
+            ]
         if entries is not None:
             self._statuses = Replayed(entries[STATUS], STATUS, is_queued=False)
 
@@ -145,7 +161,8 @@ class BusAdapter(Adapter):
         status.error = 0
         status.reason = ""
         if lost:
-            # First: in lockstep the Rack may give it up at any tick, and the clock confirms that at one.
+            # First: in lockstep the Rack may give it up at any tick, and the clock confirms that at
+            # one.
             status.state = State.HOLDING
             status.reason = f"host board '{lost[0]}' is lost: it is being restarted"
         elif gone:
@@ -156,20 +173,26 @@ class BusAdapter(Adapter):
 
 
 class HostTurn(ReleasedTask):
-    """A host board's program in lockstep, as its adapter sees it; its own end is `rack.boards.host.bus.HostBus`."""
+    """A host board's program in lockstep, as its adapter sees it; its own end is
+    `rack.boards.host.bus.HostBus`."""
 
     def __init__(self, segment: Segment, host: TaskSpec) -> None:
         super().__init__(segment, host)
         self._segment = segment
 
     def take(self, tick: int) -> None:
-        """Let the program run in the cycle released at `tick` if it is due, and wait until it waits.
+        """Let the program run in the cycle released at `tick` if it is due, and wait until it
+        waits.
 
         Raises `CannotGoOn` if that takes too long.
         """
         block = self.block
         # It may be done, or given up.
-        if block[Block.STATE] > TaskState.RUNNING or block[Block.WAITS_UNTIL] > tick or not self.is_free(tick):
+        if (
+            block[Block.STATE] > TaskState.RUNNING
+            or block[Block.WAITS_UNTIL] > tick
+            or not self.is_free(tick)
+        ):
             return
         block[Block.RELEASED] = tick
         self.wake()
@@ -181,8 +204,8 @@ class HostTurn(ReleasedTask):
                 break
             if time.monotonic() > bound_s:
                 raise CannotGoOn(
-                    f"the program of host board '{self.spec.name}' has not waited for {LONGEST_S:g} s of real time: "
-                    "lockstep cannot go on without it"
+                    f"the program of host board '{self.spec.name}' has not waited for {LONGEST_S:g}"
+                    " s of real time: lockstep cannot go on without it"
                 )
         if block[Block.LOST]:
             # The crate has noted the tick of the clock, which may be ahead of this cycle.
@@ -191,4 +214,6 @@ class HostTurn(ReleasedTask):
 
 def status_of(entries: Mapping[str, EntryConfig]) -> MessageType:
     """Return the type of a bridge's status: one group of counts for each entry."""
-    return status("adapter_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries))
+    return status(
+        "adapter_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries)
+    )

@@ -1,4 +1,5 @@
-"""The entries of a bridge: what each passes, in which direction, when, and what is counted of it."""
+"""The entries of a bridge: what each passes, in which direction, when, and what is counted of
+it."""
 
 from __future__ import annotations
 
@@ -30,11 +31,20 @@ ENTRY = MessageType(
     1,
     (
         Field("passed", "u4", "1", "messages passed to the other side"),
-        Field("refused", "u4", "1", "messages refused: damaged, forged, or not what its type permits"),
+        Field(
+            "refused", "u4", "1", "messages refused: damaged, forged, or not what its type permits"
+        ),
         Field("superseded", "u4", "1", "messages that a newer one overtook before the exchange"),
-        Field("full", "u4", "1", "messages that the host board could not send, since too many waited"),
+        Field(
+            "full", "u4", "1", "messages that the host board could not send, since too many waited"
+        ),
         Field("waiting", "u4", "1", "messages that wait for the next cycles"),
-        Field("arrived", "i8", "tick", "tick at which the newest message reached the other side; -1: none yet"),
+        Field(
+            "arrived",
+            "i8",
+            "tick",
+            "tick at which the newest message reached the other side; -1: none yet",
+        ),
         Field("age", "i8", "tick", "time since that message was written; -1: none yet"),
     ),
 )
@@ -44,18 +54,32 @@ ENTRY = MessageType(
 class EntryConfig(Table):
     """`[board.<name>.params.pass.<port>]`: one mailbox that a bus adapter passes across."""
 
-    source: str = Key(alias="from", description="mailbox to pass, as in program.requests; its side is the direction")
-    every: int = Key(1, ge=1, le=LAST_TICK, description="exchange in every n-th cycle of the bridge, cycles")
+    source: str = Key(
+        alias="from",
+        description="mailbox to pass, as in program.requests; its side is the direction",
+    )
+    every: int = Key(
+        1, ge=1, le=LAST_TICK, description="exchange in every n-th cycle of the bridge, cycles"
+    )
     phase: int = Key(0, ge=0, description="with every: which of the n cycles, cycles")
-    asynchronous: bool = Key(False, description="pass each message as it comes, once; default: the newest, repeatedly")
-    most: int = Key(8, ge=1, le=256, description="messages of a host board looked at in one cycle; the others wait")
+    asynchronous: bool = Key(
+        False, description="pass each message as it comes, once; default: the newest, repeatedly"
+    )
+    most: int = Key(
+        8,
+        ge=1,
+        le=256,
+        description="messages of a host board looked at in one cycle; the others wait",
+    )
 
     @model_validator(mode="after")
     def _has_one_mode(self) -> Self:
         if self.phase >= self.every:
             raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
         if self.asynchronous and self.every > 1:
-            raise ValueError(f"every = {self.every}: the entry is asynchronous; permitted: one of the two")
+            raise ValueError(
+                f"every = {self.every}: the entry is asynchronous; permitted: one of the two"
+            )
         return self
 
     def is_due(self, cycle: int) -> bool:
@@ -66,12 +90,17 @@ class EntryConfig(Table):
 class AdapterParams(Table):
     """`[board.<name>.params]` of a bus adapter."""
 
-    entries: dict[str, EntryConfig] = Key({}, alias="pass", description="mailboxes to pass, by port of the bridge")
+    entries: dict[str, EntryConfig] = Key(
+        {}, alias="pass", description="mailboxes to pass, by port of the bridge"
+    )
 
     @model_validator(mode="after")
     def _has_ports(self) -> Self:
         if wrong := [port for port in self.entries if not PORT.fullmatch(port) or port in RESERVED]:
-            raise ValueError(f"pass.{wrong[0]}: invalid name; permitted: a-z, 0-9 and _, except {', '.join(RESERVED)}")
+            raise ValueError(
+                f"pass.{wrong[0]}: invalid name; permitted: a-z, 0-9 and _, except"
+                f" {', '.join(RESERVED)}"
+            )
         return self
 
     @classmethod
@@ -85,7 +114,8 @@ class AdapterParams(Table):
 
 @dataclass
 class EntryCount:
-    """The counts of one entry: the fields of `ENTRY`. `written`: tick at which the newest message was written."""
+    """The counts of one entry: the fields of `ENTRY`. `written`: tick at which the newest message
+    was written."""
 
     passed: int = 0
     refused: int = 0
@@ -111,7 +141,15 @@ class EntryCount:
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
         age = NEVER if self.written == NEVER else tick - self.written
-        counts = self.passed, self.refused, self.superseded, self.full, self.waiting, self.arrived, age
+        counts = (
+            self.passed,
+            self.refused,
+            self.superseded,
+            self.full,
+            self.waiting,
+            self.arrived,
+            age,
+        )
         fill_counts(record, counts)
 
 
@@ -123,7 +161,8 @@ class Crossing(Protocol):
 
 
 class Inward:
-    """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read by ticks."""
+    """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read
+    by ticks."""
 
     def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._ring = HostReader(segment, table.source)
@@ -135,7 +174,8 @@ class Inward:
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take what waits, and check it. In lockstep what a program sends is there once its computing is over."""
+        """Take what waits, and check it. In lockstep what a program sends is there once its
+        computing is over."""
         ring = self._ring
         count = self._count
         out = getattr(write, self._port)
@@ -156,16 +196,21 @@ class Inward:
 
 
 class Outward:
-    """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it wakes them."""
+    """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it
+    wakes them."""
 
-    def __init__(self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount) -> None:
+    def __init__(
+        self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount
+    ) -> None:
         self._writer = open_writer(segment, own)
         self._port = port
         self._table = table
         self._count = count
         self._source = open_observer(segment, table.source)
         readers = self._writer.spec.readers
-        self._readers = [(segment.block(name), wake_semaphore(segment.rack, name)) for name in readers]
+        self._readers = [
+            (segment.block(name), wake_semaphore(segment.rack, name)) for name in readers
+        ]
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
         """Copy what is there."""
@@ -187,13 +232,15 @@ class Outward:
 
 
 Rows = Sequence[tuple[int, bytes]]
-"""Messages of a recorded run with their ticks, oldest first; of a mailbox that repeats itself only the changes."""
+"""Messages of a recorded run with their ticks, oldest first; of a mailbox that repeats itself only
+the changes."""
 
 
 class Replayed:
     """A mailbox of the bridge in a replay: what the recorded run wrote to it, at the same ticks.
 
-    Of messages that are each read once, a bridge that was restarted gives out those after tick `since`.
+    Of messages that are each read once, a bridge that was restarted gives out those after tick
+    `since`.
     """
 
     def __init__(self, rows: Rows, port: str, is_queued: bool, since: int = NEVER) -> None:

@@ -1,9 +1,11 @@
-"""Who may do what on a rack's session, as rules for zenoh's access control. What no rule allows is denied.
+"""Who may do what on a rack's session, as rules for zenoh's access control. What no rule allows is
+denied.
 
-A rule concerns what comes in (ingress) or goes out (egress), a kind of message, and keys. With TLS its subject is the
-common name of the other side's certificate; without, there is no identity, and rules hold for everyone: what a rack
-exports anybody may read then, and what it imports is known by its key and its seal alone. Both sides of a subscription
-need a rule: to declare it is a message too.
+A rule concerns what comes in (ingress) or goes out (egress), a kind of message, and keys. With TLS
+its subject is the common name of the other side's certificate; without, there is no identity, and
+rules hold for everyone: what a rack exports anybody may read then, and what it imports is known by
+its key and its seal alone. Both sides of a subscription need a rule: to declare it is a message
+too.
 """
 
 from __future__ import annotations
@@ -12,7 +14,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from rack.boards.lan.config import LanTable, Right
-from rack.boards.lan.keys import ALL_ALIVE, ASKED, any_alive, ask_keys, out_key, ping_key, pong_key, step_key
+from rack.boards.lan.keys import (
+    ALL_ALIVE,
+    ASKED,
+    any_alive,
+    ask_keys,
+    out_key,
+    ping_key,
+    pong_key,
+    step_key,
+)
 
 IN = ("ingress",)
 OUT = ("egress",)
@@ -33,7 +44,8 @@ class Permission(NamedTuple):
 
 
 def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
-    """Return zenoh's `access_control` for rack `own`; `asks`: it asks racks, and they may answer."""
+    """Return zenoh's `access_control` for rack `own`; `asks`: it asks racks, and they may
+    answer."""
     by_subject: dict[str, list[Permission]] = {}
     if asks:
         by_subject[ANYONE] = list(_asking(own))
@@ -51,7 +63,9 @@ def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
 
 def _exchange(own: str, peer: str, table: LanTable) -> Iterator[Permission]:
     """Yield the rules for a rack with which this one exchanges mailboxes."""
-    imports = [out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer]
+    imports = [
+        out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer
+    ]
     exports = [out_key(own, entry.source) for entry in table.exports.values()]
     taken = [*imports, step_key(peer), ping_key(peer, own), pong_key(peer, own)]
     given = [*exports, step_key(own), ping_key(own, peer), pong_key(own, peer)]
@@ -72,7 +86,8 @@ def _shown(own: str, keys: Sequence[str]) -> Iterator[Permission]:
 
 
 def _compared(own: str) -> Iterator[Permission]:
-    """Yield the rules for others that may compare their clocks with this rack's: messages of unknown age are no use."""
+    """Yield the rules for others that may compare their clocks with this rack's: messages of
+    unknown age are no use."""
     yield Permission(OUT, SUBSCRIBE, [ping_key("*", own)])
     yield Permission(IN, PUT, [ping_key("*", own)])
     yield Permission(IN, SUBSCRIBE, [pong_key("*", "*")])
@@ -111,7 +126,24 @@ def _configured(by_subject: dict[str, list[Permission]]) -> dict[str, Any]:
         ids = [f"{subject}-{at}" for at in range(len(allowed))]
         for name, rule in zip(ids, allowed, strict=True):
             flows, messages, keys = map(list, rule)
-            rules.append({"id": name, "permission": "allow", "flows": flows, "messages": messages, "key_exprs": keys})
+            rules.append(
+                {
+                    "id": name,
+                    "permission": "allow",
+                    "flows": flows,
+                    "messages": messages,
+                    "key_exprs": keys,
+                }
+            )
         policies.append({"rules": ids, "subjects": [subject]})
-    names = [{"id": name} | ({} if name == ANYONE else {"cert_common_names": [name]}) for name in by_subject]
-    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": names, "policies": policies}
+    names = [
+        {"id": name} | ({} if name == ANYONE else {"cert_common_names": [name]})
+        for name in by_subject
+    ]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": names,
+        "policies": policies,
+    }

@@ -1,11 +1,12 @@
 """The network adapter: a bus adapter whose other side is the network, on eclipse-zenoh.
 
-It is an ordinary board with a rate, and a priority above its neighbours'. In its cycles it sends what it exports, takes
-what has come of its imports, notes who is there, and answers questions; in between only the network's own threads run,
-which have its core and priority. Nothing here waits, but in lockstep, where time stands still meanwhile.
+It is an ordinary board with a rate, and a priority above its neighbours'. In its cycles it sends
+what it exports, takes what has come of its imports, notes who is there, and answers questions; in
+between only the network's own threads run, which have its core and priority. Nothing here waits,
+but in lockstep, where time stands still meanwhile.
 
-A restarted adapter continues from its own mailboxes. The status is written before the messages that it counts: an
-adapter killed in between has lost a message, but none is passed twice.
+A restarted adapter continues from its own mailboxes. The status is written before the messages that
+it counts: an adapter killed in between has lost a message, but none is passed twice.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ _LAUNCH_MASK = (1 << 62) - 1
 
 
 class LanAdapter(Adapter):
-    """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each rack."""
+    """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each
+    rack."""
 
     params = LanParams
     wired_by = "params.export"
@@ -63,7 +65,8 @@ class LanAdapter(Adapter):
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
-        """Return a port to read for each export, one to write for each import and rack, and the status."""
+        """Return a port to read for each export, one to write for each import and rack, and the
+        status."""
         table = LanParams.found_in(params)
         if table is None:
             return MadePorts(is_whole=False)
@@ -90,12 +93,17 @@ class LanAdapter(Adapter):
         self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
         self._clocks = Clocks(segment, self._peers, launch, self._grid)
-        # In the time of a lease and a connection the token of every rack that is still there has come.
+        # In the time of a lease and a connection the token of every rack that is still there has
+        # come.
         seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
         for peer in self._peers:
-            if (before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()).is_there:
+            if (
+                before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()
+            ).is_there:
                 peer.resume(before.value, seen_by)
-        self._exports = {port: Export(segment, entry, launch) for port, entry in table.exports.items()}
+        self._exports = {
+            port: Export(segment, entry, launch) for port, entry in table.exports.items()
+        }
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack])
             for port, entry in table.imports.items()
@@ -114,7 +122,8 @@ class LanAdapter(Adapter):
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
     def open(self) -> None:
-        """Open the session: its threads inherit core and priority of the board. Raises `LevelError`."""
+        """Open the session: its threads inherit core and priority of the board. Raises
+        `LevelError`."""
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
         barrier = self._barrier
@@ -128,12 +137,15 @@ class LanAdapter(Adapter):
         if barrier is not None:
             barrier.open(link, self._launch)
             self._recall(barrier)
-        self._peers.watch(link.watch_alive(TOKENS) if barrier is None else barrier.changes, barrier is not None)
+        self._peers.watch(
+            link.watch_alive(TOKENS) if barrier is None else barrier.changes, barrier is not None
+        )
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
 
     def _recall(self, barrier: Barrier) -> None:
-        """Repeat the last step of an adapter before this one: it may have died with that before it left the machine."""
+        """Repeat the last step of an adapter before this one: it may have died with that before it
+        left the machine."""
         if barrier.done >= 0:
             for export in self._exports.values():
                 export.recall(barrier.done, self.context.every)
@@ -169,7 +181,8 @@ class LanAdapter(Adapter):
                 export.is_asked = True
 
     def _demand_stop(self, tick: int) -> None:
-        """Demand that the arm stop while a rack that had been there is lost, if it is to stop then."""
+        """Demand that the arm stop while a rack that had been there is lost, if it is to stop
+        then."""
         must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)
         if must_stop != bool(self._words[System.PEER_STOP] & 1):
             # In lockstep other boards, and the clock, may be ahead in their ticks of this cycle.

@@ -1,4 +1,5 @@
-"""The rack for which an adapter waits in lockstep, in one word of its control block: for whoever watches the rack."""
+"""The rack for which an adapter waits in lockstep, in one word of its control block: for whoever
+watches the rack."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
 GIVE_UP_S = 20.0
-"""Real time after which a rack whose adapter is gone counts as lost; a restarted board is back sooner."""
+"""Real time after which a rack whose adapter is gone counts as lost; a restarted board is back
+sooner."""
 _PLACES = 8
 
 
@@ -35,7 +37,8 @@ def word_of(place: int, why: Why) -> int:
 
 
 def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
-    """Yield the adapter that waits for another rack, if one does, with a text that says for which and why."""
+    """Yield the adapter that waits for another rack, if one does, with a text that says for which
+    and why."""
     for task in segment.layout.tasks:
         if word := segment.block(task.name)[Block.AWAITS]:
             # Only here: it takes a while to import.

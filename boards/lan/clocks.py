@@ -1,9 +1,11 @@
-"""The clocks of other racks next to ours: the offset of their CLOCK_MONOTONIC, by round trips with four stamps.
+"""The clocks of other racks next to ours: the offset of their CLOCK_MONOTONIC, by round trips with
+four stamps.
 
-A ping is stamped when it is sent and when it arrives there, the answer when it is sent there and when it arrives here.
-However long each way took, the true offset is within half the round trip of the middle: NTP's bound, which asymmetric
-ways cannot break. The stamps of arrival must not wait for the adapter's cycle. They are the one thing that a callback
-takes, in a thread of the network's; it answers at once, so that an answer waits for no cycle either.
+A ping is stamped when it is sent and when it arrives there, the answer when it is sent there and
+when it arrives here. However long each way took, the true offset is within half the round trip of
+the middle: NTP's bound, which asymmetric ways cannot break. The stamps of arrival must not wait for
+the adapter's cycle. They are the one thing that a callback takes, in a thread of the network's; it
+answers at once, so that an answer waits for no cycle either.
 """
 
 from __future__ import annotations
@@ -30,12 +32,14 @@ RECENT = 32
 """Round trips of which the best one counts."""
 PING_NS = 500_000_000
 EAGER_NS = 20_000_000
-"""Time between two pings to a rack; the second before `EAGER` round trips have come back, to know it soon."""
+"""Time between two pings to a rack; the second before `EAGER` round trips have come back, to know
+it soon."""
 EAGER = 8
 UNANSWERED = 64
 """Newest pings to a rack whose answers still count: the round trip may take more than a second."""
 ANSWER_NS = 5_000_000
-"""Shortest time between two answers to one rack: a flood of pings is not answered by one of pongs."""
+"""Shortest time between two answers to one rack: a flood of pings is not answered by one of
+pongs."""
 MOST_ASKERS = 1024
 """Racks that get answers."""
 UNKNOWN_NS = 1_000_000_000
@@ -48,7 +52,8 @@ _PONG_KIND = kind_of("pong", 1, np.dtype([("launch", "<u8"), ("stamps", "<i8", 4
 
 
 class RoundTrip(NamedTuple):
-    """A ping and its answer, ns of CLOCK_MONOTONIC: sent and arrived here, received and answered there."""
+    """A ping and its answer, ns of CLOCK_MONOTONIC: sent and arrived here, received and answered
+    there."""
 
     sent: int
     received: int
@@ -75,13 +80,15 @@ class RoundTrip(NamedTuple):
 class ClockOffset:
     """The offset of another clock, from the best of the recent round trips.
 
-    One that contradicts the estimate begins a new one: a clock has stepped, as it does while a machine sleeps.
+    One that contradicts the estimate begins a new one: a clock has stepped, as it does while a
+    machine sleeps.
     """
 
     def __init__(self) -> None:
         self._recent: deque[RoundTrip] = deque(maxlen=RECENT)
         self.best: RoundTrip | None = None
-        """The round trip with the smallest uncertainty: at one time as at any other, as all grow alike."""
+        """The round trip with the smallest uncertainty: at one time as at any other, as all grow
+        alike."""
         self.steps = 0
 
     def __len__(self) -> int:
@@ -110,7 +117,8 @@ class ClockOffset:
 
 @dataclass
 class PeerClock:
-    """The clock of one rack, and its grid: CLOCK_MONOTONIC of its tick 0, 0 before that; its period; simulated time."""
+    """The clock of one rack, and its grid: CLOCK_MONOTONIC of its tick 0, 0 before that; its
+    period; simulated time."""
 
     peer: PeerRack
     put: Any = None
@@ -135,11 +143,16 @@ class PeerClock:
 
     def time_ns(self, stamp_ns: int) -> int:
         """Return its simulated time at a CLOCK_MONOTONIC of its machine; 0 before its tick 0."""
-        return max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns if self.epoch_ns else 0
+        return (
+            max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns
+            if self.epoch_ns
+            else 0
+        )
 
 
 class Responder:
-    """Answers the pings of other racks from the network's threads, each rack's at a bounded rate."""
+    """Answers the pings of other racks from the network's threads, each rack's at a bounded
+    rate."""
 
     def __init__(self, segment: Segment, launch: int) -> None:
         self._rack = segment.rack
@@ -186,7 +199,8 @@ class Responder:
 
 
 class Clocks:
-    """Compares the clocks of all peers with ours; not in lockstep, where all racks have one simulated time."""
+    """Compares the clocks of all peers with ours; not in lockstep, where all racks have one
+    simulated time."""
 
     def __init__(self, segment: Segment, peers: Peers, launch: int, grid: OwnGrid) -> None:
         self._rack = segment.rack
@@ -207,7 +221,9 @@ class Clocks:
         self._sealer = sealer
         self.responder.open(link, sealer)
         # A tuple is whole or not there: no lock is needed.
-        link.on(f"rack/*/pong/{self._rack}", lambda pong: self._arrived.append((monotonic_ns(), pong)))
+        link.on(
+            f"rack/*/pong/{self._rack}", lambda pong: self._arrived.append((monotonic_ns(), pong))
+        )
         for rack, clock in self._clocks.items():
             clock.put = link.publish(self._ping_key(rack))
 
@@ -247,10 +263,17 @@ class Clocks:
             return False
         clock = self._clocks.get(pong.key.split("/")[1])
         launch, received, epoch, period, clock_ns = _PONG.unpack(pong.payload)
-        if clock is None or launch != self._launch or head.launch != clock.peer.launch or min(period, clock_ns) < 1:
+        if (
+            clock is None
+            or launch != self._launch
+            or head.launch != clock.peer.launch
+            or min(period, clock_ns) < 1
+        ):
             return False
         sent = clock.sent.pop(head.serial, None)
-        if sent is None or not clock.offset.add(RoundTrip(sent, received, head.stamp_ns, arrived_ns)):
+        if sent is None or not clock.offset.add(
+            RoundTrip(sent, received, head.stamp_ns, arrived_ns)
+        ):
             return False
         clock.epoch_ns = epoch
         clock.period_ns = period
@@ -258,14 +281,18 @@ class Clocks:
         return True
 
     def is_unanswered(self, peer: PeerRack, tick: int) -> bool:
-        """Say whether the clock of a rack that is there has not been measured for long: its messages are held back."""
+        """Say whether the clock of a rack that is there has not been measured for long: its
+        messages are held back."""
         is_unknown = peer.is_there and peer.offset_ns is None and not self._grid.is_lockstep
         return is_unknown and tick - peer.since > self._grid.ticks_in(UNKNOWN_NS)
 
     def count(self, record: Any) -> None:
         """Write the counts into the group of a status."""
         answering = self.responder
-        fill_counts(record, (self.taken, answering.answered, answering.withheld, answering.refused + self.refused))
+        fill_counts(
+            record,
+            (self.taken, answering.answered, answering.withheld, answering.refused + self.refused),
+        )
 
     def fill(self, out: Any, rack: str, tick: int) -> None:
         """Write what is known of a rack's clock into its mailbox: see `rack.levels.peer`."""

@@ -1,4 +1,5 @@
-"""`[adapter.lan]`: what a rack exchanges with others over a network, with whom, and by which rules."""
+"""`[adapter.lan]`: what a rack exchanges with others over a network, with whom, and by which
+rules."""
 
 from __future__ import annotations
 
@@ -16,12 +17,17 @@ FASTEST_HZ = 50.0
 """Fastest exchange over a network."""
 OnPeerLoss = Literal["hold", "stop", "go on"]
 Right = Literal["watch", "command", "stop"]
-Rights = Annotated[tuple[Right, ...], BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given)]
+Rights = Annotated[
+    tuple[Right, ...],
+    BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),
+]
 PeerName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
 EndpointText = Annotated[str, AfterValidator(proper)]
 Local = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
-Remote = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
+Remote = Annotated[
+    str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")
+]
 TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 ENDPOINT_NOTE = "as in tls/192.168.1.5:7447 or tcp/127.0.0.1:7447"
 
@@ -29,18 +35,27 @@ ENDPOINT_NOTE = "as in tls/192.168.1.5:7447 or tcp/127.0.0.1:7447"
 class ExportConfig(Table):
     """`[adapter.lan.export.<port>]`: one mailbox of this rack that others may import."""
 
-    source: Local = Field(alias="from", description="mailbox, as in task.status; others import it as RACK/task.status")
-    rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's")
+    source: Local = Field(
+        alias="from", description="mailbox, as in task.status; others import it as RACK/task.status"
+    )
+    rate_hz: float = Field(
+        10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's"
+    )
 
 
 class ImportConfig(Table):
-    """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as `lan.<port>`."""
+    """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as
+    `lan.<port>`."""
 
     source: Remote = Field(alias="from", description="rack and mailbox, as in cell/task.orders")
     type: TypeName = Field(description="message type of that mailbox, package.module:TYPE")
-    rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's")
+    rate_hz: float = Field(
+        10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's"
+    )
     max_age_ms: Positive = Field(
-        description="age from which a message is old and its writer counts as lost, ms; simulated time"
+        description=(
+            "age from which a message is old and its writer counts as lost, ms; simulated time"
+        )
     )
 
     @property
@@ -63,42 +78,64 @@ class ImportConfig(Table):
 
 
 class LanTable(Table):
-    """The keys of `[adapter.lan]` that concern the network; those of its board are declared with the boards'."""
+    """The keys of `[adapter.lan]` that concern the network; those of its board are declared with
+    the boards'."""
 
     listen: tuple[EndpointText, ...] = Field(
         (), description=f"endpoints where other racks find this one, {ENDPOINT_NOTE}"
     )
-    connect: tuple[EndpointText, ...] = Field((), description=f"endpoints of other racks, {ENDPOINT_NOTE}")
+    connect: tuple[EndpointText, ...] = Field(
+        (), description=f"endpoints of other racks, {ENDPOINT_NOTE}"
+    )
     certificates: str | None = Field(
-        None, description="folder with this rack's certificate, key and secret; see rack lan certificates --help"
+        None,
+        description=(
+            "folder with this rack's certificate, key and secret; see rack lan certificates --help"
+        ),
     )
     insecure: bool = Field(False, description="permit endpoints beyond loopback without TLS")
-    lease_ms: float = Field(200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms")
+    lease_ms: float = Field(
+        200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms"
+    )
     on_peer_loss: OnPeerLoss = Field(
         "hold",
-        description="while a rack that was there is lost: hold: levels find what it writes lost at once, and hold, "
-        "until its first message after that; stop: the same, and the arm ramps to rest, then brakes, until it is back; "
-        "go on: levels keep its last message, however old",
+        description=(
+            "while a rack that was there is lost: hold: levels find what it writes lost at once,"
+            " and hold, until its first message after that; stop: the same, and the arm ramps to"
+            " rest, then brakes, until it is back; go on: levels keep its last message, however old"
+        ),
     )
     peers: tuple[PeerName, ...] = Field(
         (),
-        description="racks with which this one works, besides those from which it imports: they may import, and "
-        "lockstep waits for them",
+        description=(
+            "racks with which this one works, besides those from which it imports: they may import,"
+            " and lockstep waits for them"
+        ),
     )
     permit: dict[PeerName, Rights] = Field(
         {},
-        description="what others may do besides exchanging mailboxes, by name; watch: read status and signals; "
-        "command: command levels; stop: set the emergency stop",
+        description=(
+            "what others may do besides exchanging mailboxes, by name; watch: read status and"
+            " signals; command: command levels; stop: set the emergency stop"
+        ),
     )
-    most_bytes: int = Field(16_384, ge=64, le=1 << 20, description="length of the longest message taken; bytes")
-    exports: dict[PortName, ExportConfig] = Field({}, alias="export", description="mailboxes that others may import")
-    imports: dict[PortName, ImportConfig] = Field({}, alias="import", description="mailboxes of other racks, by port")
+    most_bytes: int = Field(
+        16_384, ge=64, le=1 << 20, description="length of the longest message taken; bytes"
+    )
+    exports: dict[PortName, ExportConfig] = Field(
+        {}, alias="export", description="mailboxes that others may import"
+    )
+    imports: dict[PortName, ImportConfig] = Field(
+        {}, alias="import", description="mailboxes of other racks, by port"
+    )
 
     @property
     def endpoints(self) -> Iterator[tuple[str, Endpoint]]:
         """Yield each endpoint with its place in the table, as in listen[0]."""
         for key in ("listen", "connect"):
-            yield from ((f"{key}[{at}]", Endpoint.of(text)) for at, text in enumerate(getattr(self, key)))
+            yield from (
+                (f"{key}[{at}]", Endpoint.of(text)) for at, text in enumerate(getattr(self, key))
+            )
 
     @property
     def has_tls(self) -> bool:

@@ -38,7 +38,8 @@ class ImportCount:
 
 
 class MessageOrder:
-    """The messages of one import as they were sent: which is new, which came twice, which are missing.
+    """The messages of one import as they were sent: which is new, which came twice, which are
+    missing.
 
     `launch`, `number` and `serial` are those of the newest one: see `Envelope`.
     """
@@ -58,7 +59,8 @@ class MessageOrder:
         self._came = _WHOLE
 
     def admits(self, head: Envelope) -> bool:
-        """Say whether a message is newer than all before it; count what is missing, or why it is not."""
+        """Say whether a message is newer than all before it; count what is missing, or why it is
+        not."""
         if head.launch != self.launch:
             self._begin(head)
         if head.serial <= self.serial:

@@ -1,9 +1,10 @@
-"""The credentials of a rack on the network: a folder with the authority, its own certificate and key, and the secret.
+"""The credentials of a rack on the network: a folder with the authority, its own certificate and
+key, and the secret.
 
-authority.pem    certificates of the authority that signs every rack of this network
-RACK.pem         certificate of this rack: its common name is the rack's name, its alternative names are addresses
-RACK-key.pem     private key of that certificate, for its owner's eyes only
-secret           32 bytes, or 64 hexadecimal digits: the key of the seals, the same on every machine of this network
+authority.pem    certificates of the authority that signs every rack of this network RACK.pem
+certificate of this rack: its common name is the rack's name, its alternative names are addresses
+RACK-key.pem     private key of that certificate, for its owner's eyes only secret           32
+bytes, or 64 hexadecimal digits: the key of the seals, the same on every machine of this network
 """
 
 from __future__ import annotations
@@ -56,17 +57,23 @@ class Credentials:
         with suppress(ValueError):
             if len(found := bytes.fromhex(content.decode("ascii").strip())) == SECRET_BYTES:
                 return found
-        raise Credential(self.secret_file, f"no secret; permitted: {SECRET_BYTES} bytes, or {2 * SECRET_BYTES} digits")
+        raise Credential(
+            self.secret_file,
+            f"no secret; permitted: {SECRET_BYTES} bytes, or {2 * SECRET_BYTES} digits",
+        )
 
     @property
     def expires(self) -> datetime:
         """When the first of the certificates expires. Raises `Credential`."""
         return min(
-            one.not_valid_after_utc for path in (self.authority, self.certificate) for one in _certificates(path)
+            one.not_valid_after_utc
+            for path in (self.authority, self.certificate)
+            for one in _certificates(path)
         )
 
     def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
-        """Yield what is wrong with each file, now. `addresses` are those at which others reach this rack."""
+        """Yield what is wrong with each file, now. `addresses` are those at which others reach this
+        rack."""
         authorities: list[Certificate] = []
         chain: list[Certificate] = []
         try:
@@ -97,8 +104,13 @@ class Credentials:
             yield Credential(self.certificate, f"for '{name}', not for rack '{self.rack}'")
         if authorities and not _is_issued(chain, authorities):
             yield Credential(self.certificate, f"not signed by {self.authority.name}")
-        if lost := [address for address in addresses if address not in (known := _addresses(chain[0]))]:
-            yield Credential(self.certificate, f"not for address {', '.join(lost)}; for {', '.join(known) or 'none'}")
+        if lost := [
+            address for address in addresses if address not in (known := _addresses(chain[0]))
+        ]:
+            yield Credential(
+                self.certificate,
+                f"not for address {', '.join(lost)}; for {', '.join(known) or 'none'}",
+            )
 
 
 def _content(path: Path, is_private: bool = False) -> bytes:
@@ -107,7 +119,9 @@ def _content(path: Path, is_private: bool = False) -> bytes:
             about = os.fstat(file.fileno())
             if is_private and about.st_mode & OTHERS:
                 mode = stat.S_IMODE(about.st_mode)
-                raise Credential(path, f"others may read it, mode {mode:04o}; permitted: {OWNER_ONLY:04o}")
+                raise Credential(
+                    path, f"others may read it, mode {mode:04o}; permitted: {OWNER_ONLY:04o}"
+                )
             if about.st_size > MAX_CREDENTIAL_BYTES:
                 raise Credential(path, f"{about.st_size} bytes; permitted: {MAX_CREDENTIAL_BYTES}")
             return file.read(MAX_CREDENTIAL_BYTES)
@@ -124,7 +138,9 @@ def _certificates(path: Path) -> list[Certificate]:
     try:
         from cryptography.x509 import load_pem_x509_certificates
     except ImportError:
-        raise Credential(path, "cannot be checked without 'cryptography': install nasrem-rack[lan]") from None
+        raise Credential(
+            path, "cannot be checked without 'cryptography': install nasrem-rack[lan]"
+        ) from None
     try:
         found = load_pem_x509_certificates(content)
     except ValueError:
@@ -132,9 +148,13 @@ def _certificates(path: Path) -> list[Certificate]:
     now = datetime.now(UTC)
     for certificate in found:
         if now > certificate.not_valid_after_utc:
-            raise Credential(path, f"expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC")
+            raise Credential(
+                path, f"expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
+            )
         if now < certificate.not_valid_before_utc:
-            raise Credential(path, f"not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC")
+            raise Credential(
+                path, f"not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
+            )
     return found
 
 
@@ -169,7 +189,8 @@ def _addresses(certificate: Certificate) -> list[str]:
 
 
 def _is_issued(chain: list[Certificate], authorities: list[Certificate]) -> bool:
-    """Say whether each certificate of a chain is signed by the next, and one of them by an authority."""
+    """Say whether each certificate of a chain is signed by the next, and one of them by an
+    authority."""
     for at, certificate in enumerate(chain):
         if any(_issued(certificate, authority) for authority in authorities):
             return True

@@ -1,11 +1,14 @@
-"""The desk of a rack's network adapter: it answers questions from other machines, in the adapter's cycles.
+"""The desk of a rack's network adapter: it answers questions from other machines, in the adapter's
+cycles.
 
-What others may ask is in `[adapter.lan.permit]`; the rest is refused. A question that is malformed, unsigned or
-oversized gets no answer at all. Answers and bytes of a cycle are bounded, whatever comes: what exceeds them waits, and
-in the end is overwritten by newer questions. The emergency stop has a channel of its own, and comes first.
+What others may ask is in `[adapter.lan.permit]`; the rest is refused. A question that is malformed,
+unsigned or oversized gets no answer at all. Answers and bytes of a cycle are bounded, whatever
+comes: what exceeds them waits, and in the end is overwritten by newer questions. The emergency stop
+has a channel of its own, and comes first.
 
-Commands go into the operator table, as those of an operator at the rack. A request waits there as long as its client
-asks on: `CLIENT_S` after its last question, or at the end of this process, it is withdrawn.
+Commands go into the operator table, as those of an operator at the rack. A request waits there as
+long as its client asks on: `CLIENT_S` after its last question, or at the end of this process, it is
+withdrawn.
 """
 
 from __future__ import annotations
@@ -24,7 +27,13 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.host_ring import ProperContent
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message, fill_counts
-from rack.backplane.operator_table import OperatorTable, Request, RequestClaim, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    OperatorTable,
+    Request,
+    RequestClaim,
+    RequestStage,
+    RequestWord,
+)
 from rack.backplane.segment import VERSION, Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, System
@@ -57,10 +66,11 @@ CLIENT_S = 2.0
 WATCHED_S = 1.0
 LINGER_S = 0.3
 PAUSE_S = 0.005
-"""At the end of a run: time since the last look from which nobody watches any more, how long those who do may still
-look, and how often the desk then has a cycle; real time."""
+"""At the end of a run: time since the last look from which nobody watches any more, how long those
+who do may still look, and how often the desk then has a cycle; real time."""
 STALE_S = 0.5
-"""How much longer than its ticks a cycle may take, real time, before commands that came meanwhile are dropped."""
+"""How much longer than its ticks a cycle may take, real time, before commands that came meanwhile
+are dropped."""
 REMEMBERED = 64
 """Commands of which the desk remembers that it gave them, in case they are asked for again."""
 MOST_CLIENTS = 16
@@ -95,7 +105,8 @@ class Asked(NamedTuple):
 
 @dataclass
 class Waiting:
-    """A request in the operator table, of a client's session, and until when that counts as there, CLOCK_MONOTONIC."""
+    """A request in the operator table, of a client's session, and until when that counts as there,
+    CLOCK_MONOTONIC."""
 
     session: tuple[str, int]
     claim: RequestClaim
@@ -105,13 +116,18 @@ class Waiting:
     def waits(self) -> bool:
         """Whether it has not been issued yet."""
         entry = self.claim.entry
-        return entry[RequestWord.TICKET] == self.claim.ticket and entry.stage == RequestStage.WAITING
+        return (
+            entry[RequestWord.TICKET] == self.claim.ticket and entry.stage == RequestStage.WAITING
+        )
 
 
 class Desk:
-    """Answers the questions to one rack. An emergency stop from another machine is one of its `findings`."""
+    """Answers the questions to one rack. An emergency stop from another machine is one of its
+    `findings`."""
 
-    def __init__(self, segment: Segment, grid: OwnGrid, permit: Permit, findings: list[Finding]) -> None:
+    def __init__(
+        self, segment: Segment, grid: OwnGrid, permit: Permit, findings: list[Finding]
+    ) -> None:
         self._segment = segment
         self._grid = grid
         self._findings = findings
@@ -119,8 +135,12 @@ class Desk:
         self._lines = UtilityLines(segment)
         self._table = OperatorTable(segment)
         boxes = enumerate(segment.layout.mailboxes)
-        self._boxes = {at: box for at, box in boxes if box.writer == CLOCK and box.name.endswith(".operator")}
-        self._hosts = [segment.map.blocks[host.name] + 8 * Block.PID for host in segment.layout.hosts]
+        self._boxes = {
+            at: box for at, box in boxes if box.writer == CLOCK and box.name.endswith(".operator")
+        }
+        self._hosts = [
+            segment.map.blocks[host.name] + 8 * Block.PID for host in segment.layout.hosts
+        ]
         self._channels: dict[Right, Callable[[], Iterator[Question]]] = {}
         self._waiting: list[Waiting] = []
         self._given: deque[tuple[tuple[str, int, int], Ticket]] = deque(maxlen=REMEMBERED)
@@ -134,7 +154,9 @@ class Desk:
         self._sealer = link.sealer
         self._launch = launch
         rights: tuple[Right, ...] = ("stop", "command", "watch")
-        self._channels = {right: link.answer(f"rack/{link.rack}/ask/{ASKED[right]}/*/*") for right in rights}
+        self._channels = {
+            right: link.answer(f"rack/{link.rack}/ask/{ASKED[right]}/*/*") for right in rights
+        }
 
     def answer(self, tick: int) -> None:
         """Answer the questions that have come, within the bounds of a cycle."""
@@ -156,7 +178,8 @@ class Desk:
             self._dismiss()
 
     def _drop_stale(self, tick: int) -> None:
-        """Drop commands that waited while the rack was held: who gave them may have gone, or asks again."""
+        """Drop commands that waited while the rack was held: who gave them may have gone, or asks
+        again."""
         now = time.monotonic_ns()
         ticks = tick - self._tick
         if now - self._cycled_ns > STALE_S * 1e9 + ticks * self._segment.words[System.PERIOD_NS]:
@@ -178,7 +201,8 @@ class Desk:
         self.count = DeskCount(*record.tolist())
 
     def fill(self, record: object) -> None:
-        """Write its counts into the group of a status; in lockstep none, since they do not depend on ticks alone."""
+        """Write its counts into the group of a status; in lockstep none, since they do not depend
+        on ticks alone."""
         if not self._grid.is_lockstep:
             fill_counts(record, (self.count.answered, self.count.refused, self.count.dropped))
 
@@ -217,14 +241,26 @@ class Desk:
         self.count.answered += is_granted
         self.count.refused += not is_granted
         self._sent += len(content)
-        hosts = sum(self._segment.is_locked(address) << at for at, address in enumerate(self._hosts[:64]))
-        payload = DeskAnswer(code, tick, time.monotonic_ns(), time.time_ns(), hosts, content).packed()
+        hosts = sum(
+            self._segment.is_locked(address) << at for at, address in enumerate(self._hosts[:64])
+        )
+        payload = DeskAnswer(
+            code, tick, time.monotonic_ns(), time.time_ns(), hosts, content
+        ).packed()
         head = asked.head
         grid = self._grid
         stamped = Envelope(
-            VERSION, self._launch, head.serial, head.launch, tick, grid.time_ns(tick), grid.stamp_ns(tick)
+            VERSION,
+            self._launch,
+            head.serial,
+            head.launch,
+            tick,
+            grid.time_ns(tick),
+            grid.stamp_ns(tick),
         )
-        asked.question.reply(payload, self._sealer.seal(answer_key(asked.question.key), stamped, payload))
+        asked.question.reply(
+            payload, self._sealer.seal(answer_key(asked.question.key), stamped, payload)
+        )
 
     def _stop(self, asker: str) -> tuple[Code, bytes]:
         if not self._lines.emergency_stop:
@@ -266,14 +302,20 @@ class Desk:
         box = self._boxes.get(request.mailbox)
         if box is None or len(request.message) != box.size:
             return False
-        message = Message(message_dtype(box.fields, box.size), memoryview(bytearray(request.message)))
+        message = Message(
+            message_dtype(box.fields, box.size), memoryview(bytearray(request.message))
+        )
         return ProperContent(box.fields)(message)
 
     def _withdraw(self, asked: Asked) -> tuple[Code, bytes]:
         ticket = Ticket.unpacked(asked.question.payload)
         session = asked.asker, asked.head.launch
         for waiting in self._waiting:
-            if ticket is not None and waiting.session == session and waiting.claim.ticket == ticket.number:
+            if (
+                ticket is not None
+                and waiting.session == session
+                and waiting.claim.ticket == ticket.number
+            ):
                 waiting.until_ns = 0
         return Code.GRANTED, b""
 

@@ -57,7 +57,8 @@ class Export:
         self.every = grid.cycles(self._rate_hz)
 
     def recall(self, tick: int, ticks: int) -> None:
-        """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its cycle."""
+        """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its
+        cycle."""
         if (tick // ticks) % self.every:
             return
         self._source.read(tick - self.every * ticks)
@@ -70,7 +71,8 @@ class Export:
 
     def exchange(self, tick: int) -> None:
         """Send the newest message, if it is new or asked for."""
-        # Not the reading of the port: it does not say which message it is, and when that was written.
+        # Not the reading of the port: it does not say which message it is, and when that was
+        # written.
         source = self._source
         grid = self._grid
         reading = source.read(tick)
@@ -96,8 +98,9 @@ class Export:
 class Import:
     """A mailbox of another rack: the newest good message of each exchange becomes one here.
 
-    Its type is that of the mailbox `lan.<port>` into which it is written. While its rack is lost, and until its first
-    message after that, readers there find the writer lost or, if levels are to go on, the last message not too old.
+    Its type is that of the mailbox `lan.<port>` into which it is written. While its rack is lost,
+    and until its first message after that, readers there find the writer lost or, if levels are to
+    go on, the last message not too old.
     """
 
     def __init__(self, segment: Segment, own: str, table: ImportConfig, peer: PeerRack) -> None:
@@ -156,7 +159,11 @@ class Import:
         newest: Envelope | None = None
         for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
             head = self._opened(arrived)
-            if head is not None and self._is_due(head, arrived, came, tick) and self._is_next(head, arrived.payload):
+            if (
+                head is not None
+                and self._is_due(head, arrived, came, tick)
+                and self._is_next(head, arrived.payload)
+            ):
                 self.count.superseded += newest is not None
                 newest = head
         if newest is None:
@@ -174,16 +181,23 @@ class Import:
             self._switch(False, tick + self._delay)
 
     def _opened(self, arrived: Arrived) -> Envelope | None:
-        """Return the head of what came, if it may be a message of this mailbox; else count that it was refused."""
+        """Return the head of what came, if it may be a message of this mailbox; else count that it
+        was refused."""
         head = self._sealer.opened(arrived.key, arrived.envelope, arrived.payload)
         is_fit = len(arrived.payload) == len(self._buffer.raw)
-        if not isinstance(head, Flaw) and head.kind == self._kind and is_fit and max(head[1:4]) < LARGEST:
+        if (
+            not isinstance(head, Flaw)
+            and head.kind == self._kind
+            and is_fit
+            and max(head[1:4]) < LARGEST
+        ):
             return head
         self.count.refused += 1
         return None
 
     def _is_due(self, head: Envelope, arrived: Arrived, came: int, tick: int) -> bool:
-        """Say whether a message is of the launch that is there, and of known age. If it may yet be, keep it for later.
+        """Say whether a message is of the launch that is there, and of known age. If it may yet be,
+        keep it for later.
 
         In lockstep it is: see `Barrier`.
         """

@@ -1,8 +1,9 @@
-"""The envelope of a message on the network: from which launch and which write it is, when it was written, and a seal.
+"""The envelope of a message on the network: from which launch and which write it is, when it was
+written, and a seal.
 
-The payload is the message as it lies in its mailbox; nothing is decoded before the seal is checked. The seal is a keyed
-BLAKE2b over key expression, head and payload: a message cannot be changed, nor passed off as another mailbox's. With an
-empty secret it detects damage only.
+The payload is the message as it lies in its mailbox; nothing is decoded before the seal is checked.
+The seal is a keyed BLAKE2b over key expression, head and payload: a message cannot be changed, nor
+passed off as another mailbox's. With an empty secret it detects damage only.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Envelope(NamedTuple):
     kind: int  # fingerprint of its type: see `kind_of`
     launch: int  # random number of the launch whose backplane it is from
     serial: int  # of the message in its mailbox; of a question, answer or sign, its own
-    number: int  # of the message among those sent from its mailbox: it rises by one, `serial` may by more
+    # of the message among those sent from its mailbox: it rises by one, `serial` may by more
+    number: int
     tick: int  # release of the cycle that wrote it, on its rack's grid
     time_ns: int  # simulated time of that tick
     stamp_ns: int  # CLOCK_MONOTONIC of that tick on its machine; in lockstep the simulated time
@@ -73,7 +75,8 @@ class Sealer:
         return packed + self._seal(key, packed, payload)
 
     def opened(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
-        """Return the head of what has come under a key expression, or what is wrong with it, which is counted."""
+        """Return the head of what has come under a key expression, or what is wrong with it, which
+        is counted."""
         if len(payload) > self._most:
             return self._flawed(Flaw.OVERSIZED)
         if envelope is None or len(envelope) != HEAD_BYTES or envelope[:4] != _MAGIC:

@@ -1,4 +1,5 @@
-"""The grid of this rack next to those of others: ticks as times on another machine's clock, and the other way round."""
+"""The grid of this rack next to those of others: ticks as times on another machine's clock, and the
+other way round."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from rack.boards.lan.peers import PeerRack
 
 
 class OwnGrid:
-    """Converts ticks. In lockstep all racks have one simulated time; in real time each has an epoch of its own.
+    """Converts ticks. In lockstep all racks have one simulated time; in real time each has an epoch
+    of its own.
 
     `every`: ticks of the adapter's cycle.
     """
@@ -37,14 +39,15 @@ class OwnGrid:
         return tick * self._clock_ns
 
     def stamp_ns(self, tick: int) -> int:
-        """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated time."""
+        """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated
+        time."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
 
     def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
         """Return the tick here at which a message was written there, at most `tick`, now.
 
-        The clocks have been compared. It counts as written as early as the uncertainty of that permits: never as
-        younger than it is.
+        The clocks have been compared. It counts as written as early as the uncertainty of that
+        permits: never as younger than it is.
         """
         if self.is_lockstep:
             return min(tick, head.time_ns // self._clock_ns)

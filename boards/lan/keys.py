@@ -1,11 +1,13 @@
 """Key expressions on the network; R is the name of the rack that sends, or that is asked.
 
-    rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is silent for the lease;
-                                   in lockstep its cycle follows, ns, after a hyphen
+    rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is
+                                   silent for the lease; in lockstep its cycle follows,
+                                   ns, after a hyphen
     rack/R/out/<board>/<port>      an exported mailbox
     rack/R/step                    lockstep: a cycle of R's adapter, with all that it exports
     rack/R/ping/<to>, .../pong/<to>   round trips between clocks
-    rack/R/ask/<what>/<from>       a question to R, answered in its adapter's cycles to those who have the right
+    rack/R/ask/<what>/<from>       a question to R, answered in its adapter's cycles to those who
+                                   have the right
 
 All begin with a rack's name, so that access control can hold each rack to its own.
 """
@@ -29,12 +31,14 @@ def out_key(rack: str, mailbox: str) -> str:
 
 
 def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
-    """Return the key expression of a launch's token; in lockstep with the length of its adapter's cycle, ns."""
+    """Return the key expression of a launch's token; in lockstep with the length of its adapter's
+    cycle, ns."""
     return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
 
 
 def launch_and_cycle(alive: str) -> tuple[int, int] | None:
-    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real time.
+    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real
+    time.
 
     None for a token that no adapter has made.
     """
@@ -65,5 +69,6 @@ def pong_key(rack: str, to: str) -> str:
 
 
 def ask_keys(rack: str, what: str = "", asker: str = "") -> str:
-    """Return the key expression of all questions to a rack, or of those of one asker about one thing."""
+    """Return the key expression of all questions to a rack, or of those of one asker about one
+    thing."""
     return f"rack/{rack}/ask/{what}/{asker}/**" if asker else f"rack/{rack}/ask/**"

@@ -1,11 +1,13 @@
-"""The link: a rack's session on the network, with everything that looks for others by itself switched off.
+"""The link: a rack's session on the network, with everything that looks for others by itself
+switched off.
 
-What comes is kept in channels of fixed length, which overwrite the oldest; the adapter takes it in its own cycles.
+What comes is kept in channels of fixed length, which overwrite the oldest; the adapter takes it in
+its own cycles.
 
-Strangers who fail their TLS handshake disturb nobody who is connected. But zenoh takes no new connection for 0.1 s
-after each (its issue 2685), and over quic only one handshake at a time (2719). A rack that also connects outwards is
-found all the same: where strangers may come, let each rack list the others in `connect`, and let the firewall admit
-their addresses alone.
+Strangers who fail their TLS handshake disturb nobody who is connected. But zenoh takes no new
+connection for 0.1 s after each (its issue 2685), and over quic only one handshake at a time (2719).
+A rack that also connects outwards is found all the same: where strangers may come, let each rack
+list the others in `connect`, and let the firewall admit their addresses alone.
 """
 
 from __future__ import annotations
@@ -50,8 +52,8 @@ class Arrived(NamedTuple):
 class Question(NamedTuple):
     """A question that has come. `reply` sends one answer, a payload and its envelope.
 
-    Several answers reach only those who ask with `ConsolidationMode.NONE`. The asker is done when the next question is
-    taken, or none is left.
+    Several answers reach only those who ask with `ConsolidationMode.NONE`. The asker is done when
+    the next question is taken, or none is left.
     """
 
     key: str
@@ -68,7 +70,9 @@ class LanLink:
 
     def __init__(self, rack: str, table: LanTable, asks: bool = False) -> None:
         self.rack = rack
-        credentials = None if table.certificates is None else Credentials(Path(table.certificates), rack)
+        credentials = (
+            None if table.certificates is None else Credentials(Path(table.certificates), rack)
+        )
         try:
             most = MOST_ANSWER if asks else table.most_bytes
             self.sealer = Sealer(credentials.secret if credentials else b"", most)
@@ -76,13 +80,16 @@ class LanLink:
             self.session = zenoh.open(_settings(rack, table, credentials, asks))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
-            raise LevelError(f"adapter.lan: listen {', '.join(table.listen) or 'nowhere'}: {why}") from None
+            raise LevelError(
+                f"adapter.lan: listen {', '.join(table.listen) or 'nowhere'}: {why}"
+            ) from None
         except Credential as flaw:
             raise LevelError(f"adapter.lan: {flaw}") from None
         self._kept: list[Any] = []
 
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends payload and envelope under a key expression, and never waits.
+        """Return a function that sends payload and envelope under a key expression, and never
+        waits.
 
         `reliable`: it waits for room instead; for lockstep only.
         """
@@ -95,7 +102,8 @@ class LanLink:
         return lambda payload, envelope: put(payload, attachment=envelope)
 
     def subscribe(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Arrived]]:
-        """Return a function that yields what has come under a key expression since the last call, oldest first."""
+        """Return a function that yields what has come under a key expression since the last call,
+        oldest first."""
         subscriber = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(unread))
         self._kept.append(subscriber)
         take = subscriber.try_recv
@@ -105,21 +113,31 @@ class LanLink:
             for _ in range(unread):
                 if (sample := take()) is None:
                     return
-                yield Arrived(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
+                yield Arrived(
+                    str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()
+                )
 
         return arrived
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
-        """Call a function in a thread of the network with everything that comes under a key expression, at once."""
+        """Call a function in a thread of the network with everything that comes under a key
+        expression, at once."""
 
         def take(sample: zenoh.Sample) -> None:
-            callback(Arrived(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()))
+            callback(
+                Arrived(
+                    str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()
+                )
+            )
 
         # Direct: a thread between would add its wake-up, and a queue without a bound.
-        self._kept.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False)))
+        self._kept.append(
+            self.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False))
+        )
 
     def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
-        """Return a function that yields the questions asked under a key expression since the last call, oldest first.
+        """Return a function that yields the questions asked under a key expression since the last
+        call, oldest first.
 
         A question under several keys at once is dropped unanswered.
         """
@@ -139,11 +157,15 @@ class LanLink:
         return questions
 
     def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
-        """Show others that this launch is there; after everything that they may send it. See `alive_key`."""
-        self._kept.append(self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns)))
+        """Show others that this launch is there; after everything that they may send it. See
+        `alive_key`."""
+        self._kept.append(
+            self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
+        )
 
     def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
-        """Return a function that yields rack, launch, and whether it has come or gone, of others, oldest first."""
+        """Return a function that yields rack, launch, and whether it has come or gone, of others,
+        oldest first."""
         subscriber = self.session.liveliness().declare_subscriber(
             ALL_ALIVE, zenoh.handlers.RingChannel(unread), history=True
         )
@@ -172,14 +194,17 @@ def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
     return lambda payload, envelope: query.reply(query.key_expr, payload, attachment=envelope)
 
 
-def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks: bool) -> zenoh.Config:
+def _settings(
+    rack: str, table: LanTable, credentials: Credentials | None, asks: bool
+) -> zenoh.Config:
     config = zenoh.Config()
 
     def put(key: str, value: Any) -> None:
         config.insert_json5(key, json.dumps(value))
 
     put("mode", "peer")
-    # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it leaves there.
+    # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it leaves
+    # there.
     for key in ("scouting/multicast", "scouting/gossip", "transport/shared_memory", "adminspace"):
         put(f"{key}/enabled", False)
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
@@ -190,22 +215,35 @@ def _settings(rack: str, table: LanTable, credentials: Credentials | None, asks:
     # A peer that is not there yet keeps nobody: opening would wait for it for half a second.
     put("open/return_conditions/connect_scouted", False)
     shortest, longest = RETRY_MS
-    put("connect/retry", {"period_init_ms": shortest, "period_max_ms": longest, "period_increase_factor": 1})
+    put(
+        "connect/retry",
+        {"period_init_ms": shortest, "period_max_ms": longest, "period_increase_factor": 1},
+    )
     put("access_control", access_control(rack, table, asks))
     if credentials is not None and table.has_tls:
         put("transport/link/tls", _tls(credentials))
-    put("transport/link/protocols", sorted({endpoint.protocol for _, endpoint in table.endpoints}) or ["tcp"])
+    put(
+        "transport/link/protocols",
+        sorted({endpoint.protocol for _, endpoint in table.endpoints}) or ["tcp"],
+    )
     # Whoever opens a connection and says no more is forgotten; these many at once are borne.
     put("transport/unicast/accept_timeout", HANDSHAKE_MS)
     put("transport/unicast/open_timeout", HANDSHAKE_MS)
-    put("transport/link/rx/max_message_size", max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES)
+    put(
+        "transport/link/rx/max_message_size",
+        max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES,
+    )
     put("transport/link/tx/lease", round(table.lease_ms))
     put("transport/link/tx/keep_alive", KEEP_ALIVES)
     put("transport/link/tx/queue/size/real_time", 16)
-    # An answer takes over the congestion control of its question: whoever asks must not make the adapter wait.
+    # An answer takes over the congestion control of its question: whoever asks must not make the
+    # adapter wait.
     put("qos/network", [NO_WAIT])
     # What does wait for room, in lockstep, waits no longer than until the peer counts as lost.
-    put("transport/link/tx/queue/congestion_control/block/wait_before_close", round(table.lease_ms * 1e3))
+    put(
+        "transport/link/tx/queue/congestion_control/block/wait_before_close",
+        round(table.lease_ms * 1e3),
+    )
     return config
 
 

@@ -1,18 +1,21 @@
-"""Racks in lockstep step as one: each cycle of an adapter ends when those of all racks that work together have begun.
+"""Racks in lockstep step as one: each cycle of an adapter ends when those of all racks that work
+together have begun.
 
-In the cycle released at simulated time t an adapter sends its step: the time t, and everything that its rack exports
-then. It waits for the step of t from every other rack, then passes on what they have exported up to t. As a message
-becomes visible at the end of its cycle, nobody needs more, and the imports depend on ticks alone. No clock gets further
-ahead of another than two of these cycles, and while one is held, all are.
+In the cycle released at simulated time t an adapter sends its step: the time t, and everything that
+its rack exports then. It waits for the step of t from every other rack, then passes on what they
+have exported up to t. As a message becomes visible at the end of its cycle, nobody needs more, and
+the imports depend on ticks alone. No clock gets further ahead of another than two of these cycles,
+and while one is held, all are.
 
-Exports travel in the step: a cycle costs one message, and nothing depends on the order of several. Alternatives
-considered: a mark after the exports (each costs a message, and the network keeps order within one key only), a barrier
-in the clock at every tick (the clock would wait for the network even where no message is due; an adapter at the rate of
-the clock comes to the same), and one rack that steps the others (one more process on which all depend).
+Exports travel in the step: a cycle costs one message, and nothing depends on the order of several.
+Alternatives considered: a mark after the exports (each costs a message, and the network keeps order
+within one key only), a barrier in the clock at every tick (the clock would wait for the network
+even where no message is due; an adapter at the rate of the clock comes to the same), and one rack
+that steps the others (one more process on which all depend).
 
-A step that somebody could not receive is sent again: to a rack that comes, and to an adapter that sends its first. A
-rack whose adapter dies is awaited, since its board may be restarted; one that ends says so, and is lost from the next
-cycle on.
+A step that somebody could not receive is sent again: to a rack that comes, and to an adapter that
+sends its first. A rack whose adapter dies is awaited, since its board may be restarted; one that
+ends says so, and is lost from the next cycle on.
 """
 
 from __future__ import annotations
@@ -44,8 +47,8 @@ NEVER = -1
 class Partner:
     """A rack that steps with this one.
 
-    `launch` is that of its steps, `time_ns` the simulated time of the newest; `steps` are not passed on yet. Nothing
-    more comes of one that `is_out`.
+    `launch` is that of its steps, `time_ns` the simulated time of the newest; `steps` are not
+    passed on yet. Nothing more comes of one that `is_out`.
     """
 
     def __init__(self, rack: str, place: int) -> None:
@@ -92,7 +95,9 @@ class Barrier:
     Exports and imports use it in place of the network: they `publish` and `subscribe`.
     """
 
-    def __init__(self, segment: Segment, board: str, racks: Iterable[str], lost: Iterable[str]) -> None:
+    def __init__(
+        self, segment: Segment, board: str, racks: Iterable[str], lost: Iterable[str]
+    ) -> None:
         """Step with `racks`, except those that an adapter before this one has `lost`."""
         self._segment, self._words, self._block = segment, segment.words, segment.block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
@@ -132,14 +137,18 @@ class Barrier:
             if self._is_restarted:
                 # It may have ended meanwhile.
                 partner.gone_s = time.monotonic()
-        self._kept.append(link.session.liveliness().declare_subscriber(ALL_ALIVE, handler, history=True))
+        self._kept.append(
+            link.session.liveliness().declare_subscriber(ALL_ALIVE, handler, history=True)
+        )
 
     def publish(self, key: str) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends payload and envelope under a key expression, in the step of this cycle."""
+        """Return a function that sends payload and envelope under a key expression, in the step of
+        this cycle."""
         return lambda payload, envelope: self._exports.append(Arrived(key, envelope, payload))
 
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
-        """Return a function that yields what others have sent under a key expression up to this cycle, once."""
+        """Return a function that yields what others have sent under a key expression up to this
+        cycle, once."""
         return partial(_emptied, self._imports.setdefault(key, deque()))
 
     def changes(self) -> Iterator[tuple[str, int, bool]]:
@@ -158,7 +167,8 @@ class Barrier:
         self._steps.append((tick * self._tick_ns, content))
 
     def meet(self, tick: int) -> bool:
-        """Send the step of this cycle, and wait for those of all others; return False if the run is over.
+        """Send the step of this cycle, and wait for those of all others; return False if the run is
+        over.
 
         Raises `CannotGoOn` if a rack cannot step with this one.
         """
@@ -168,7 +178,9 @@ class Barrier:
             self._send_again(StepFlag.FIRST)
         else:
             self._send(*self._steps[-1], StepFlag(0))
-        while late := [partner for partner in self._partners.values() if not partner.has_reached(now_ns)]:
+        while late := [
+            partner for partner in self._partners.values() if not partner.has_reached(now_ns)
+        ]:
             try:
                 self._note(self._events.get(timeout=LOOK_S))
             except Empty:
@@ -183,14 +195,17 @@ class Barrier:
         return True
 
     def close(self) -> None:
-        """Let the others go on without this rack, if its run has ended: a board alone may come back."""
+        """Let the others go on without this rack, if its run has ended: a board alone may come
+        back."""
         if self._steps and (self._is_over or self._has_refused):
             self._send(*self._steps[-1], StepFlag.OVER | self._first)
 
     def _send(self, time_ns: int, content: bytes, flags: StepFlag) -> None:
         self._sent += 1
         tick = time_ns // self._tick_ns
-        head = Envelope(STEP_KIND, self._launch, self._sent, self._sent, tick, time_ns, time_ns, flags)
+        head = Envelope(
+            STEP_KIND, self._launch, self._sent, self._sent, tick, time_ns, time_ns, flags
+        )
         self._put(content, self._sealer.seal(self._key, head, content))
 
     def _send_again(self, flags: StepFlag) -> None:
@@ -248,24 +263,26 @@ class Barrier:
         self._check_cycle(partner, step.cycle_ns)
         if not step.flags & StepFlag.OVER and self._rack not in step.racks:
             self._refuse(
-                f"rack '{partner.rack}' does not wait for '{self._rack}' in lockstep: name it in adapter.lan.peers "
-                "there, and start all racks anew"
+                f"rack '{partner.rack}' does not wait for '{self._rack}' in lockstep: name it in"
+                " adapter.lan.peers there, and start all racks anew"
             )
         if not self._has_begun and partner.time_ns == NEVER and step.time_ns > self._now_ns:
             self._refuse(
-                f"rack '{partner.rack}' is at {step.time_ns * 1e-9:g} s already: racks in lockstep begin together, "
-                "start all anew"
+                f"rack '{partner.rack}' is at {step.time_ns * 1e-9:g} s already: racks in lockstep"
+                " begin together, start all anew"
             )
         partner.take(step)
         if partner.is_out and step.flags & StepFlag.FIRST and not self._has_begun:
             # Neither has begun: it may be started again.
             partner.forget()
         elif step.flags & StepFlag.FIRST:
-            # Before this rack goes on: it may come too late for the other one to have received its step.
+            # Before this rack goes on: it may come too late for the other one to have received its
+            # step.
             self._send_again(StepFlag(0))
 
     def _is_of(self, partner: Partner, launch: int) -> bool:
-        """Say whether a launch is the one that steps with this rack; one that comes later takes no part."""
+        """Say whether a launch is the one that steps with this rack; one that comes later takes no
+        part."""
         if partner.launch != launch:
             if self._has_begun and partner.launch != NONE:
                 partner.is_out = True

@@ -1,4 +1,5 @@
-"""The status of a network adapter: its exchange, entry by entry. Of other racks see `rack.levels.peer`."""
+"""The status of a network adapter: its exchange, entry by entry. Of other racks see
+`rack.levels.peer`."""
 
 from __future__ import annotations
 
@@ -23,10 +24,20 @@ IMPORT = MessageType(
         Field("disordered", "u4", "1", "messages that came after a later one, and were not passed"),
         Field("repeated", "u4", "1", "messages that came twice"),
         Field("late", "u4", "1", "messages older than max_age_ms when they came"),
-        Field("refused", "u4", "1", "messages refused: malformed, unsigned, oversized, or not what its type permits"),
+        Field(
+            "refused",
+            "u4",
+            "1",
+            "messages refused: malformed, unsigned, oversized, or not what its type permits",
+        ),
         Field("unknown_launch", "u4", "1", "messages of a launch that is over, or not there"),
         Field("superseded", "u4", "1", "messages that a newer one overtook before the exchange"),
-        Field("launch", "i8", "1", "number of the launch that wrote the newest message taken; 0: none, or in lockstep"),
+        Field(
+            "launch",
+            "i8",
+            "1",
+            "number of the launch that wrote the newest message taken; 0: none, or in lockstep",
+        ),
         Field("number", "i8", "1", "number of that message among those sent from its mailbox"),
         Field("serial", "i8", "1", "its serial in its mailbox; 0: none"),
         Field("age", "i8", "tick", "age of its information in this rack's ticks; -1: none yet"),
@@ -37,8 +48,18 @@ FLAWS = MessageType(
     "lan_flaws",
     1,
     (
-        Field("malformed", "u4", "1", "not of this protocol, or of another version of it; in lockstep always 0"),
-        Field("unsigned", "u4", "1", "changed on the way, under another key, or sealed with another secret; likewise"),
+        Field(
+            "malformed",
+            "u4",
+            "1",
+            "not of this protocol, or of another version of it; in lockstep always 0",
+        ),
+        Field(
+            "unsigned",
+            "u4",
+            "1",
+            "changed on the way, under another key, or sealed with another secret; likewise",
+        ),
         Field("oversized", "u4", "1", "longer than most_bytes; likewise"),
     ),
 )
@@ -48,17 +69,33 @@ CLOCKS = MessageType(
     (
         Field("taken", "u4", "1", "round trips measured"),
         Field("answered", "u4", "1", "pings of other racks answered"),
-        Field("withheld", "u4", "1", "pings not answered: they came too fast, or from too many racks"),
-        Field("refused", "u4", "1", "pings and answers refused: malformed, unsigned, or to nothing that was asked"),
+        Field(
+            "withheld", "u4", "1", "pings not answered: they came too fast, or from too many racks"
+        ),
+        Field(
+            "refused",
+            "u4",
+            "1",
+            "pings and answers refused: malformed, unsigned, or to nothing that was asked",
+        ),
     ),
 )
 DESK = MessageType(
     "lan_desk",
     1,
     (
-        Field("answered", "u4", "1", "questions from other machines that were answered; in lockstep always 0"),
-        Field("refused", "u4", "1", "questions refused: not permitted, or not to be done; likewise"),
-        Field("dropped", "u4", "1", "questions dropped: malformed, unsigned or oversized; likewise"),
+        Field(
+            "answered",
+            "u4",
+            "1",
+            "questions from other machines that were answered; in lockstep always 0",
+        ),
+        Field(
+            "refused", "u4", "1", "questions refused: not permitted, or not to be done; likewise"
+        ),
+        Field(
+            "dropped", "u4", "1", "questions dropped: malformed, unsigned or oversized; likewise"
+        ),
     ),
 )
 

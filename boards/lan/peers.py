@@ -1,14 +1,16 @@
 """The other racks, as an adapter sees them: there or lost, and which launch.
 
-Each launch of a rack has a number, which its liveliness token and all its messages carry. Tokens come and go in any
-order: the token of a restarted rack may come before that of its last launch has expired, and both may be there when
-this adapter itself has just joined. So:
+Each launch of a rack has a number, which its liveliness token and all its messages carry. Tokens
+come and go in any order: the token of a restarted rack may come before that of its last launch has
+expired, and both may be there when this adapter itself has just joined. So:
 
 - A launch whose token comes is the one that is there. If another was, that one is lost.
 - When its token goes and another one is there, that launch is there; otherwise the rack is lost.
-- A launch that another has replaced, and whose token has gone, is over: no late token or message brings it back.
+- A launch that another has replaced, and whose token has gone, is over: no late token or message
+  brings it back.
 
-In lockstep nothing here follows from when a token comes: the barrier says, cycle by cycle, who is there.
+In lockstep nothing here follows from when a token comes: the barrier says, cycle by cycle, who is
+there.
 """
 
 from __future__ import annotations
@@ -24,16 +26,18 @@ from rack.levels.peer import Presence
 
 NONE = 0
 REMEMBERED = 16
-"""Launches of one rack that are remembered, and tokens of one rack that are followed at a time, at most."""
+"""Launches of one rack that are remembered, and tokens of one rack that are followed at a time, at
+most."""
 Changes = Callable[[], Iterator[tuple[str, int, bool]]]
 
 
 @dataclass
 class PeerRack:
-    """One other rack. `launch`: number of the launch that is there, or was last; 0: none was. Times are ticks.
+    """One other rack. `launch`: number of the launch that is there, or was last; 0: none was. Times
+    are ticks.
 
-    `tokens` are the launches whose tokens are there, oldest first. `confirm_by`: of a rack that was there when an
-    adapter before this one ended, until when its token must have come; -1: it has.
+    `tokens` are the launches whose tokens are there, oldest first. `confirm_by`: of a rack that was
+    there when an adapter before this one ended, until when its token must have come; -1: it has.
     """
 
     rack: str
@@ -120,7 +124,8 @@ class PeerRack:
         self.confirm_by = -1
 
     def joins(self, launch: int, tick: int) -> None:
-        """Note, in lockstep, that it is there: from the start, or still when this adapter has been restarted."""
+        """Note, in lockstep, that it is there: from the start, or still when this adapter has been
+        restarted."""
         if self.presence is Presence.AWAITED:
             self.presence = Presence.THERE
             self.launches = 1
@@ -129,7 +134,8 @@ class PeerRack:
         self.confirm_by = -1
 
     def resume(self, message: Any, confirm_by: int) -> None:
-        """Continue from the message that an adapter before this one wrote: see `rack.levels.peer.PEER`."""
+        """Continue from the message that an adapter before this one wrote: see
+        `rack.levels.peer.PEER`."""
         self.presence = Presence(message.presence)
         self.launch = message.launch
         self.launches = message.launches
@@ -161,7 +167,8 @@ class Peers:
         self.arrivals = 0
 
     def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
-        """Take what comes and goes from now on from this function: rack, launch, whether it has come."""
+        """Take what comes and goes from now on from this function: rack, launch, whether it has
+        come."""
         self._changes = changes
         self._is_lockstep = is_lockstep
 

@@ -1,12 +1,13 @@
 """Questions to a rack from another machine, and their answers, as bytes.
 
-A question is a query under the key `question_key`. Its envelope carries the version of the segment's layout as `kind`,
-a number of the asker's session as `launch`, the number of the question in it as `serial`, and as `number` that of the
-question that it repeats, or its own: an answer may be lost. The answer's envelope carries session and number back, as
-`number` and `serial`: it cannot be passed off as that to another question.
+A question is a query under the key `question_key`. Its envelope carries the version of the
+segment's layout as `kind`, a number of the asker's session as `launch`, the number of the question
+in it as `serial`, and as `number` that of the question that it repeats, or its own: an answer may
+be lost. The answer's envelope carries session and number back, as `number` and `serial`: it cannot
+be passed off as that to another question.
 
-A reader maps a window of another rack's memory into its own, as a bus adapter does: it asks for stretches of the
-segment, and finds out by itself what lies there.
+A reader maps a window of another rack's memory into its own, as a bus adapter does: it asks for
+stretches of the segment, and finds out by itself what lies there.
 """
 
 from __future__ import annotations
@@ -96,7 +97,8 @@ def question_key(rack: str, what: What, asker: str) -> str:
 
 
 def answer_key(question: str) -> str:
-    """Return the key under which the answer to a question is sealed: no question passes for an answer."""
+    """Return the key under which the answer to a question is sealed: no question passes for an
+    answer."""
     return f"{question}/answer"
 
 
@@ -106,7 +108,8 @@ def packed_stretches(stretches: Sequence[Stretch]) -> bytes:
 
 
 def unpacked_stretches(packed: bytes, end: int) -> list[Stretch] | None:
-    """Return the stretches of a question; None if one is outside a segment of `end` bytes, or they are too many."""
+    """Return the stretches of a question; None if one is outside a segment of `end` bytes, or they
+    are too many."""
     if len(packed) % _STRETCH.size or len(packed) > MOST_STRETCHES * _STRETCH.size:
         return None
     found = [Stretch(*pair) for pair in _STRETCH.iter_unpack(packed)]

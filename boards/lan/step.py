@@ -1,4 +1,5 @@
-"""A step: what a rack in lockstep sends at the end of each cycle of its adapter, with all that it exports then."""
+"""A step: what a rack in lockstep sends at the end of each cycle of its adapter, with all that it
+exports then."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class StepFlag(IntFlag):
 
 
 class Step(NamedTuple):
-    """One step of a rack. `cycle_ns`: length of its adapter's cycle; `racks`: those for which it waits."""
+    """One step of a rack. `cycle_ns`: length of its adapter's cycle; `racks`: those for which it
+    waits."""
 
     launch: int
     time_ns: int
@@ -45,7 +47,12 @@ def pack_step(cycle_ns: int, racks: Iterable[str], exports: Iterable[Arrived]) -
     for export in found:
         key = export.key.encode()
         envelope = export.envelope or b""
-        parts += [_PART.pack(len(key), len(envelope), len(export.payload)), key, envelope, export.payload]
+        parts += [
+            _PART.pack(len(key), len(envelope), len(export.payload)),
+            key,
+            envelope,
+            export.payload,
+        ]
     return b"".join(parts)
 
 
@@ -64,7 +71,9 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
             key = start + lengths[0]
             envelope = start + sum(lengths[:2])
             at = start + sum(lengths)
-            exports.append(Arrived(content[start:key].decode(), content[key:envelope], content[envelope:at]))
+            exports.append(
+                Arrived(content[start:key].decode(), content[key:envelope], content[envelope:at])
+            )
     except (struct.error, UnicodeDecodeError):
         return None
     if at != len(content):

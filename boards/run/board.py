@@ -11,7 +11,14 @@ from contextlib import nullcontext
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import lock_memory, touch_memory
-from rack.backplane.process import cores_kept_awake, die_with_parent, name_process, pin, set_priority, take_processor
+from rack.backplane.process import (
+    cores_kept_awake,
+    die_with_parent,
+    name_process,
+    pin,
+    set_priority,
+    take_processor,
+)
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.classes import find_class
@@ -27,8 +34,8 @@ from rack.levels.level import Executor, Planner
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""
 FAST_NS = 10_000_000
-"""Longest cycle for which memory is touched in advance: that takes a tenth of a second, and longer cycles have time for
-page faults."""
+"""Longest cycle for which memory is touched in advance: that takes a tenth of a second, and longer
+cycles have time for page faults."""
 
 
 def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
@@ -50,7 +57,8 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
 def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
     """Build a task's level, test it, take the processor, and cycle until the run is over.
 
-    `attention` is an eventfd on which the Rack waits: a board writes to it when it is ready or raises an alarm.
+    `attention` is an eventfd on which the Rack waits: a board writes to it when it is ready or
+    raises an alarm.
     """
     block = segment.block(wiring.task)
     block[Block.PID] = os.getpid()
@@ -69,7 +77,11 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
     spec = segment.layout.task(wiring.task)
     block = segment.block(wiring.task)
     kind: type[Executor] | type[Planner]
-    kind = find_class(wiring.target, Executor) if spec.role == "executor" else find_class(wiring.target, Planner)
+    kind = (
+        find_class(wiring.target, Executor)
+        if spec.role == "executor"
+        else find_class(wiring.target, Planner)
+    )
     level = kind(wiring.context)
     if isinstance(level, Adapter):
         level.attach(segment, wiring.entries)
@@ -80,7 +92,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         UtilityLines(segment).release_sysfail(spec.slot)
         is_fast = spec.every * segment.layout.clock_ns <= FAST_NS
         if is_fast and spec.priority and not segment.words[System.LOCKSTEP]:
-            # Still at ordinary priority: a board that is restarted must not delay another board's cycle.
+            # Still at ordinary priority: a board that is restarted must not delay another board's
+            # cycle.
             touch_memory()
         block[Block.PRIORITY] = take_processor(spec)
         block[Block.CORE] = spec.core
@@ -101,7 +114,8 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> in
     """Take the processor and run the system clock."""
     pin(wiring.core)
     set_priority(wiring.priority)
-    # Not touched: every board waits for the clock's start, and its lead over the grid has room for a page fault.
+    # Not touched: every board waits for the clock's start, and its lead over the grid has room for
+    # a page fault.
     lock_memory()
     with cores_kept_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention)

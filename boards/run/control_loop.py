@@ -1,9 +1,9 @@
 """A level in execution: `procedure level()` of the paper (section 2).
 
-`VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin` becomes two processes:
-on one core, by priority (tightly coupled), or on two cores (loosely coupled). `lock` and `unlock` are inside the
-mailboxes, since only protocol `lock` needs them. The stopwatch keeps time stamps, trace and counts; faults take effect
-between cycles.
+`VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin`
+becomes two processes: on one core, by priority (tightly coupled), or on two cores (loosely
+coupled). `lock` and `unlock` are inside the mailboxes, since only protocol `lock` needs them. The
+stopwatch keeps time stamps, trace and counts; faults take effect between cycles.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _DEMANDS = tuple(Demand)
 
 
 class VirtualControlLoop(Task):
-    """The executor section of `procedure level()`: one virtual control loop, at the higher priority.
+    """The executor section of `procedure level()`: one virtual control loop, at the higher
+    priority.
 
         repeat
             waituntil(next-cycle); update(next-cycle)
@@ -38,10 +39,13 @@ class VirtualControlLoop(Task):
             lock; write_command; unlock; lock; write_status; unlock
         until forever
 
-    First, the exchange (C of fig. 4) transfers the plan over the bus from the planner's processor; then it is at hand.
+    First, the exchange (C of fig. 4) transfers the plan over the bus from the planner's processor;
+    then it is at hand.
     """
 
-    def __init__(self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None) -> None:
+    def __init__(
+        self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None
+    ) -> None:
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
         self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
@@ -49,11 +53,14 @@ class VirtualControlLoop(Task):
         self._due = segment.layout.due(self.spec)
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
-        self.read_command_and_status = interrupted(slowed(self._read(wiring), times.read_ns), self.interrupts)
+        self.read_command_and_status = interrupted(
+            slowed(self._read(wiring), times.read_ns), self.interrupts
+        )
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
 
     def _read(self, wiring: TaskWiring) -> Callable[[int], None]:
-        """Return the reading of a cycle; a board with an exchange also notes which messages it took."""
+        """Return the reading of a cycle; a board with an exchange also notes which messages it
+        took."""
         read = self.inputs.read_command_and_status
         if not wiring.exchange:
             return read
@@ -94,14 +101,16 @@ class VirtualControlLoop(Task):
         watch.finish(in_time, deadline, done=tick)
 
     def _handle_delay(self, tick: int) -> None:
-        """Note a pause in reading, in the first cycle too; in one that begins late, check the clock."""
+        """Note a pause in reading, in the first cycle too; in one that begins late, check the
+        clock."""
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since, self._has_cycled = tick, True
         if self._guard is not None:
             self._guard.check_release(tick)
 
     def process(self, tick: int) -> None:
-        """Let the level process, given the demand on the arm; then report its findings and the faults that acted."""
+        """Let the level process, given the demand on the arm; then report its findings and the
+        faults that acted."""
         executor = self.executor
         executor.demand = _DEMANDS[self.words[_DEMAND]]
         executor.process(self.inputs.values, self.outputs.messages, tick)
@@ -126,11 +135,14 @@ class PlannerLoop(Task):
             lock; write_plan; unlock
         until forever
 
-    In every cycle it asks the level whether it wants a plan. If it is tightly coupled under protocol `lock`, writing
-    the plan is the paper's critical section, which the executor cannot preempt.
+    In every cycle it asks the level whether it wants a plan. If it is tightly coupled under
+    protocol `lock`, writing the plan is the paper's critical section, which the executor cannot
+    preempt.
     """
 
-    def __init__(self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None = None) -> None:
+    def __init__(
+        self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None = None
+    ) -> None:
         super().__init__(segment, wiring, planner, attention)
         self.planner = planner
         self.slice = self.spec.every * self.spec.within_cycles
@@ -179,7 +191,8 @@ class PlannerLoop(Task):
         self.stopwatch.notify_clock()
 
     def _pass(self, tick: int) -> None:
-        """Let a release pass without a plan; trace it if it came too late or others were skipped."""
+        """Let a release pass without a plan; trace it if it came too late or others were
+        skipped."""
         self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice
         if in_time and not self.next_cycle.skipped:
@@ -190,7 +203,8 @@ class PlannerLoop(Task):
 
     @contextmanager
     def _critical_section(self) -> Iterator[None]:
-        """Take the executor's priority for the update of the plan, so that the executor cannot preempt it."""
+        """Take the executor's priority for the update of the plan, so that the executor cannot
+        preempt it."""
         if self._critical_priority:
             set_priority(self._critical_priority)
         try:

@@ -1,9 +1,9 @@
 """The interrupt handler of a board, under protocol interrupt: what it costs, and what it counts.
 
-On the boards of the time it ran whenever a message came. Here the first task of the board does its work, just before it
-reads: it takes as much processor time as the handler has worked since the last cycle. So reading, t_comm of eq. 3.5,
-grows by it, and every task below on the same core is kept waiting. In lockstep, where nothing waits for a processor, it
-takes no time.
+On the boards of the time it ran whenever a message came. Here the first task of the board does its
+work, just before it reads: it takes as much processor time as the handler has worked since the last
+cycle. So reading, t_comm of eq. 3.5, grows by it, and every task below on the same core is kept
+waiting. In lockstep, where nothing waits for a processor, it takes no time.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ _WAITING = int(Block.INTERRUPTS_WAITING)
 
 
 class InterruptHandler:
-    """Serves the interrupts of a task's board: charges their time, counts them, and reports those that are lost."""
+    """Serves the interrupts of a task's board: charges their time, counts them, and reports those
+    that are lost."""
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
         self._inbox, self._block = inbox, segment.block(task)
         clock = SystemClock(segment)
         self._takes_time = not clock.is_lockstep
-        self._lines = [(line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()]
+        self._lines = [
+            (line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()
+        ]
         # What happened before this process was there is neither charged nor counted.
         inbox.advance(clock.tick)
         inbox.inbox.most_waiting = 0
@@ -42,8 +45,11 @@ class InterruptHandler:
         self._cycles = 0
 
     @classmethod
-    def of(cls, segment: Segment, task: str, inbox: BoardInbox | None, alarms: AlarmWriter) -> Self | None:
-        """Return the handler that a task runs; None: nothing interrupts its board, or another task runs it."""
+    def of(
+        cls, segment: Segment, task: str, inbox: BoardInbox | None, alarms: AlarmWriter
+    ) -> Self | None:
+        """Return the handler that a task runs; None: nothing interrupts its board, or another task
+        runs it."""
         is_first = task == segment.layout.handler(segment.layout.task(task).slot)
         return cls(segment, task, inbox, alarms) if inbox is not None and is_first else None
 
@@ -73,7 +79,9 @@ class InterruptHandler:
                 episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
 
 
-def interrupted(read: Callable[[int], None], handler: InterruptHandler | None) -> Callable[[int], None]:
+def interrupted(
+    read: Callable[[int], None], handler: InterruptHandler | None
+) -> Callable[[int], None]:
     """Return `read`, after the handler has served what has come; `read` itself without one."""
     if handler is None:
         return read

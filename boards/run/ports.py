@@ -50,14 +50,15 @@ class InputPorts:
     ) -> None:
         """Read `sources` by port, from a queue as many messages as there is `room` for on its port.
 
-        `plan` is the mailbox that holds the task's own plan, `exchange` the ports that are not simply read in every
-        cycle, `inbox` that of the task's board.
+        `plan` is the mailbox that holds the task's own plan, `exchange` the ports that are not
+        simply read in every cycle, `inbox` that of the task's board.
         """
         self.task = ReadingTask(inbox)
         self.taken: list[Taken] = []
         self.values = Ports()
         self.readers: dict[str, Reader] = {}
-        # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
+        # Where each reading goes: the ports themselves, or the dict of a port that reads many
+        # mailboxes.
         self._plan: list[Line] = []
         self._rest: list[Line] = []
         for port, source in sources.items():
@@ -65,7 +66,9 @@ class InputPorts:
             boxes = {port: source} if isinstance(source, str) else source
             values = self.values.__dict__ if isinstance(source, str) else by_board
             how = (exchange or {}).get(port)
-            open_port = partial(watched, segment, alarms=alarms, task=self.task, room=partial(room, port))
+            open_port = partial(
+                watched, segment, alarms=alarms, task=self.task, room=partial(room, port)
+            )
             for key, mailbox in boxes.items():
                 found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
                 read = found.read if how is None else GridReader(found, how.grid).read
@@ -81,7 +84,8 @@ class InputPorts:
         self._counted = self._traffic
 
     def follow(self, segment: Segment, queue: QueuePort, alarms: AlarmWriter) -> None:
-        """Read the position of the reader of a queue that the task writes, with the mailboxes of its ports."""
+        """Read the position of the reader of a queue that the task writes, with the mailboxes of
+        its ports."""
         found = watched(segment, taken_name(queue.writer.spec.name), alarms, self.task)
         self._rest.append(({}, "", queue.noting(found.read)))
         self._readers.append(found.reader)
@@ -126,7 +130,8 @@ class InputPorts:
 
 
 class OldestOf:
-    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of a `Reader`."""
+    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of
+    a `Reader`."""
 
     def __init__(self, readers: Sequence[Reader]) -> None:
         self._readers = readers
@@ -145,9 +150,9 @@ class OldestOf:
 class OutputPorts:
     """The mailboxes that a task writes; `messages` holds the outgoing message of each port.
 
-    Each message carries the tick of the oldest information that it rests on. A command inherits the tick of the command
-    that it follows, a status that of the status below: see `Output.rests_on`. So the system's response time can be
-    measured.
+    Each message carries the tick of the oldest information that it rests on. A command inherits the
+    tick of the command that it follows, a status that of the status below: see `Output.rests_on`.
+    So the system's response time can be measured.
     """
 
     def __init__(
@@ -158,12 +163,19 @@ class OutputPorts:
         inputs: InputPorts,
         sent: Collection[str] = (),
     ) -> None:
-        """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level sends by itself."""
+        """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level
+        sends by itself."""
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
-        self._demanded = {port: DemandPort(writer) for port, writer in self.writers.items() if writer.spec.max_age}
+        self._demanded = {
+            port: DemandPort(writer) for port, writer in self.writers.items() if writer.spec.max_age
+        }
         messages = {port: writer.message for port, writer in self.writers.items()}
-        self.messages = Ports(**messages | {port: demanded.message for port, demanded in self._demanded.items()})
-        self._rests_on = {port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()}
+        self.messages = Ports(
+            **messages | {port: demanded.message for port, demanded in self._demanded.items()}
+        )
+        self._rests_on = {
+            port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()
+        }
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
         self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
         self._queues = {
@@ -180,11 +192,18 @@ class OutputPorts:
         self._route()
 
     def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Apply these faults, by kind, from now on; messages delayed by earlier ones go out with the next write."""
+        """Apply these faults, by kind, from now on; messages delayed by earlier ones go out with
+        the next write."""
         for port, writer in self.writers.items():
             index = self._indices[writer.spec.name]
-            struck = [(kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)]
-            chosen = [(kind, e) for kind, e in struck if port not in self._queues or not KINDS[kind].not_queued]
+            struck = [
+                (kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)
+            ]
+            chosen = [
+                (kind, e)
+                for kind, e in struck
+                if port not in self._queues or not KINDS[kind].not_queued
+            ]
             if chosen or port in self._faulty:
                 self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)
         self._route()
@@ -192,7 +211,14 @@ class OutputPorts:
     def _route(self) -> None:
         """Route each port to its writer, or to the faulty writer around it."""
         self._lines = [
-            (port, w, self._write_of(port), self._rests_on[port], w.spec.ahead - w.spec.phase, w.spec.every)
+            (
+                port,
+                w,
+                self._write_of(port),
+                self._rests_on[port],
+                w.spec.ahead - w.spec.phase,
+                w.spec.every,
+            )
             for port, w in self.writers.items()
         ]
 
@@ -200,7 +226,9 @@ class OutputPorts:
         faulty = self._faulty.get(port)
         write: Write = self.writers[port].write if faulty is None else faulty.write
         if port in self._demanded:
-            return partial(self._demanded[port].write, write, _no_flush if faulty is None else faulty.flush)
+            return partial(
+                self._demanded[port].write, write, _no_flush if faulty is None else faulty.flush
+            )
         return partial(self._queues[port].write, write) if port in self._queues else write
 
     @property
@@ -215,7 +243,8 @@ class OutputPorts:
         """
         in_time = True
         for port, writer, write, source, ahead, every in self._lines:
-            # A message that is not written in every cycle becomes visible at multiples of its period, from its phase.
+            # A message that is not written in every cycle becomes visible at multiples of its
+            # period, from its phase.
             if (tick + ahead) % every:
                 if port in self._faulty:
                     self._faulty[port].flush(tick, now)
@@ -269,6 +298,7 @@ def _no_flush(tick: int, now: int | None) -> None:
 
 
 def _basis(mailboxes: Sequence[str], readers: Mapping[str, Reader]) -> Reader | OldestOf | None:
-    """Return what gives the basis of a message that rests on these mailboxes; None: it rests on nothing read."""
+    """Return what gives the basis of a message that rests on these mailboxes; None: it rests on
+    nothing read."""
     found = [readers[name] for name in mailboxes]
     return OldestOf(found) if len(found) > 1 else next(iter(found), None)

@@ -16,7 +16,8 @@ Flush = Callable[[int, int | None], None]
 class QueuePort:
     """Writes one queue for a task, and raises an alarm when it is full.
 
-    A level that does not send by itself (`sends`) has its message sent in every cycle in which it is written.
+    A level that does not send by itself (`sends`) has its message sent in every cycle in which it
+    is written.
     """
 
     def __init__(self, writer: QueueWriter, episodes: Episodes, sends: bool) -> None:
@@ -26,7 +27,8 @@ class QueuePort:
         self._refused = 0
 
     def noting(self, read: Callable[[int], Reading]) -> Callable[[int], Reading]:
-        """Return a function that reads the position of the queue's reader as of a tick, by `read`, and notes it."""
+        """Return a function that reads the position of the queue's reader as of a tick, by `read`,
+        and notes it."""
 
         def note(tick: int) -> Reading:
             reading = read(tick)
@@ -49,7 +51,8 @@ class QueuePort:
 
 
 class DemandPort:
-    """Writes one mailbox for a task in the cycles in which its level has sent a message; `message` is that message."""
+    """Writes one mailbox for a task in the cycles in which its level has sent a message; `message`
+    is that message."""
 
     def __init__(self, writer: Writer) -> None:
         self.message = sending(writer.message, writer.message.record.dtype, self._send, lambda: 1)
@@ -61,8 +64,11 @@ class DemandPort:
         self._basis = basis
         return True
 
-    def write(self, onward: Write, flush: Flush, tick: int, now: int | None, basis: int | None) -> bool:
-        """Write the cycle's message by `onward`, if there is one; else `flush` what faults have delayed."""
+    def write(
+        self, onward: Write, flush: Flush, tick: int, now: int | None, basis: int | None
+    ) -> bool:
+        """Write the cycle's message by `onward`, if there is one; else `flush` what faults have
+        delayed."""
         if not self._is_sent:
             flush(tick, now)
             return True

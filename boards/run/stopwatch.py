@@ -1,7 +1,9 @@
-"""The stopwatch of a task: times and traces each cycle, and keeps the counts in the task's control block.
+"""The stopwatch of a task: times and traces each cycle, and keeps the counts in the task's control
+block.
 
-It holds all bookkeeping around the paper's procedure: time stamps (R, X, W, C of eqs. 3.5 and 3.9), the trace record,
-missed deadlines, skipped releases, failed accesses, and the report to the clock that a release is done.
+It holds all bookkeeping around the paper's procedure: time stamps (R, X, W, C of eqs. 3.5 and 3.9),
+the trace record, missed deadlines, skipped releases, failed accesses, and the report to the clock
+that a release is done.
 """
 
 from __future__ import annotations
@@ -19,20 +21,34 @@ from rack.boards.run.ports import InputPorts, OutputPorts
 _EPOCH = int(System.EPOCH_NS)
 _DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
     int(Block[name])
-    for name in ("DONE", "CYCLES", "MISSED", "SKIPPED", "LEVEL_STATE", "LEVEL_SINCE", "CORRUPT", "BUS_ERRORS")
+    for name in (
+        "DONE",
+        "CYCLES",
+        "MISSED",
+        "SKIPPED",
+        "LEVEL_STATE",
+        "LEVEL_SINCE",
+        "CORRUPT",
+        "BUS_ERRORS",
+    )
 )
-_MISS, _SKIP, _BUS_ERROR, _DAMAGED = (int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT))
+_MISS, _SKIP, _BUS_ERROR, _DAMAGED = (
+    int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT)
+)
 BUS_COUNT_CYCLES = 64
 """Cycles between updates of the bus counters."""
 
 
 class Stopwatch:
-    """Times one task: a cycle calls `start`, stamps the end of each part, and calls `finish` or `idle`.
+    """Times one task: a cycle calls `start`, stamps the end of each part, and calls `finish` or
+    `idle`.
 
     Stamps are of CLOCK_MONOTONIC.
     """
 
-    def __init__(self, segment: Segment, task: str, inputs: InputPorts, outputs: OutputPorts) -> None:
+    def __init__(
+        self, segment: Segment, task: str, inputs: InputPorts, outputs: OutputPorts
+    ) -> None:
         self._block = segment.block(task)
         self._words = segment.words
         self._clock = SystemClock(segment)
@@ -41,7 +57,9 @@ class Stopwatch:
         self._reading = inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
-        self._lockstep_done = done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
+        self._lockstep_done = (
+            done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
+        )
         self._troubles = self._bus_errors = self._corrupt = 0
         self._cycles = self._block[_CYCLES]
         self._state = self._block[_LEVEL_STATE]
@@ -51,7 +69,8 @@ class Stopwatch:
         self._tick = self._skipped = 0
         self._late_ns = self._period_ns // 2
         self._release_ns = 0  # grid point of the tick; in lockstep the start
-        self.is_late = True  # the cycle began more than half a tick late, or after skipped ones, or is the first
+        # the cycle began more than half a tick late, or after skipped ones, or is the first
+        self.is_late = True
         self.start_ns = 0  # start of the cycle
         self.plan_ns = 0  # the plan has been transferred over the bus (C of fig. 4)
         self.read_ns = 0  # command, status and plan are read (R)
@@ -73,7 +92,8 @@ class Stopwatch:
         self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
     def now(self, deadline: int) -> int | None:
-        """Return the clock's tick once the level has processed; None while tick `deadline` has not come."""
+        """Return the clock's tick once the level has processed; None while tick `deadline` has not
+        come."""
         if self._lockstep_done is None and self.process_ns < self._time_of(deadline):
             return None
         now = self._clock.now()
@@ -155,7 +175,8 @@ class Stopwatch:
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
     def count_bus(self) -> None:
-        """Update the bus counters of the control block; doing so in every cycle would cost too much."""
+        """Update the bus counters of the control block; doing so in every cycle would cost too
+        much."""
         reads = self._inputs.take_traffic()
         writes = self._outputs.take_traffic()
         block = self._block
@@ -166,7 +187,10 @@ class Stopwatch:
 
 
 def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:
-    """Return where, in which bytes, a level's status holds its state, one byte; always 0 without a status."""
+    """Return where, in which bytes, a level's status holds its state, one byte; always 0 without a
+    status."""
     status = getattr(outputs.messages, "status", None)
     at = (status.record.dtype.fields or {}).get("state") if status is not None else None
-    return (at[1], status.raw) if status is not None and at is not None else (0, memoryview(bytes(1)))
+    return (
+        (at[1], status.raw) if status is not None and at is not None else (0, memoryview(bytes(1)))
+    )

@@ -1,7 +1,7 @@
 """The board in slot 1: the system controller, which runs the clock.
 
-At every tick it releases the tasks, begins and ends faults, issues operator commands, lets restarted boards rejoin the
-grid, and demands that the arm stop or brake.
+At every tick it releases the tasks, begins and ends faults, issues operator commands, lets
+restarted boards rejoin the grid, and demands that the arm stop or brake.
 """
 
 from __future__ import annotations
@@ -24,15 +24,24 @@ from rack.boards.faults.clock_board import FaultStage
 from rack.boards.wiring import ClockWiring
 
 HEAD_START_NS = 20_000_000
-"""Time from the start of the clock's board to tick 0, so that its start-up does not delay a tick."""
+"""Time from the start of the clock's board to tick 0, so that its start-up does not delay a
+tick."""
 # Plain integers for the hot path.
 _LOSSES, _EMERGENCY, _REQUESTED, _INJECTED, _PEER_STOP = (
-    int(word) for word in (System.LOSSES, System.EMERGENCY_STOP, System.REQUESTED, System.INJECTED, System.PEER_STOP)
+    int(word)
+    for word in (
+        System.LOSSES,
+        System.EMERGENCY_STOP,
+        System.REQUESTED,
+        System.INJECTED,
+        System.PEER_STOP,
+    )
 )
 
 
 class SystemController:
-    """The clock's duties at every tick besides releasing tasks; see `rack.backplane.clock.driver.Controller`."""
+    """The clock's duties at every tick besides releasing tasks; see
+    `rack.backplane.clock.driver.Controller`."""
 
     def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
         self._words = segment.words
@@ -52,7 +61,12 @@ class SystemController:
             faults.advance(tick)
         if desk.waiting or words[_REQUESTED] != desk.requested:
             desk.advance(tick)
-        if self._settled != (words[_LOSSES], self._driver.watchdog.losses, words[_EMERGENCY], words[_PEER_STOP]):
+        if self._settled != (
+            words[_LOSSES],
+            self._driver.watchdog.losses,
+            words[_EMERGENCY],
+            words[_PEER_STOP],
+        ):
             self._handle_losses(tick)
 
     def released(self, tick: int) -> None:
@@ -60,7 +74,8 @@ class SystemController:
         self._faults.within(tick)
 
     def _handle_losses(self, tick: int) -> None:
-        """Let restarted boards rejoin, latch for those given up, and set the demand for all other losses."""
+        """Let restarted boards rejoin, latch for those given up, and set the demand for all other
+        losses."""
         words = self._words
         seen = words[_LOSSES], self._driver.watchdog.losses
         processes = self._driver.processes
@@ -97,7 +112,9 @@ class SystemController:
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
 
     def _set_demand(self, lost: list[ReleasedTask], tick: int) -> None:
-        asked = [(self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost]
+        asked = [
+            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
+        ]
         if self._words[_EMERGENCY]:
             asked.append((Demand.BRAKE, -1))
         if is_on(self._words[_PEER_STOP], tick):
@@ -111,9 +128,11 @@ class SystemController:
 
 
 class OperatorDesk:
-    """Issues operator commands at the start of a tick, each into its level's mailbox, before any task is released.
+    """Issues operator commands at the start of a tick, each into its level's mailbox, before any
+    task is released.
 
-    There is nothing to do in a tick if no command is `waiting` and none but the first `requested` ones have come.
+    There is nothing to do in a tick if no command is `waiting` and none but the first `requested`
+    ones have come.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -122,7 +141,11 @@ class OperatorDesk:
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
         boxes = segment.layout.mailboxes
-        self._writers = {at: open_writer(segment, box.name) for at, box in enumerate(boxes) if box.writer == CLOCK}
+        self._writers = {
+            at: open_writer(segment, box.name)
+            for at, box in enumerate(boxes)
+            if box.writer == CLOCK
+        }
         self.requested = -1
         self.waiting: list[RequestEntry] = []
 
@@ -133,7 +156,8 @@ class OperatorDesk:
             self.waiting = self._table.waiting()
         for entry in [entry for entry in self.waiting if entry[RequestWord.TICK] <= tick]:
             self.waiting.remove(entry)
-            # Mark first, then check that it still waits; a client that withdraws it uses the opposite order.
+            # Mark first, then check that it still waits; a client that withdraws it uses the
+            # opposite order.
             entry.words[RequestWord.GIVEN_TICK] = tick
             if self._table.is_waiting(entry):
                 self._give(entry, tick)
@@ -144,7 +168,8 @@ class OperatorDesk:
         words = entry.words
         writer = self._writers[entry[RequestWord.MAILBOX]]
         if not words[RequestWord.SERIAL]:
-            # If the clock dies after this line, its successor issues the command again, under the same serial.
+            # If the clock dies after this line, its successor issues the command again, under the
+            # same serial.
             self._words[System.COMMANDED] += 1
             words[RequestWord.SERIAL] = self._words[System.COMMANDED]
         message = writer.message
@@ -174,9 +199,15 @@ class EndOfRun:
         self._next = 0
 
     def __call__(self, tick: int) -> int | None:
-        """Return the tick at which the run stops, by the messages as of the tick before; None until it is known."""
+        """Return the tick at which the run stops, by the messages as of the tick before; None until
+        it is known."""
         final = tick - 1
-        if final >= self._next and self._stop_tick is None and self._reader is not None and self._writer is not None:
+        if (
+            final >= self._next
+            and self._stop_tick is None
+            and self._reader is not None
+            and self._writer is not None
+        ):
             boundary = final - (final - self._phase) % self._every
             self._next = boundary + self._every
             reading = self._reader.read(boundary)
@@ -204,7 +235,9 @@ def run_clock(segment: Segment, wiring: ClockWiring, attention: int | None = Non
     driver.run()
 
 
-def driver_of_run(segment: Segment, wiring: ClockWiring, ended: Ended, alarms: AlarmWriter) -> ClockDriver:
+def driver_of_run(
+    segment: Segment, wiring: ClockWiring, ended: Ended, alarms: AlarmWriter
+) -> ClockDriver:
     """Return the clock driver for the run's mode."""
     if not wiring.lockstep:
         return RealtimeDriver(segment, ended, alarms)

@@ -1,4 +1,5 @@
-"""A task on its board: the common part of the executor's and the planner's loop, and the clock guard of fast tasks."""
+"""A task on its board: the common part of the executor's and the planner's loop, and the clock
+guard of fast tasks."""
 
 from __future__ import annotations
 
@@ -35,14 +36,20 @@ class Task(ABC):
     """One task around a level's executor or planner: ports, clock, stopwatch and faults."""
 
     def __init__(
-        self, segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int | None = None
+        self,
+        segment: Segment,
+        wiring: TaskWiring,
+        level: Executor | Planner,
+        attention: int | None = None,
     ) -> None:
         self.spec = spec = segment.layout.task(wiring.task)
         self.block = segment.block(wiring.task)
         self.words = segment.words
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
-        self.next_cycle = NextCycle(segment, wiring.task, self.alarms if wiring.guards_clock else None)
+        self.next_cycle = NextCycle(
+            segment, wiring.task, self.alarms if wiring.guards_clock else None
+        )
         inbox = open_inbox(segment, wiring.task)
         self.interrupts = InterruptHandler.of(segment, wiring.task, inbox, self.alarms)
         self.inputs = InputPorts(
@@ -83,10 +90,12 @@ class Task(ABC):
 
 
 class ClockGuard:
-    """A fast task's check of the clock: has it skipped ticks and, if a cycle begins late, has it released it late?
+    """A fast task's check of the clock: has it skipped ticks and, if a cycle begins late, has it
+    released it late?
 
-    Most skips cost a task that does not cycle in every tick no release, and make none of its cycles late: only the
-    clock's count shows them. `reported`: how much of it this task has reported, in this process or before a restart.
+    Most skips cost a task that does not cycle in every tick no release, and make none of its cycles
+    late: only the clock's count shows them. `reported`: how much of it this task has reported, in
+    this process or before a restart.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter, block: memoryview) -> None:
@@ -102,7 +111,8 @@ class ClockGuard:
         """Report the ticks skipped since the last report, in the cycle released at `tick`."""
         words = self._words
         since = words[_SKIPPED_FROM]
-        # A task may begin so late that the clock has skipped ticks since its release: that is for its next cycle.
+        # A task may begin so late that the clock has skipped ticks since its release: that is for
+        # its next cycle.
         if tick >= since:
             counted = words[_CLOCK_SKIPPED]
             self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since)
@@ -112,7 +122,8 @@ class ClockGuard:
         """Check whether the clock was late, in a cycle released at `tick` that begins late."""
         words = self._words
         late_ns = words[_TICK_NS] - self._clock.time_of(tick)
-        # Checked after the read: the time is this tick's only if the clock has not advanced meanwhile.
+        # Checked after the read: the time is this tick's only if the clock has not advanced
+        # meanwhile.
         if self._clock.is_lockstep or words[_TICK] != tick:
             return
         if late_ns > self._late_ns:
@@ -122,7 +133,8 @@ class ClockGuard:
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
-    """Return `access`, extended to at least `time_ns` of processor time; `access` itself if that is 0.
+    """Return `access`, extended to at least `time_ns` of processor time; `access` itself if that is
+    0.
 
     This emulates a slower bus: programmed transfers over VME occupied the processor.
     """

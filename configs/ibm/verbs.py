@@ -1,6 +1,8 @@
-"""The programming side: verbs that start motions on the real-time side, and a new verb made of two of them.
+"""The programming side: verbs that start motions on the real-time side, and a new verb made of two
+of them.
 
-`guarded_line` is a line and a guard, without a change to either; the guard travels with the line's request.
+`guarded_line` is a line and a guard, without a change to either; the guard travels with the line's
+request.
 """
 
 from collections.abc import Sequence
@@ -31,7 +33,10 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
 class Assembly(HostProgram):
     """Puts a block on the table, and the other one on it; how high that is, only touch tells."""
 
-    inputs = {"motion": Input(MOTION_STATUS, "below.motion"), "sensors": Input(ARM_STATUS, "below.sensors")}
+    inputs = {
+        "motion": Input(MOTION_STATUS, "below.motion"),
+        "sensors": Input(ARM_STATUS, "below.sensors"),
+    }
     outputs = {"requests": MOTION_REQUEST}
 
     def run(self, bus: Bus) -> None:
@@ -41,7 +46,10 @@ class Assembly(HostProgram):
             self._fetch(motions, bus, block)
             touched = self._lower(motions)
             motions.wait(motions.release())
-            print(f"{block}: {'touched at' if touched else 'no touch down to'} {motions.where()[2]:.4f} m")
+            print(
+                f"{block}: {'touched at' if touched else 'no touch down to'}"
+                f" {motions.where()[2]:.4f} m"
+            )
             motions.wait(motions.line((*PLACE, 0.70)))
         motions.wait(motions.move())
 

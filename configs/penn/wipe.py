@@ -1,6 +1,8 @@
-"""Wipes along a surface at a force, over an edge that the script does not know, as far as a wall, and back.
+"""Wipes along a surface at a force, over an edge that the script does not know, as far as a wall,
+and back.
 
-The rack runs it as its host board `coordinator`. If that was not done it ends with an error, and the run with status 1.
+The rack runs it as its host board `coordinator`. If that was not done it ends with an
+error, and the run with status 1.
 By hand, at any time:
     rack run penn --set host.coordinator.external=true
     rack prompt penn coordinator configs/penn/wipe.py
@@ -23,7 +25,8 @@ def expect(request, end, what):
 
 
 def wipe(y, seconds, end, what):
-    """Move along the surface to y, pressing; raise if the force was off on more than a fifth of the way."""
+    """Move along the surface to y, pressing; raise if the force was off on more than a fifth of the
+    way."""
     pressed = {}
 
     def look():
@@ -44,7 +47,9 @@ x, y, _ = where()
 line((x, y, ABOVE), DOWN)  # after a former process the tool may be anywhere
 line((X, START, ABOVE), DOWN)
 guard("touch")
-expect(line((X, START, SURFACE - 0.02), DOWN, segment=3.0), RequestEnd.GUARDED, "touching the surface")
+expect(
+    line((X, START, SURFACE - 0.02), DOWN, segment=3.0), RequestEnd.GUARDED, "touching the surface"
+)
 expect(comply("wipe", wrench={"z": PRESS}), RequestEnd.DONE, "pressing")
 wipe(END, 6.0, RequestEnd.DONE, "wiping over the edge")
 guard("wall")

@@ -1,4 +1,5 @@
-"""The arm: its interface to the servo level, the simulated one, and the faults injected between the two."""
+"""The arm: its interface to the servo level, the simulated one, and the faults injected between the
+two."""
 
 from rack.levels.arm import drives, poses, substeps
 from rack.levels.arm.arm import Arm, Link, Sensed, find_arm

@@ -1,4 +1,5 @@
-"""The commands of the boards above that drive an arm, or a hand, together: all of them must be fresh."""
+"""The commands of the boards above that drive an arm, or a hand, together: all of them must be
+fresh."""
 
 from __future__ import annotations
 
@@ -9,13 +10,17 @@ from rack.levels.robot.limits import MotorPatience
 
 
 class CommandsAbove:
-    """Says whether the commands of the boards above are there and fresh; `oldest`: the ages permitted, ticks, by board.
+    """Says whether the commands of the boards above are there and fresh; `oldest`: the ages
+    permitted, ticks, by board.
 
-    In messages they are called `what`, and the arm, or hand, is `halted` while one is missing. A command rests on a
-    status of a cycle ago and takes `cycles` of its board; then the motors, or valves, keep it.
+    In messages they are called `what`, and the arm, or hand, is `halted` while one is missing. A
+    command rests on a status of a cycle ago and takes `cycles` of its board; then the motors, or
+    valves, keep it.
     """
 
-    def __init__(self, context: LevelContext, patience: MotorPatience, cycles: int, what: str, halted: str) -> None:
+    def __init__(
+        self, context: LevelContext, patience: MotorPatience, cycles: int, what: str, halted: str
+    ) -> None:
         self._what = what
         self._halted = halted
         self.oldest = {
@@ -24,7 +29,8 @@ class CommandsAbove:
         }
 
     def missing(self, commands: Mapping[str, Reading], tick: int, since: int) -> str:
-        """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of `since` or later."""
+        """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of
+        `since` or later."""
         all_know = True
         for board, oldest in self.oldest.items():
             value, verdict, is_lost, _ = commands[board]
@@ -34,6 +40,9 @@ class CommandsAbove:
             if sampled < 0:
                 return f"no {self._what} from board '{board}' yet"
             if tick - sampled > oldest:
-                return f"stale {self._what} from board '{board}': based on a status more than {oldest} ticks old"
+                return (
+                    f"stale {self._what} from board '{board}': based on a status more than {oldest}"
+                    " ticks old"
+                )
             all_know = all_know and sampled >= since
         return "" if all_know else f"{self._halted} until the boards above have seen it"

@@ -1,10 +1,11 @@
 """The seam between the servo level and an arm: sense, drive, brake, and let time pass.
 
-The servo level drives whatever class `[board.servo.params] arm = "package.module:Class"` names: the simulated arm by
-default, your own hardware or simulation otherwise. In every cycle it calls, in this order, `step` (the ticks since the
-last cycle), `sense`, then either `drive` or `brake` or neither (the last command stays in force), `save` and `look`.
-All calls come from the executor's process, within its cycle: none may block. An exception ends the board, which is
-restarted as after any crash; report a broken arm in `fault` instead.
+The servo level drives whatever class `[board.servo.params] arm = "package.module:Class"` names: the
+simulated arm by default, your own hardware or simulation otherwise. In every cycle it calls, in
+this order, `step` (the ticks since the last cycle), `sense`, then either `drive` or `brake` or
+neither (the last command stays in force), `save` and `look`. All calls come from the executor's
+process, within its cycle: none may block. An exception ends the board, which is restarted as after
+any crash; report a broken arm in `fault` instead.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig, named_class
 
 TORQUE_MARGIN = 1.001
-"""Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits itself."""
+"""Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits
+itself."""
 
 
 class Sensed(NamedTuple):
@@ -44,28 +46,37 @@ class Link(Protocol):
         """Return the newest sample. The arrays are valid until the next call."""
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, (joints,), N m, and the gripper's force, N, for one torque cycle.
+        """Release the brakes and apply torques, (joints,), N m, and the gripper's force, N, for one
+        torque cycle.
 
-        A torque that must not be applied (see `Arm.refused`) engages the brakes, and the finding is returned.
+        A torque that must not be applied (see `Arm.refused`) engages the brakes, and the finding is
+        returned.
         """
 
 
 class Arm(Plant, ABC):
-    """An arm with torque-driven joints that have brakes, and a force-driven gripper. Implements `Link`.
+    """An arm with torque-driven joints that have brakes, and a force-driven gripper. Implements
+    `Link`.
 
-    Subclasses write `sense`, `drive`, `brake` and `step`, and keep the attributes below up to date. All else has a
-    default that suits an arm without contact sensors, whose state outlives its board.
+    Subclasses write `sense`, `drive`, `brake` and `step`, and keep the attributes below up to date.
+    All else has a default that suits an arm without contact sensors, whose state outlives its
+    board.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
-        """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is for random noise."""
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
+        """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
+        for random noise."""
         super().__init__(cell)
         # Ticks without a command after which the brakes must engage.
         self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
         self.waited = self.patience
         self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
         self.grip_force = 0.0  # N: given to the gripper last
-        self.dynamics = Dynamics(cell)  # for the level that drives the arm; one that senses exactly shares it with it
+        self.dynamics = Dynamics(
+            cell
+        )  # for the level that drives the arm; one that senses exactly shares it with it
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
     @abstractmethod
@@ -74,21 +85,25 @@ class Arm(Plant, ABC):
 
     @abstractmethod
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets `waited` to 0."""
+        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets
+        `waited` to 0."""
 
     @abstractmethod
     def brake(self) -> None:
-        """Engage the brakes: they stop and hold the joints, motors give no torque, the gripper keeps its force."""
+        """Engage the brakes: they stop and hold the joints, motors give no torque, the gripper
+        keeps its force."""
 
     @abstractmethod
     def step(self, ticks: int) -> None:
-        """Let `ticks` ticks pass: advance `tick` and `waited` (all that hardware does), and keep to `patience`.
+        """Let `ticks` ticks pass: advance `tick` and `waited` (all that hardware does), and keep to
+        `patience`.
 
         `ticks` exceeds the level's cycle after missed cycles, and may be 0.
         """
 
     def refused(self, torque: Array) -> Finding | None:
-        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit; None: it may."""
+        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
+        None: it may."""
         if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
             return None
         if np.isfinite(torque).all():
@@ -111,21 +126,25 @@ class Arm(Plant, ABC):
         return f"geom {contact[0]} touches geom {contact[1]}"
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motors' torque to `most`, (joints,), N m, as if they were weak; None: they are sound.
+        """Limit the motors' torque to `most`, (joints,), N m, as if they were weak; None: they are
+        sound.
 
         Injected faults of motors act through this. Default: they have no effect.
         """
 
     def feel(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None, it has none."""
+        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None,
+        it has none."""
         return None
 
     def look(self, scene: Message) -> None:
-        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the tool as sensed."""
+        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the
+        tool as sensed."""
         self._data.qpos[self.cell.qpos] = self.sense().position
         self._show(scene)
 
 
 def find_arm(reference: str) -> type[Arm]:
-    """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing or no whole `Arm`."""
+    """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing
+    or no whole `Arm`."""
     return named_class(reference, Arm)

@@ -1,4 +1,5 @@
-"""Parts of the simulated arm's drives: brakes, the limit gate on torques, and encoders of finite resolution."""
+"""Parts of the simulated arm's drives: brakes, the limit gate on torques, and encoders of finite
+resolution."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 STANDSTILL = 0.01
 """Joint speed, rad/s, below which a joint holds its position."""
 SPEED_PART = 0.99
-"""Part of a velocity limit that the gate lets a joint reach; the rest covers model errors within a cycle."""
+"""Part of a velocity limit that the gate lets a joint reach; the rest covers model errors within a
+cycle."""
 RANGE_KEPT_RAD = 0.002
 """Distance that the gate keeps from the ends of a joint's range, for the same reason."""
 CLEAR_PART = 0.01
@@ -29,8 +31,11 @@ SOFT = 8
 class Brake:
     """Stops the joints and holds them where they came to rest, even with the motors off."""
 
-    def __init__(self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0) -> None:
-        """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of the hold."""
+    def __init__(
+        self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0
+    ) -> None:
+        """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of
+        the hold."""
         self._braking = braking
         self._dynamics = dynamics
         self._stiffness = stiffness
@@ -49,12 +54,14 @@ class Brake:
 
 
 class LimitGate:
-    """Cuts torques so that the next cycle ends within limits, at a state from which the arm can still be stopped.
+    """Cuts torques so that the next cycle ends within limits, at a state from which the arm can
+    still be stopped.
 
-    A joint may be only so fast that it can brake, with `braking` (joints,), rad/s2, before the end of its range. The
-    arm's equation of motion predicts the velocities. Torques that lead too far are replaced by the nearest ones, in
-    acceleration, that do not: a small quadratic program, in which torque limits take precedence. Far from all limits,
-    nearly always, one rough prediction shows that nothing is to be cut.
+    A joint may be only so fast that it can brake, with `braking` (joints,), rad/s2, before the end
+    of its range. The arm's equation of motion predicts the velocities. Torques that lead too far
+    are replaced by the nearest ones, in acceleration, that do not: a small quadratic program, in
+    which torque limits take precedence. Far from all limits, nearly always, one rough prediction
+    shows that nothing is to be cut.
     """
 
     def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
@@ -65,7 +72,9 @@ class LimitGate:
         self._braking = braking
         self._period_s = period_s
         self._dynamics = dynamics
-        limits = np.stack((self._torque, self._fastest, self._low, self._high, braking, dynamics.dry))
+        limits = np.stack(
+            (self._torque, self._fastest, self._low, self._high, braking, dynamics.dry)
+        )
         self.clearance = limits, period_s  # for `is_clear`
         self._is_clear = is_clear.load()
         joints = len(braking)
@@ -75,7 +84,8 @@ class LimitGate:
         self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
 
     def admit(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
-        """Return the torques (joints,), N m, that may pass at state `q`, `qd`, and whether anything was cut.
+        """Return the torques (joints,), N m, that may pass at state `q`, `qd`, and whether anything
+        was cut.
 
         `torque` must be finite.
         """
@@ -86,29 +96,38 @@ class LimitGate:
         least = -self._speed_towards(q - self._low, -qd) - qd
         most = self._speed_towards(self._high - q, qd) - qd
         gain = np.clip(self._gain(passed, q, qd), least, most)
-        # Light joints change speed so much within a cycle that only its middle predicts where it ends.
+        # Light joints change speed so much within a cycle that only its middle predicts where it
+        # ends.
         gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < least).any() or (gain > most).any():
             passed = self._nearest(gain, least, most)
         return passed, not np.array_equal(passed, torque)
 
     def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
-        """Return the change in velocity, rad/s, that torques cause in one cycle at state `q`, `qd`."""
+        """Return the change in velocity, rad/s, that torques cause in one cycle at state `q`,
+        `qd`."""
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
     def _nearest(self, gain: Array, least: Array, most: Array) -> Array:
-        """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between `least` and `most`."""
+        """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between
+        `least` and `most`."""
         scale = self._fastest
         per_torque = self._inertia * (scale / self._period_s) / self._torque[:, None]
         offset = self._resisting / self._torque
         upper = np.concatenate((most / scale, 1.0 - offset))
         lower = np.concatenate((least / scale, -1.0 - offset))
-        nearest, _, status, _ = daqp.solve(self._unity, -gain / scale, per_torque, upper, lower, self._kinds)
+        nearest, _, status, _ = daqp.solve(
+            self._unity, -gain / scale, per_torque, upper, lower, self._kinds
+        )
         if status < 0:
             nearest = np.clip(gain, least, most) / scale
-        return np.asarray(np.clip((mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque))
+        return np.asarray(
+            np.clip(
+                (mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque
+            )
+        )
 
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
         return speed_towards(distance, speed, self._fastest, self._braking, self._period_s)
@@ -118,13 +137,15 @@ class LimitGate:
 def is_clear(
     torque: Array,
     evaluation: Array,  # of the equation of motion: (3 + joints, joints)
-    limits: Array,  # (6, joints): torque, speed, low and high end of the range, braking, dry friction
+    # (6, joints): torque, speed, low and high end of the range, braking, dry friction
+    limits: Array,
     period_s: float,
 ) -> bool:
-    """Return whether `torque` leads nowhere near a limit, by the equation of motion at the state of `evaluation`.
+    """Return whether `torque` leads nowhere near a limit, by the equation of motion at the state of
+    `evaluation`.
 
-    It does not if the velocity stays within its bounds at no gain as at twice the gain predicted, with some room: more
-    than inertia and bias change in a cycle.
+    It does not if the velocity stays within its bounds at no gain as at twice the gain predicted,
+    with some room: more than inertia and bias change in a cycle.
     """
     q = evaluation[0]
     qd = evaluation[1]
@@ -141,8 +162,16 @@ def is_clear(
         speed = fastest[joint]
         hard = braking[joint]
         room = CLEAR_PART * fastest[joint]
-        least = -speed_towards(q[joint] - low[joint], -qd[joint], speed, hard, period_s) - qd[joint] + room
-        most = speed_towards(high[joint] - q[joint], qd[joint], speed, hard, period_s) - qd[joint] - room
+        least = (
+            -speed_towards(q[joint] - low[joint], -qd[joint], speed, hard, period_s)
+            - qd[joint]
+            + room
+        )
+        most = (
+            speed_towards(high[joint] - q[joint], qd[joint], speed, hard, period_s)
+            - qd[joint]
+            - room
+        )
         if not (least <= 0.0 <= most and least <= twice[joint] <= most):
             return False
     return True
@@ -157,9 +186,11 @@ def give(
     places: NDArray[np.int64],  # (4, joints), in the next: of position, velocity, motor, brake
     memory: Array,
 ) -> bool:
-    """Give the torque asked for to the motors, and none to the brakes, if it is clear; return whether it is.
+    """Give the torque asked for to the motors, and none to the brakes, if it is clear; return
+    whether it is.
 
-    The usual case in one call: the equation of motion has been evaluated, for the controller, at the arm's state.
+    The usual case in one call: the equation of motion has been evaluated, for the controller, at
+    the arm's state.
     """
     for row in range(STATE_ROWS):
         for joint in range(torques.shape[1]):
@@ -174,11 +205,14 @@ def give(
 
 
 @compiled
-def speed_towards(distance: Array, speed: Array, fastest: Array, braking: Array, period_s: float) -> Array:
-    """Return the highest speed, at the end of the cycle, towards an end of the range that is `distance` away.
+def speed_towards(
+    distance: Array, speed: Array, fastest: Array, braking: Array, period_s: float
+) -> Array:
+    """Return the highest speed, at the end of the cycle, towards an end of the range that is
+    `distance` away.
 
-    With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within the rest:
-    v'^2 / 2 a <= distance - (v + v') T / 2.
+    With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within
+    the rest: v'^2 / 2 a <= distance - (v + v') T / 2.
     """
     half = 0.5 * braking * period_s
     left = np.maximum(distance - 0.5 * speed * period_s, 0.0)
@@ -187,10 +221,12 @@ def speed_towards(distance: Array, speed: Array, fastest: Array, braking: Array,
 
 
 class CoarseSensors:
-    """Samples positions and velocities of the joints: noise on the truth, then the nearest step of the encoder.
+    """Samples positions and velocities of the joints: noise on the truth, then the nearest step of
+    the encoder.
 
-    Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as positions over
-    `EDGE_TIMING_S`. The noise of a tick is always the same, even on a restarted board or when sampled twice.
+    Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as
+    positions over `EDGE_TIMING_S`. The noise of a tick is always the same, even on a restarted
+    board or when sampled twice.
     """
 
     def __init__(self, encoders: Encoders, seed: int) -> None:
@@ -207,7 +243,8 @@ class CoarseSensors:
 
 @compiled
 def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
-    """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to multiples of `step`."""
+    """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to
+    multiples of `step`."""
     joints = sample.shape[1]
     chance = uniform(seed, tick, 2 * joints)
     for joint in range(joints):
@@ -218,12 +255,15 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
         sample[1, joint] += noise[1, joint] * length * math.sin(angle)
         for row in range(2):
             if step[row, joint] > 0.0:
-                sample[row, joint] = np.rint(sample[row, joint] / step[row, joint]) * step[row, joint]
+                sample[row, joint] = (
+                    np.rint(sample[row, joint] / step[row, joint]) * step[row, joint]
+                )
 
 
 @compiled
 def uniform(seed: int, tick: int, count: int) -> Array:
-    """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick alone."""
+    """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick
+    alone."""
     bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
     bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
     return ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53

@@ -1,4 +1,5 @@
-"""The link between the servo level and its arm, with faults injected into samples, torques and motors.
+"""The link between the servo level and its arm, with faults injected into samples, torques and
+motors.
 
 The steps that act the faults are in `rack.levels.faults`.
 """
@@ -21,13 +22,15 @@ from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART,
 STEPS = (SensorStep, MotorStep, CommandStep)
 """Classes of steps that act on an arm, as `Executor.faults` names them."""
 SLIGHT = 0.02
-"""Part of its torque limit that a motor must lack to count, in addition to what friction and a contact may hide."""
+"""Part of its torque limit that a motor must lack to count, in addition to what friction and a
+contact may hide."""
 TURNS_FROM = 5.0 * FRICTION_SPEED
 """Velocity, rad/s, above which the dry friction of a joint is known."""
 
 
 class FaultyLink:
-    """Implements `Link` with injected faults. `acted` collects those that act, for `Executor.acted`."""
+    """Implements `Link` with injected faults. `acted` collects those that act, for
+    `Executor.acted`."""
 
     def __init__(self, arm: Arm, cell: Cell, every: int, acted: dict[int, bool]) -> None:
         """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell."""
@@ -40,7 +43,9 @@ class FaultyLink:
         # A contact that pushed along may now push back.
         self._pressed = 2.0 * MAX_CONTACT_PART * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
-        self._motors: list[tuple[float, ActiveFault]] = []  # with the part of its torque limit that a motor still gives
+        self._motors: list[
+            tuple[float, ActiveFault]
+        ] = []  # with the part of its torque limit that a motor still gives
         self._commands: list[tuple[CommandStep, ActiveFault]] = []
         self._kept: dict[Key, Sensed] = {}
         self._torque = np.zeros(len(limits))
@@ -61,7 +66,11 @@ class FaultyLink:
         self._arm.weaken(self._most() if self._motors else None)
 
     def _joints(self, fault: Fault) -> NDArray[np.bool_]:
-        return np.full(len(self._limits), True) if fault.joint < 0 else np.arange(len(self._limits)) == fault.joint
+        return (
+            np.full(len(self._limits), True)
+            if fault.joint < 0
+            else np.arange(len(self._limits)) == fault.joint
+        )
 
     def _most(self) -> Array:
         most = np.full(len(self._limits), np.inf)
@@ -97,7 +106,11 @@ class FaultyLink:
         if self._arm.leans:
             return self._pressed
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
-        return MAX_RESTING_CONTACT_PART * self._limits if self._arm.holds and turning < MIN_TURNING_JOINTS else 0.0
+        return (
+            MAX_RESTING_CONTACT_PART * self._limits
+            if self._arm.holds and turning < MIN_TURNING_JOINTS
+            else 0.0
+        )
 
     def _corrupt(self, torque: Array) -> Array:
         corrupt = self._torque

@@ -1,4 +1,5 @@
-"""Monitors of the simulation: limits exceeded and unintended contacts, independent of the code that prevents them."""
+"""Monitors of the simulation: limits exceeded and unintended contacts, independent of the code that
+prevents them."""
 
 from __future__ import annotations
 
@@ -21,18 +22,24 @@ class LimitMonitor:
 
     def __init__(self, cell: Cell, steps: Substeps) -> None:
         """Judge what `advance` records in `steps`."""
-        self._names = [cell.model.joint(int(joint)).name for joint in cell.model.dof_jntid[cell.dof]]
+        self._names = [
+            cell.model.joint(int(joint)).name for joint in cell.model.dof_jntid[cell.dof]
+        ]
         self._seen, (self._low, self._high) = steps.seen, steps.judged[:2]
         self.count = 0  # steps in which the drives broke a limit
-        self.pushed = 0  # steps in which a blow broke a limit of position or velocity: no drive can prevent it
+        # steps in which a blow broke a limit of position or velocity: no drive can prevent it
+        self.pushed = 0
         self.first = ""  # the first broken limit, readable
 
     def judge(self, time_s: float, struck: bool) -> bool:
-        """Judge the steps of the tick that began at simulated `time_s`; return whether one broke a limit.
+        """Judge the steps of the tick that began at simulated `time_s`; return whether one broke a
+        limit.
 
         `struck`: a blow still moves the arm.
         """
-        wrong = ~((self._seen >= self._low) & (self._seen <= self._high))  # NaN is not within limits either
+        wrong = ~(
+            (self._seen >= self._low) & (self._seen <= self._high)
+        )  # NaN is not within limits either
         if not wrong.any():
             return False
         self._count(wrong, time_s, struck)
@@ -68,7 +75,9 @@ class ContactMonitor:
         self._root = cell.model.body_rootid[cell.model.geom_bodyid]
         self.count = 0  # unintended contacts, summed over the steps
         self.first = ""  # the first one, readable: which geoms, and when
-        self.struck: tuple[int, int] | None = None  # geoms of the newest one of arm or load since last cleared
+        self.struck: tuple[int, int] | None = (
+            None  # geoms of the newest one of arm or load since last cleared
+        )
 
     def look(self, data: mujoco.MjData) -> None:
         """Count the unintended contacts of the last step."""

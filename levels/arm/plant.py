@@ -10,23 +10,34 @@ from rack.levels.robot.cell import Cell
 
 
 class Plant:
-    """Time, counters and state of a driven mechanism in a cell; `ARM_STATE` and `SCENE` are filled from them."""
+    """Time, counters and state of a driven mechanism in a cell; `ARM_STATE` and `SCENE` are filled
+    from them."""
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
         self.tick = 0  # tick of the state
         self.waited = 0  # ticks since the last command
-        self.braked = True  # held without commands: the brakes of an arm are engaged, the valves of a hand closed
+        # held without commands: the brakes of an arm are engaged, the valves of a hand closed
+        self.braked = True
         self.fault = ""  # why it has failed and moves no more; empty: it has not
         self.clipped = 0  # cycles in which a command was refused or cut
-        self.contact: tuple[int, int] | None = None  # geoms of an unintended contact, of it or its load, in a step
+        self.contact: tuple[int, int] | None = (
+            None  # geoms of an unintended contact, of it or its load, in a step
+        )
         self.touches = 0  # unintended contacts so far
         self.first_touch = ""  # the first of them, readable: which geoms, and when
-        self.violations = 0  # steps in which the drives broke a limit of position, velocity or torque
+        self.violations = (
+            0  # steps in which the drives broke a limit of position, velocity or torque
+        )
         self.struck = 0  # ticks for which the motion is still blamed on a blow
-        self.pushed = 0  # steps in which a blow pushed a joint beyond a limit of position or velocity
-        self.first_violation = ""  # the first violation, readable: which limit, by how much, and when
-        self._saved: tuple[Message, tuple[int, ...]] | None = None  # last message filled, with what seldom changes
+        self.pushed = (
+            0  # steps in which a blow pushed a joint beyond a limit of position or velocity
+        )
+        # the first violation, readable: which limit, by how much, and when
+        self.first_violation = ""
+        self._saved: tuple[Message, tuple[int, ...]] | None = (
+            None  # last message filled, with what seldom changes
+        )
         self._data = cell.start()
         self._poses, self._fill = poses(cell, self._data), show.load()
 
@@ -37,17 +48,27 @@ class Plant:
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
 
-        A simulation adds its state: `state.state` has room for MuJoCo's integration state of the cell.
+        A simulation adds its state: `state.state` has room for MuJoCo's integration state of the
+        cell.
         """
         state.tick = self.tick
-        seldom = self.waited, self.braked, self.clipped, self.touches, self.violations, self.pushed, self.struck
+        seldom = (
+            self.waited,
+            self.braked,
+            self.clipped,
+            self.touches,
+            self.violations,
+            self.pushed,
+            self.struck,
+        )
         if (state, seldom) != self._saved:
             state.waited, state.braked, state.clipped, state.touches = seldom[:4]
             state.violations, state.pushed, state.struck = seldom[4:]
             self._saved = state, seldom
 
     def restore(self, state: Message) -> None:
-        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted board."""
+        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
+        board."""
         self.tick = state.tick
         self.waited = state.waited
         self.braked = bool(state.braked)

@@ -41,12 +41,20 @@ def poses(cell: Cell, data: mujoco.MjData) -> PoseViews:
         where = first + width * rows[:, None] + np.arange(width)
         places[begin : begin + where.size] = where.ravel()
     turned = data.site_xmat[cell.tool]
-    return PoseViews(cell.model._address, data._address, places, memory, turned, begins["tool_quaternion"])
+    return PoseViews(
+        cell.model._address, data._address, places, memory, turned, begins["tool_quaternion"]
+    )
 
 
 @compiled
 def show(
-    model: int, data: int, places: NDArray[np.int64], memory: Array, turned: Array, quaternion: int, scene: Array
+    model: int,
+    data: int,
+    places: NDArray[np.int64],
+    memory: Array,
+    turned: Array,
+    quaternion: int,
+    scene: Array,
 ) -> None:
     """Fill the numbers of a `scene`."""
     mj_kinematics(model, data)  # after a step, poses are those before it
@@ -61,4 +69,6 @@ def preload() -> None:
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     data = mujoco.MjData(model)
     turned = np.eye(3).ravel()
-    show.load()(model._address, data._address, np.zeros(0, dtype=int), turned, turned, 0, np.zeros(4))
+    show.load()(
+        model._address, data._address, np.zeros(0, dtype=int), turned, turned, 0, np.zeros(4)
+    )

@@ -21,14 +21,17 @@ from rack.levels.tables import SceneConfig
 
 
 class SimulatedArm(Simulation, Arm):
-    """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period, always.
+    """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period,
+    always.
 
-    Samples are as coarse and noisy as the cell's encoders; brakes and limit gate belong to the drives and see the
-    truth. A command is for one torque cycle. It passes the limit gate in every tick, even in those that the servo level
-    missed.
+    Samples are as coarse and noisy as the cell's encoders; brakes and limit gate belong to the
+    drives and see the truth. A command is for one torque cycle. It passes the limit gate in every
+    tick, even in those that the servo level missed.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         d = self._data
         joints = len(cell.qpos)
@@ -39,7 +42,9 @@ class SimulatedArm(Simulation, Arm):
         self._ctrl: memoryview[float] = memoryview(d.ctrl)
         self._grip = cell.gripper_actuator
         gripped = cell.gripper_qpos, cell.gripper_dof
-        self._gripper = None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])
+        self._gripper = (
+            None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])
+        )
         dynamics = Dynamics(cell)
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
@@ -50,10 +55,14 @@ class SimulatedArm(Simulation, Arm):
         self._asked, self._command, self.torque = torques = np.zeros((3, joints))
         self._given = False  # the command for the coming tick has passed the gate
         memory, (qpos, qvel, ctrl, brakes) = one_view(d.qpos, d.qvel, d.ctrl, d.qfrc_applied)
-        places = np.stack((qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof))
+        places = np.stack(
+            (qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof)
+        )
         self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
         self._give_clear = give.load()
-        if self._wrist is not None:  # until the first step it senses an arm that is braked, not one that falls
+        if (
+            self._wrist is not None
+        ):  # until the first step it senses an arm that is braked, not one that falls
             self._give()
             mujoco.mj_forward(cell.model, d)
 
@@ -78,7 +87,8 @@ class SimulatedArm(Simulation, Arm):
         return Sensed(position, velocity, self._qpos[at], self._qvel[dof], self.tick)
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and give torques and gripper force for the coming torque cycle; see `Link.drive`."""
+        """Release the brakes and give torques and gripper force for the coming torque cycle; see
+        `Link.drive`."""
         self._asked[:] = torque
         if self._grip is not None and math.isfinite(grip_force):
             self._ctrl[self._grip] = self.grip_force = grip_force
@@ -109,11 +119,13 @@ class SimulatedArm(Simulation, Arm):
             self._brake.hold_at(self._state[0])
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motors to `most` (joints,), N m, from the next command on; None: they are sound."""
+        """Limit the motors to `most` (joints,), N m, from the next command on; None: they are
+        sound."""
         self._most = most
 
     def step(self, ticks: int) -> None:
-        """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time continues."""
+        """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time
+        continues."""
         self.contact = None
         for _ in range(ticks):
             if self.waited >= self.patience:
@@ -129,7 +141,8 @@ class SimulatedArm(Simulation, Arm):
             self._data.time = self._now_s
 
     def feel(self) -> Array | None:
-        """Return the sample of the wrist sensor, (6,), N, N m: that of a substep ago, as MuJoCo's are."""
+        """Return the sample of the wrist sensor, (6,), N, N m: that of a substep ago, as MuJoCo's
+        are."""
         return None if self._wrist is None else self._wrist.sample(self.tick)
 
     def save(self, state: Message) -> None:
@@ -151,11 +164,14 @@ class SimulatedArm(Simulation, Arm):
         self._given = True
 
     def _give(self) -> None:
-        """Apply the command to the motors, or the brakes' torque to the joints, through the limit gate."""
+        """Apply the command to the motors, or the brakes' torque to the joints, through the limit
+        gate."""
         cell = self.cell
         braked = self.braked
         q, qd = self._state
-        passed, cut = self._gate.admit(self._brake.torque(q, qd) if braked else self._command, q, qd)
+        passed, cut = self._gate.admit(
+            self._brake.torque(q, qd) if braked else self._command, q, qd
+        )
         self.clipped += cut
         self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)

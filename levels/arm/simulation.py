@@ -1,4 +1,5 @@
-"""The simulation of a cell: the ticks of a plant in MuJoCo, judged at every step, and what moves by itself in it."""
+"""The simulation of a cell: the ticks of a plant in MuJoCo, judged at every step, and what moves by
+itself in it."""
 
 from __future__ import annotations
 
@@ -16,13 +17,15 @@ from rack.levels.robot.cell import STATE
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
-"""Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the blow."""
+"""Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the
+blow."""
 
 
 class Simulation(Plant):
     """A plant in MuJoCo: `substeps` steps a tick; simulated time is tick times period, always.
 
-    Subclasses call `begin` when the plant is made, and give the drives their commands before each `_simulate`.
+    Subclasses call `begin` when the plant is made, and give the drives their commands before each
+    `_simulate`.
     """
 
     def begin(self, scene: SceneConfig, clock_ns: int) -> None:
@@ -32,14 +35,24 @@ class Simulation(Plant):
         self._model = cell.model
         self._clock_ns = clock_ns
         self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
-        self._state = self._steps.seen[-1, 0], self._steps.seen[-1, 1]  # (joints,): true positions and velocities
+        self._state = (
+            self._steps.seen[-1, 0],
+            self._steps.seen[-1, 1],
+        )  # (joints,): true positions and velocities
         self._refresh()
         self._addresses = self._steps.model, self._steps.data
         self._contacts = ContactMonitor(cell)
         self._limits = LimitMonitor(cell, self._steps)
-        obstacles = zip(cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True)
+        obstacles = zip(
+            cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True
+        )
         self._motions = [
-            (mocap, ObstacleMotion(cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)))
+            (
+                mocap,
+                ObstacleMotion(
+                    cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)
+                ),
+            )
             for mocap, body, name in obstacles
         ]
         self._pushes = [
@@ -48,11 +61,13 @@ class Simulation(Plant):
             if (pushes := tuple(push for push in scene.push if push.body == name))
         ]
         self._advance, self._copy_state = advance.load(), copy_state.load()
-        # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the working directory.
+        # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the
+        # working directory.
         mujoco.set_mju_user_warning(lambda _: None)
 
     def _refresh(self) -> None:
-        """Take positions and velocities of the joints from MuJoCo's state, after it was set other than by a step."""
+        """Take positions and velocities of the joints from MuJoCo's state, after it was set other
+        than by a step."""
         position, velocity = self._state
         position[:], velocity[:] = self._data.qpos[self.cell.qpos], self._data.qvel[self.cell.dof]
 
@@ -98,7 +113,8 @@ class Simulation(Plant):
             self.struck -= 1
 
     def _look_closer(self, made: int) -> None:
-        """Finish a tick in which step `made` failed a check; on a fault, restore the state before the tick."""
+        """Finish a tick in which step `made` failed a check; on a fault, restore the state before
+        the tick."""
         touches, self._contacts.struck = self._contacts.count, self.contact
         self._contacts.look(self._data)
         while made < len(self._steps.seen):
@@ -165,5 +181,7 @@ def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
         since = time_s - push.at
         left = push.at + push.seconds - time_s
         if since >= 0.0 and left > 0.0:
-            total += np.array(push.force) * (min(1.0, since / push.rise, left / push.rise) if push.rise > 0.0 else 1.0)
+            total += np.array(push.force) * (
+                min(1.0, since / push.rise, left / push.rise) if push.rise > 0.0 else 1.0
+            )
     return total

@@ -19,13 +19,15 @@ PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
 
 
 class Substeps(NamedTuple):
-    """Further arguments of `advance`, prepared once: few, because each array costs more than the arithmetic on it."""
+    """Further arguments of `advance`, prepared once: few, because each array costs more than the
+    arithmetic on it."""
 
     model: int  # address
     data: int  # address
     places: NDArray[np.int64]  # (4, joints), in `memory`: of position, velocity, motor, brake
     memory: Array  # MuJoCo's
-    judged: Array  # (2 + substeps, 3, joints): lowest, highest and, after each step, position, velocity, torque
+    # (2 + substeps, 3, joints): lowest, highest and, after each step, position, velocity, torque
+    judged: Array
     states: Array  # (2, state): MuJoCo's before the tick; after it, as far as the steps change it
     warnings: NDArray[np.int32]  # (kinds,), how often MuJoCo has raised each
     contacts: NDArray[np.int32]  # (1,), their number
@@ -44,7 +46,9 @@ def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
     bounds = cell.bounds
     high = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
     low = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
-    memory, (qpos, qvel, motors, brakes) = one_view(data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied)
+    memory, (qpos, qvel, motors, brakes) = one_view(
+        data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
+    )
     return Substeps(
         cell.model._address,
         data._address,
@@ -74,10 +78,11 @@ def advance(  # flat arguments: a field of a named record takes 0.1 us
     distance: Array,
     touch: NDArray[np.bool_],
 ) -> int:
-    """Make the steps of a tick from number `begin` on, up to one that needs a closer look; the tick ends at `end_s`.
+    """Make the steps of a tick from number `begin` on, up to one that needs a closer look; the tick
+    ends at `end_s`.
 
-    Returns the number of the step to continue with; negative if the last one made broke a limit, or has an unintended
-    contact, a warning, or a state that is not finite.
+    Returns the number of the step to continue with; negative if the last one made broke a limit, or
+    has an unintended contact, a warning, or a state that is not finite.
     """
     before = states[0]
     after = states[1]

@@ -1,11 +1,13 @@
 """The wrist sensor, and what it says of a contact.
 
-The sensor gives the force and torque between the flange and all that hangs on it: of a contact, of the weight, and of
-the inertia. The last two follow from the model: it evaluates the same sensor at the same motion, without any contact.
-So no mass is entered twice, and a tool with joints of its own needs no special case.
+The sensor gives the force and torque between the flange and all that hangs on it: of a contact, of
+the weight, and of the inertia. The last two follow from the model: it evaluates the same sensor at
+the same motion, without any contact. So no mass is entered twice, and a tool with joints of its own
+needs no special case.
 
-MuJoCo gives a sensor's reading as the force of the parent on the child, in the frame of the site: a tool at rest that
-nothing touches reads its weight upwards, and one that presses down on a table reads less than that.
+MuJoCo gives a sensor's reading as the force of the parent on the child, in the frame of the site: a
+tool at rest that nothing touches reads its weight upwards, and one that presses down on a table
+reads less than that.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ class WristSensor:
         self._seed, self._uniform = seed + STREAM, uniform.load()
 
     def sample(self, tick: int) -> Array:
-        """Return force, N, and torque, N m, in the sensor's frame, (6,), of the last step before `tick`."""
+        """Return force, N, and torque, N m, in the sensor's frame, (6,), of the last step before
+        `tick`."""
         sample = self._numbers[self._places]
         if self._noise[0] > 0.0:
             chance = self._uniform(self._seed, tick, 2 * AXES)
@@ -61,21 +64,35 @@ class ContactWrench:
         """Use `dynamics` of the cell, the arm's: an evaluation at the same state costs nothing."""
         self._dynamics, self._range, joints = dynamics, np.repeat(wrist.range, 3), len(cell.dof)
         self.raw = np.zeros(AXES)  # (6,), N, N m: as sensed, in the sensor's frame
-        self.wrench = np.zeros(AXES)  # (6,), N, N m: of the contact on the tool, at the tool, in the world's frame
+        self.wrench = np.zeros(
+            AXES
+        )  # (6,), N, N m: of the contact on the tool, at the tool, in the world's frame
         self.torque = np.zeros(joints)  # (joints,), N m: of the contact on the joints
-        self.saturated = True  # the sample is at the end of the range, or NaN: the contact may be any stronger
+        self.saturated = (
+            True  # the sample is at the end of the range, or NaN: the contact may be any stronger
+        )
         model, data = dynamics.evaluated
         body = int(model.site_bodyid[wrist.site])
         root = int(model.body_rootid[model.site_bodyid[wrist.site]])
-        memory, begins = one_view(data.qacc, data.cfrc_int, data.site_xpos, data.site_xmat, data.subtree_com)
+        memory, begins = one_view(
+            data.qacc, data.cfrc_int, data.site_xpos, data.site_xmat, data.subtree_com
+        )
         first = (0, AXES * body, 3 * wrist.site, 9 * wrist.site, 3 * root)
         tool = int(begins[2]) + 3 * cell.tool
         self._places = np.array((*(begins + first), tool, model.site_bodyid[cell.tool]))
-        self._fixed = model._address, data._address, self._places, memory, cell.dof, np.zeros((2, 3, model.nv))
+        self._fixed = (
+            model._address,
+            data._address,
+            self._places,
+            memory,
+            cell.dof,
+            np.zeros((2, 3, model.nv)),
+        )
         self._set = set_contact.load()
 
     def take(self, raw: Array, state: Array, acceleration: Array) -> None:
-        """Take a sample (6,), N, N m, at the state (2, joints), rad, rad/s, and the accelerations (joints,), rad/s2."""
+        """Take a sample (6,), N, N m, at the state (2, joints), rad, rad/s, and the accelerations
+        (joints,), rad/s2."""
         self.raw[:] = raw
         self.saturated = not bool((np.abs(raw) < self._range).all())  # written so that NaN counts
         if not np.isfinite(raw).all():
@@ -88,7 +105,9 @@ class ContactWrench:
 def set_contact(
     model: int,
     data: int,  # evaluated at the state
-    places: NDArray[np.int64],  # in `memory`: accelerations, interaction force; sensor's place, frame; reference; tool
+    places: NDArray[
+        np.int64
+    ],  # in `memory`: accelerations, interaction force; sensor's place, frame; reference; tool
     memory: Array,
     dof: NDArray[np.int64],
     jacobians: Array,  # (2, 3, nv)
@@ -113,7 +132,9 @@ def set_contact(
         other = (axis + 2) % 3
         arm_one = memory[site + one] - memory[centre + one]
         arm_other = memory[site + other] - memory[centre + other]
-        expected = memory[force + axis] - (arm_one * memory[force + 3 + other] - arm_other * memory[force + 3 + one])
+        expected = memory[force + axis] - (
+            arm_one * memory[force + 3 + other] - arm_other * memory[force + 3 + one]
+        )
         wrench[3 + axis] = expected - turning
     for axis in range(3):
         one = (axis + 1) % 3
@@ -121,7 +142,14 @@ def set_contact(
         arm_one = memory[site + one] - memory[tool + one]
         arm_other = memory[site + other] - memory[tool + other]
         wrench[3 + axis] += arm_one * wrench[other] - arm_other * wrench[one]
-    mj_jac(model, data, jacobians[0].ctypes.data, jacobians[1].ctypes.data, memory[tool:].ctypes.data, body)
+    mj_jac(
+        model,
+        data,
+        jacobians[0].ctypes.data,
+        jacobians[1].ctypes.data,
+        memory[tool:].ctypes.data,
+        body,
+    )
     for joint in range(len(dof)):
         torque[joint] = 0.0
         for axis in range(3):
@@ -139,4 +167,6 @@ def preload() -> None:
     memory = np.zeros(16)
     wrench = np.zeros(AXES)
     at = model._address, data._address
-    set_contact.load()(*at, places, memory, places[:0], np.zeros((2, 3, 0)), wrench, none, wrench, none)
+    set_contact.load()(
+        *at, places, memory, places[:0], np.zeros((2, 3, 0)), wrench, none, wrench, none
+    )

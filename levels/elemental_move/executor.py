@@ -19,12 +19,20 @@ from rack.levels.messages import (
     SegmentKind,
     Verb,
 )
-from rack.levels.operator import ABOVE_LOST, BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import (
+    ABOVE_LOST,
+    BELOW_LOST,
+    HELD_FROM_ABOVE,
+    OPERATOR_COMMAND,
+    Operation,
+    Orders,
+)
 from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
-    """Hands segments down as soon as they are planned, and requests another path where the arm is blocked.
+    """Hands segments down as soon as they are planned, and requests another path where the arm is
+    blocked.
 
     After a restart of its board it continues from its own last messages. The arm is held on
     its path while the board above is lost, and on `hold` from above or from an operator.
@@ -38,7 +46,8 @@ class ElementalMoveExecutor(Executor):
         "last_status": Input(MOVE_STATUS, "own.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    # The status first: a board killed between the two finds done moves still in its window, and removes them again.
+    # The status first: a board killed between the two finds done moves still in its window, and
+    # removes them again.
     outputs = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = ElementalMoveParams
@@ -77,13 +86,16 @@ class ElementalMoveExecutor(Executor):
             self._fill(command.value, segments, tick)
         if self._error:
             segments.clear()
-        held = command.is_lost or bool(command.value.hold) or self._orders.standing is Operation.HOLD
+        held = (
+            command.is_lost or bool(command.value.hold) or self._orders.standing is Operation.HOLD
+        )
         write.command.hold = self._request > 0 or self._error > 0 or held
         self._report(read, segments, write.status)
         self._answer(read, write)
 
     def _recall(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
-        """Continue from the last command and status in the mailboxes; the stock of plans is lost."""
+        """Continue from the last command and status in the mailboxes; the stock of plans is
+        lost."""
         self._started = True
         write.status.end = read.status.value.position
         if read.last_command.is_there and read.last_status.is_there:
@@ -120,7 +132,8 @@ class ElementalMoveExecutor(Executor):
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
             if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
                 self._fail(
-                    Error.GRASP_MISSED, f"the gripper has closed to {status.opening * 1e3:.1f} mm: it holds nothing"
+                    Error.GRASP_MISSED,
+                    f"the gripper has closed to {status.opening * 1e3:.1f} mm: it holds nothing",
                 )
 
     def _check_below(self, status: Message, segments: SegmentWindow) -> None:
@@ -130,11 +143,13 @@ class ElementalMoveExecutor(Executor):
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
         if moving and status.held >= 0 and self._is_shut(status):
             self._fail(
-                Error.OBJECT_LOST, f"the gripper has closed to {status.opening * 1e3:.1f} mm: the object is lost"
+                Error.OBJECT_LOST,
+                f"the gripper has closed to {status.opening * 1e3:.1f} mm: the object is lost",
             )
 
     def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
-        """Request another path where the arm rests in front of an obstacle; cancel the request when the way is free."""
+        """Request another path where the arm rests in front of an obstacle; cancel the request when
+        the way is free."""
         blocked = bool(
             segments.count
             and status.blocked
@@ -145,7 +160,9 @@ class ElementalMoveExecutor(Executor):
         if not blocked:
             self._close_request()
         elif not self._request and self._replans_of_move >= self._params.replans:
-            self._fail(Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}")
+            self._fail(
+                Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}"
+            )
         elif not self._request:
             self._open_request(tick)
         elif (plan := self._plans.answer(self._request)) is not None:
@@ -198,7 +215,9 @@ class ElementalMoveExecutor(Executor):
         if gripper is None:
             self._fail(Error.UNREACHABLE, f"move {move['id']} needs a gripper; the robot has none")
             return False
-        segments.add_gripper(move, gripper.closed if move["verb"] == Verb.GRASP else gripper.open, gripper.force)
+        segments.add_gripper(
+            move, gripper.closed if move["verb"] == Verb.GRASP else gripper.open, gripper.force
+        )
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:
@@ -211,10 +230,12 @@ class ElementalMoveExecutor(Executor):
             self._fail(Error(refusal.error), refusal.reason)
 
     def _time_below(self, by_s: float) -> float:
-        """Return the time by which the level below must be done for this level to report it by `by_s`."""
+        """Return the time by which the level below must be done for this level to report it by
+        `by_s`."""
         if by_s <= 0.0:
             return 0.0
-        # A status from below waits up to a cycle to be read, and this level's becomes visible another cycle later.
+        # A status from below waits up to a cycle to be read, and this level's becomes visible
+        # another cycle later.
         return by_s - 2.0 * self.context.period_s - self._params.answer
 
     def _is_shut(self, status: Message) -> bool:
@@ -232,7 +253,11 @@ class ElementalMoveExecutor(Executor):
         status = read.status.value
         report.echo = command.id
         report.state = self._state(command)
-        waits = self._reason_to_wait(read.command, read.status) if report.state == State.EXECUTING else ""
+        waits = (
+            self._reason_to_wait(read.command, read.status)
+            if report.state == State.EXECUTING
+            else ""
+        )
         if waits:
             report.state = State.HOLDING
         report.error = self._error
@@ -243,7 +268,9 @@ class ElementalMoveExecutor(Executor):
         report.replan = self._request
         report.start = status.position
 
-    def _report_move(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
+    def _report_move(
+        self, command: Message, status: Message, segments: SegmentWindow, report: Message
+    ) -> None:
         """Report what is done, and the progress of the move under way."""
         under_way = segments.first if segments.count else None
         report.done = self._done
@@ -253,9 +280,15 @@ class ElementalMoveExecutor(Executor):
         is_begun = under_way is not None and under_way["id"] == status.current
         report.progress = status.progress if is_begun else 0.0
         under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
-        report.verb = int(command.moves["verb"][under_way_at[0]]) if report.current and under_way_at.size else Verb.NONE
+        report.verb = (
+            int(command.moves["verb"][under_way_at[0]])
+            if report.current and under_way_at.size
+            else Verb.NONE
+        )
 
-    def _report_plans(self, command: Message, status: Message, segments: SegmentWindow, report: Message) -> None:
+    def _report_plans(
+        self, command: Message, status: Message, segments: SegmentWindow, report: Message
+    ) -> None:
         """Report how far moves are planned: the planner continues from there."""
         report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
         end = self._plans.end(report.planned)
@@ -279,7 +312,8 @@ class ElementalMoveExecutor(Executor):
         self._orders.report(write.status, above)
 
     def _reason_to_wait(self, command: Reading, below: Reading) -> str:
-        """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
+        """Return the reason why the level waits, and the condition that ends the wait; empty: it
+        does not."""
         if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
         if command.is_lost:

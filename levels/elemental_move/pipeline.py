@@ -1,4 +1,5 @@
-"""The executor's plans, which wait until their moves are due, and its segments handed down. The level's parameters."""
+"""The executor's plans, which wait until their moves are due, and its segments handed down. The
+level's parameters."""
 
 from __future__ import annotations
 
@@ -16,34 +17,50 @@ from rack.levels.tables import Positive, Table
 MAX_GAP_RAD = 0.005
 """Paths join if no joint moves by more than this from the end of one to the start of the next."""
 MAX_PLANS = 2 * WINDOW
-"""Plans kept: the planner is never farther ahead than its window, and done moves are dropped with the next plan."""
+"""Plans kept: the planner is never farther ahead than its window, and done moves are dropped with
+the next plan."""
 
 
 class ElementalMoveParams(Table):
-    """Bounds of patience, of grasping, and of the answers from below, in `[board.<name>.params]`."""
+    """Bounds of patience, of grasping, and of the answers from below, in
+    `[board.<name>.params]`."""
 
-    patience: Positive = Field(60.0, description="time that a move waits for a free path before it is an error, s")
-    retry: Positive = Field(2.0, description="time after which a path is searched again in a world at rest, s")
-    replans: int = Field(
-        10, ge=1, le=1000, description="other paths that one move may take before a blocked way is an error"
+    patience: Positive = Field(
+        60.0, description="time that a move waits for a free path before it is an error, s"
     )
-    grasp_gap: Positive = Field(0.002, description="a gripper closer to closed than this holds nothing, m or rad")
-    answer: Positive = Field(0.3, description="time that settling and the report from below may take, s")
+    retry: Positive = Field(
+        2.0, description="time after which a path is searched again in a world at rest, s"
+    )
+    replans: int = Field(
+        10,
+        ge=1,
+        le=1000,
+        description="other paths that one move may take before a blocked way is an error",
+    )
+    grasp_gap: Positive = Field(
+        0.002, description="a gripper closer to closed than this holds nothing, m or rad"
+    )
+    answer: Positive = Field(
+        0.3, description="time that settling and the report from below may take, s"
+    )
 
 
 class PlanStore:
-    """The newest plan of every move from the one under way on, and the answer to the open request for another path."""
+    """The newest plan of every move from the one under way on, and the answer to the open request
+    for another path."""
 
     def __init__(self) -> None:
         self._by_move: dict[int, Message] = {}
         self._answer: Message | None = None
 
     def take(self, plan: Reading, done: int, handed_down: int, end: Array) -> None:
-        """Keep a new plan of a move after `handed_down`, if it begins where the path before it ends.
+        """Keep a new plan of a move after `handed_down`, if it begins where the path before it
+        ends.
 
-        `end` (joints,), rad, is the end of the moves whose plans have been dropped. A plan that does not join is based
-        on one that was lost or replaced; the planner will make it again. Plans of moves before `done` are dropped.
-        After a refusal, or a path that ends elsewhere than before, all later plans are dropped.
+        `end` (joints,), rad, is the end of the moves whose plans have been dropped. A plan that
+        does not join is based on one that was lost or replaced; the planner will make it again.
+        Plans of moves before `done` are dropped. After a refusal, or a path that ends elsewhere
+        than before, all later plans are dropped.
         """
         if not plan.is_new:
             return
@@ -55,10 +72,16 @@ class PlanStore:
         for move in [m for m in self._by_move if m < done]:
             del self._by_move[move]
         before = self.end(message.move - 1)
-        if message.move <= handed_down or not (message.error or joins(message, end if before is None else before)):
+        if message.move <= handed_down or not (
+            message.error or joins(message, end if before is None else before)
+        ):
             return
         known = self._by_move.get(message.move)
-        stays = known is not None and not (known.error or message.error) and is_same(end_of(known), end_of(message))
+        stays = (
+            known is not None
+            and not (known.error or message.error)
+            and is_same(end_of(known), end_of(message))
+        )
         for move in [m for m in self._by_move if m > message.move and not stays]:
             del self._by_move[move]
         if len(self._by_move) < MAX_PLANS:
@@ -73,7 +96,8 @@ class PlanStore:
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
     def reach(self, window: Any, handed_down: int) -> int:
-        """Return the newest move, at least `handed_down`, up to which every motion of `window` has its path."""
+        """Return the newest move, at least `handed_down`, up to which every motion of `window` has
+        its path."""
         reached = handed_down
         for move in window:
             if move["id"] == reached + 1:
@@ -85,7 +109,8 @@ class PlanStore:
         return reached
 
     def end(self, move: int) -> Array | None:
-        """Return the end of the newest path up to that of `move`, (joints,), rad; None: there is none."""
+        """Return the end of the newest path up to that of `move`, (joints,), rad; None: there is
+        none."""
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
         return end_of(self._by_move[max(paths)]) if paths else None
 
@@ -106,7 +131,8 @@ def is_same(a: Array, b: Array) -> bool:
 
 
 class SegmentWindow:
-    """Segments handed down and not known to be done, oldest first, kept in the outgoing `MOVE_COMMAND` itself.
+    """Segments handed down and not known to be done, oldest first, kept in the outgoing
+    `MOVE_COMMAND` itself.
 
     Serials are never reused: a segment that replaces another has a newer one.
     """
@@ -136,7 +162,8 @@ class SegmentWindow:
         return int(self._segments["move"][self.count - 1]) if self.count else 0
 
     def take_done(self, done: int) -> Any:
-        """Remove and return the oldest segment if its serial is at most `done`; else return None."""
+        """Remove and return the oldest segment if its serial is at most `done`; else return
+        None."""
         if not self.count or self._segments["id"][0] > done:
             return None
         taken = self._segments[0].copy()
@@ -158,19 +185,22 @@ class SegmentWindow:
         self._lay(segment, plan)
 
     def replace_first(self, plan: Message) -> None:
-        """Withdraw all segments; hand down the oldest again along another path, with a new serial."""
+        """Withdraw all segments; hand down the oldest again along another path, with a new
+        serial."""
         self._command.count = 1
         self._blank()
         self._command.id = self.first["id"] = int(self._command.id) + 1
         self._lay(self.first, plan)
 
     def add_gripper(self, move: Any, opening: float, force: float) -> None:
-        """Hand down a motion of the gripper to `opening`, m or rad, with at most `force`, N or N m."""
+        """Hand down a motion of the gripper to `opening`, m or rad, with at most `force`, N or N
+        m."""
         segment = self._add(move, SegmentKind.GRIPPER)
         segment["opening"], segment["force"] = opening, force
 
     def end(self) -> Array | None:
-        """Return the last waypoint (joints,) of the newest path in the window; None: there is none."""
+        """Return the last waypoint (joints,) of the newest path in the window; None: there is
+        none."""
         for segment in self._segments[: self.count][::-1]:
             if segment["kind"] == SegmentKind.PATH:
                 return np.array(segment["waypoints"][segment["count"] - 1])

@@ -1,4 +1,5 @@
-"""The planner of the elemental move level: a collision-free path for every move, before it is due."""
+"""The planner of the elemental move level: a collision-free path for every move, before it is
+due."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
 
 ACKNOWLEDGED_CYCLES = 2
-"""Cycles until the executor's status must acknowledge a plan; otherwise the plan is lost and made again."""
+"""Cycles until the executor's status must acknowledge a plan; otherwise the plan is lost and made
+again."""
 MAX_HANDED_DOWN = 1
 """Moves after the one under way that the executor may have handed down already."""
 
@@ -98,7 +100,9 @@ class ElementalMovePlanner(Planner):
         self._published: list[Published] = []
         self._job: PlanningJob | None = None
         self._window: list[Move] = []
-        self._grip: tuple[int, Pose] | None = None  # row of the object that is, or will be, held and its pose
+        self._grip: tuple[int, Pose] | None = (
+            None  # row of the object that is, or will be, held and its pose
+        )
         self._revision = -1  # of the world in which all published paths are free
         self._refusal: Refusal | None = None  # of the job tried last
         self._tries = 0  # of that job
@@ -128,7 +132,9 @@ class ElementalMovePlanner(Planner):
         visible_at = tick + self.context.every * self.context.within_cycles
         try:
             situation = self._situation(job.move, read)
-            path = self._motion.plan(job.move, job.start, situation, attempt=self._tries, goal=job.goal)
+            path = self._motion.plan(
+                job.move, job.start, situation, attempt=self._tries, goal=job.goal
+            )
         except Refused as refused:
             write.error = refused.code
             write.reason = str(refused)
@@ -141,7 +147,8 @@ class ElementalMovePlanner(Planner):
         self._note_path(job, path, visible_at)
 
     def _requested(self, read: Ports, tick: int) -> PlanningJob | None:
-        """Return the job that the executor requests where the arm is blocked; its end stays, for the moves after it."""
+        """Return the job that the executor requests where the arm is blocked; its end stays, for
+        the moves after it."""
         status = read.status.value
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
             return None
@@ -159,7 +166,9 @@ class ElementalMovePlanner(Planner):
             return None
         handed_down = max(status.current, status.done) + MAX_HANDED_DOWN
         for move, path, _ in self._published:
-            if move.id > handed_down and not self._motion.still_free(move, path, self._situation(move, read)):
+            if move.id > handed_down and not self._motion.still_free(
+                move, path, self._situation(move, read)
+            ):
                 return PlanningJob(move, path.waypoints[0], path.end)
         self._revision = revision
         return None
@@ -172,7 +181,8 @@ class ElementalMovePlanner(Planner):
         move = next_motion(self._window, newest)
         if move is None:
             return None
-        # The executor's report of a path's end is exact, but it may not have received the newest path yet.
+        # The executor's report of a path's end is exact, but it may not have received the newest
+        # path yet.
         if self._published and self._published[-1].move.id > status.planned:
             return PlanningJob(move, self._published[-1].path.end)
         if status.planned > status.done:
@@ -180,7 +190,8 @@ class ElementalMovePlanner(Planner):
         return PlanningJob(move, np.array(primitive.position)) if primitive.resting else None
 
     def _situation(self, move: Move, read: Ports) -> Situation:
-        """Return the situation when `move` begins: the world as sensed, changed by the moves before it."""
+        """Return the situation when `move` begins: the world as sensed, changed by the moves before
+        it."""
         world = read.world.value
         held = read.primitive.value.held
         done = read.status.value.done
@@ -188,41 +199,53 @@ class ElementalMovePlanner(Planner):
         if held >= 0:
             situation = situation.holding(held, self._grip[1] if self._grip is not None else None)
         for earlier in self._window:
-            # A grasp may be reported done only after the object is reported held: it must not count twice.
+            # A grasp may be reported done only after the object is reported held: it must not count
+            # twice.
             known = earlier.verb is Verb.GRASP and earlier.object == situation.held
             if done < earlier.id < move.id and not known:
                 situation = situation.after(earlier)
         return situation
 
     def _forget(self, status: Message, tick: int) -> None:
-        """Drop paths that are done, and those that the executor should have acknowledged but has not."""
+        """Drop paths that are done, and those that the executor should have acknowledged but has
+        not."""
         late = tick - ACKNOWLEDGED_CYCLES * self.context.every
         kept = [p for p in self._published if p.move.id > status.done]
         lost = [p.move.id for p in kept if p.move.id > status.planned and p.visible_at <= late]
         self._published = [p for p in kept if not lost or p.move.id < lost[0]]
 
     def _note_grip(self, read: Ports) -> None:
-        """Store how the next object, still at rest, will be grasped; after a restart, how it is held."""
+        """Store how the next object, still at rest, will be grasped; after a restart, how it is
+        held."""
         world = read.world.value
         held = read.primitive.value.held
         done = read.status.value.done
         if held < 0:
-            ahead = [(m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done]
-            self._grip = next(((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None)
+            ahead = [
+                (m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done
+            ]
+            self._grip = next(
+                ((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None
+            )
         elif self._grip is None or self._grip[0] != held:
             scene = read.scene.value
             tool = pose(scene.tool_position, scene.tool_quaternion)
             self._grip = (held, grip_of(held, tool, scene))
 
     def _may_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
-        """Return whether a job may be tried: a refused one only after a change of the world, or after `retry`."""
+        """Return whether a job may be tried: a refused one only after a change of the world, or
+        after `retry`."""
         refusal = self._refusal
         if refusal is None or (refusal.move, refusal.request) != (job.move.id, job.request):
             self._tries = 0
             return True
-        return refusal.error == Error.NO_PATH and (revision != refusal.revision or tick >= refusal.again_at)
+        return refusal.error == Error.NO_PATH and (
+            revision != refusal.revision or tick >= refusal.again_at
+        )
 
-    def _note_refusal(self, job: PlanningJob, refused: Refused, revision: int, visible_at: int) -> None:
+    def _note_refusal(
+        self, job: PlanningJob, refused: Refused, revision: int, visible_at: int
+    ) -> None:
         again_at = visible_at + round(self._params.retry / self.context.tick_s)
         self._refusal = Refusal(job.move.id, job.request, refused.code, revision, again_at)
         self._tries += 1
@@ -243,7 +266,8 @@ class ElementalMovePlanner(Planner):
 
 
 def next_motion(window: Sequence[Move], newest: int) -> Move | None:
-    """Return the first motion after move `newest`; None when the window does not reach it without a gap."""
+    """Return the first motion after move `newest`; None when the window does not reach it without a
+    gap."""
     for move in window:
         if move.id == newest + 1:
             if move.is_motion:
@@ -253,7 +277,8 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def end_handed_down(command: Message, move: Move) -> Array | None:
-    """Return the end of the path of `move` in a `MOVE_COMMAND`, (joints,), rad; None: it has none there."""
+    """Return the end of the path of `move` in a `MOVE_COMMAND`, (joints,), rad; None: it has none
+    there."""
     for segment in command.segments[: command.count]:
         if segment["move"] == move.id and segment["kind"] == SegmentKind.PATH:
             return np.array(segment["waypoints"][segment["count"] - 1])
@@ -261,5 +286,6 @@ def end_handed_down(command: Message, move: Move) -> Array | None:
 
 
 def grip_of(row: int, tool: Pose, seen: Message) -> Pose:
-    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a SCENE or a WORLD_MODEL."""
+    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a SCENE or a
+    WORLD_MODEL."""
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

@@ -13,7 +13,8 @@ from rack.levels.algebra import Array, norm
 COINCIDENT_RAD = 1e-7
 """Waypoints closer than this count as one, and a shorter blend counts as none."""
 MAX_STRAIGHT_BEND = 1e-9
-"""Two unit directions that differ by less than this count as equal: the corner between them needs no stop."""
+"""Two unit directions that differ by less than this count as equal: the corner between them needs
+no stop."""
 OVERLAP_ROUNDING = 1e-9
 """Blends may overlap by this part of the line between them, from rounding."""
 
@@ -112,11 +113,13 @@ class BlendedPath:
         return self._point
 
     def piece_at(self, s: float) -> int:
-        """Return the index of the piece that contains `s`; at a break, of the piece that begins there."""
+        """Return the index of the piece that contains `s`; at a break, of the piece that begins
+        there."""
         return min(max(bisect_right(self._breaks, s) - 1, 0), len(self._pieces) - 1)
 
     def sample(self, step_rad: float) -> Array:
-        """Return points along the path, both ends included, at most `step_rad` of s apart; (n, joints)."""
+        """Return points along the path, both ends included, at most `step_rad` of s apart; (n,
+        joints)."""
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
         return np.array([self.evaluate(s).q.copy() for s in np.linspace(0.0, self.length, count)])
 
@@ -140,7 +143,9 @@ class BlendedPath:
                 self.stops.append(self._starts[corner])
         if not self._pieces:
             self._pieces, self._breaks = [(-1, -1)], [0.0, self.length]
-        self.breaks = np.array(self._breaks)  # (pieces + 1,), rad: s where each piece begins, and the end
+        self.breaks = np.array(
+            self._breaks
+        )  # (pieces + 1,), rad: s where each piece begins, and the end
 
     def _add_piece(self, piece: tuple[int, int], end: float) -> None:
         """Append a piece up to `end`, unless adjacent blends leave no line between them."""
@@ -168,11 +173,15 @@ def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
     if points.ndim != 2 or len(points) == 0:
         raise ValueError(f"path: waypoints of shape {points.shape}; valid: (k, joints) with k >= 1")
     if radii.shape != (len(points),):
-        raise ValueError(f"path: blend of shape {radii.shape}; valid: {(len(points),)}, one per waypoint")
+        raise ValueError(
+            f"path: blend of shape {radii.shape}; valid: {(len(points),)}, one per waypoint"
+        )
     if not (np.isfinite(points).all() and np.isfinite(radii).all()):
         raise ValueError("path: a waypoint or a blend is not finite")
     if (radii < 0.0).any():
-        raise ValueError(f"path: blend {radii.min():.4g} rad of corner {radii.argmin()}; valid: 0 or more")
+        raise ValueError(
+            f"path: blend {radii.min():.4g} rad of corner {radii.argmin()}; valid: 0 or more"
+        )
     return points, radii
 
 
@@ -194,6 +203,6 @@ def _check_overlap(radii: Array, lengths: Array) -> None:
     for k, length in enumerate(lengths):
         if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
             raise ValueError(
-                f"path: blends {radii[k]:.4g} and {radii[k + 1]:.4g} rad of corners {k} and {k + 1} overlap; "
-                f"valid: together at most the line between them, {length:.4g} rad"
+                f"path: blends {radii[k]:.4g} and {radii[k + 1]:.4g} rad of corners {k} and {k + 1}"
+                f" overlap; valid: together at most the line between them, {length:.4g} rad"
             )

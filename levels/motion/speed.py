@@ -1,4 +1,5 @@
-"""Limits of a path's parameter s: joint limits seen along the path, and the speeds that they permit."""
+"""Limits of a path's parameter s: joint limits seen along the path, and the speeds that they
+permit."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from rack.levels.motion.path import PathBounds
 from rack.levels.robot.limits import Limits
 
 REACHABLE_PART = 1.0 - 1e-7
-"""Part of a reachable change of speed that is used: at the exact limit, rounding decides whether it is reachable."""
+"""Part of a reachable change of speed that is used: at the exact limit, rounding decides whether it
+is reachable."""
 MIN_ACCELERATION_PART = 1e-6
 """Acceleration or jerk below this part of the speed, in 1/s or 1/s2, counts as none."""
 SMALLEST_LINEAR_TERM = 1e-12
@@ -22,12 +24,14 @@ SMALLEST_LINEAR_TERM = 1e-12
 
 
 def braking_limits(limits: Limits, factor: float) -> Limits:
-    """Return the limits of a hold, `factor` times the acceleration and jerk: planned motion on a curve may use all."""
+    """Return the limits of a hold, `factor` times the acceleration and jerk: planned motion on a
+    curve may use all."""
     return replace(limits, acceleration=factor * limits.acceleration, jerk=factor * limits.jerk)
 
 
 class SpeedLimits(NamedTuple):
-    """Limits of ds/dt and its derivatives, in rad/s, rad/s2, rad/s3; acceleration 0: constant speed."""
+    """Limits of ds/dt and its derivatives, in rad/s, rad/s2, rad/s3; acceleration 0: constant
+    speed."""
 
     speed: float
     acceleration: float
@@ -35,10 +39,12 @@ class SpeedLimits(NamedTuple):
 
 
 def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
-    """Return limits of s that keep every joint within `limits` on a piece with the given bounds, (joints,) each.
+    """Return limits of s that keep every joint within `limits` on a piece with the given bounds,
+    (joints,) each.
 
-    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. `share` (0 to 1) is the
-    part used of the highest speed that the bend of a curve permits: a smaller share leaves more to accelerate with.
+    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. `share` (0
+    to 1) is the part used of the highest speed that the bend of a curve permits: a smaller share
+    leaves more to accelerate with.
     """
     first, second, third = piece
     velocity = limits.velocity
@@ -47,7 +53,11 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
     curved = bool(second.any())
     speed = _least(velocity, first)
     if curved:
-        speed = min(speed, share * math.sqrt(_least(acceleration, second)), share * math.cbrt(_least(jerk, third)))
+        speed = min(
+            speed,
+            share * math.sqrt(_least(acceleration, second)),
+            share * math.cbrt(_least(jerk, third)),
+        )
     left = np.maximum(acceleration - second * speed**2, 0.0)
     left_jerk = np.maximum(jerk - third * speed**3, 0.0)
     most = _least(left, first)
@@ -60,12 +70,14 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
 
 
 def acceleration_room(first: Array, limits: Limits) -> tuple[float, float]:
-    """Return the acceleration and jerk of s that the joints have on a straight line with |q'| = `first`."""
+    """Return the acceleration and jerk of s that the joints have on a straight line with |q'| =
+    `first`."""
     return _least(limits.acceleration, first), _least(limits.jerk, first)
 
 
 def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
-    """Return the highest speed reachable from speed `start` over `length` rad, both without acceleration, in rad/s.
+    """Return the highest speed reachable from speed `start` over `length` rad, both without
+    acceleration, in rad/s.
 
     By symmetry it is also the highest speed from which `start` can still be reached.
     """
@@ -83,7 +95,8 @@ def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
 
 
 def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
-    """Return the highest speeds at the ends of consecutive stretches, from rest to rest, in rad/s."""
+    """Return the highest speeds at the ends of consecutive stretches, from rest to rest, in
+    rad/s."""
     speeds = [0.0]
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
         following = limits[k + 1].speed if k + 1 < len(limits) else 0.0

@@ -1,4 +1,5 @@
-"""Time along a path: sections of constant jerk of its parameter, within the limits of every joint; ramps to rest."""
+"""Time along a path: sections of constant jerk of its parameter, within the limits of every joint;
+ramps to rest."""
 
 from __future__ import annotations
 
@@ -21,8 +22,18 @@ SHARES = (1.0, 0.9, 0.75, 0.6)
 """Parts of a curve's highest speed that are tried; the fastest trajectory is taken."""
 MIN_SECTION_S = 1e-12
 """Sections shorter than this are dropped."""
-STOP_EFFORTS = ((1.0, 1.0), (0.6, 1.0), (0.6, 0.5), (0.35, 0.6), (0.35, 0.3), (0.2, 0.3), (0.2, 0.15), (0.1, 0.1))
-"""Parts of a straight line's deceleration and jerk that a stop tries; a curve leaves less of both."""
+STOP_EFFORTS = (
+    (1.0, 1.0),
+    (0.6, 1.0),
+    (0.6, 0.5),
+    (0.35, 0.6),
+    (0.35, 0.3),
+    (0.2, 0.3),
+    (0.2, 0.15),
+    (0.1, 0.1),
+)
+"""Parts of a straight line's deceleration and jerk that a stop tries; a curve leaves less of
+both."""
 STOP_INTERVALS = 24
 """Intervals of equal time in which the joint limits of a stop are checked."""
 LIMIT_ROUNDING = 1e-6
@@ -46,7 +57,9 @@ class Trajectory:
     """Motion along a path as sections of constant jerk, from rest or from motion to rest."""
 
     def __init__(self, sections: Array, duration: float) -> None:
-        self.sections = sections  # (n, 5), n >= 1: start in s; s, ds, dds and jerk of the path parameter there
+        self.sections = (
+            sections  # (n, 5), n >= 1: start in s; s, ds, dds and jerk of the path parameter there
+        )
         self.duration = duration  # s
         self._starts: list[float] = sections[:, 0].tolist()
         self._rows: list[list[float]] = sections[:, 1:].tolist()
@@ -60,7 +73,9 @@ class Trajectory:
         s, ds, dds, jerk = self._rows[k]
         t = time_s - self._starts[k]
         return PathState(
-            s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)), ds + t * (dds + t * jerk / 2.0), dds + t * jerk
+            s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
+            ds + t * (dds + t * jerk / 2.0),
+            dds + t * jerk,
         )
 
     def states(self, times_s: Array) -> tuple[Array, Array, Array]:
@@ -71,10 +86,15 @@ class Trajectory:
         ds = row[:, 2]
         dds = row[:, 3]
         jerk = row[:, 4]
-        return s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)), ds + t * (dds + t * jerk / 2.0), dds + t * jerk
+        return (
+            s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
+            ds + t * (dds + t * jerk / 2.0),
+            dds + t * jerk,
+        )
 
     def stretched(self, factor: float) -> Trajectory:
-        """Return the same motion slowed by `factor` >= 1; it keeps every limit that this one keeps."""
+        """Return the same motion slowed by `factor` >= 1; it keeps every limit that this one
+        keeps."""
         powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
         return Trajectory(self.sections * powers, self.duration * factor)
 
@@ -82,8 +102,8 @@ class Trajectory:
 def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Trajectory:
     """Make the fastest motion found from rest at `begin`, in rad, to rest at the end of `path`.
 
-    It rests at the path's stops too. The path's analytic bounds, not samples, ensure that joint velocity, acceleration
-    and jerk keep `limits` everywhere. At most `SECTIONS` sections.
+    It rests at the path's stops too. The path's analytic bounds, not samples, ensure that joint
+    velocity, acceleration and jerk keep `limits` everywhere. At most `SECTIONS` sections.
     """
     stops = [s for s in path.stops if s > begin + COINCIDENT_RAD]
     marks = [min(begin, path.length), *stops, path.length]
@@ -97,14 +117,17 @@ def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Tr
 def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory | None:
     """Make the shortest ramp found to rest along `path` from `state` that keeps the joint limits.
 
-    None: every ramp would exceed a limit or overrun the path. Motion may then follow its trajectory, which itself ends
-    at rest, and try again a cycle later. The time taken is bounded for every path.
+    None: every ramp would exceed a limit or overrun the path. Motion may then follow its
+    trajectory, which itself ends at rest, and try again a cycle later. The time taken is bounded
+    for every path.
     """
     if state.ds < MAX_REST_RAD_S:
         return _joined([], state.s)
     most, jerk = acceleration_room(path.bounds.first[path.piece_at(state.s)], limits)
     # After a stop the path continues in another direction: the motion must rest there.
-    end = next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
+    end = (
+        next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
+    )
     for part, part_of_jerk in STOP_EFFORTS:
         stop = _ramp(state, max(part * most, abs(state.dds)), part_of_jerk * jerk)
         if stop.end <= end and _keeps(stop, path, limits):
@@ -126,10 +149,13 @@ class _Run:
         self.most_sections = SECTIONS_A_LINE * (1 + corners)
 
     def ways(self) -> list[tuple[list[float], PathBounds]]:
-        """Return marks and bounds: limits for each piece, and one set for all, which suits many small corners."""
+        """Return marks and bounds: limits for each piece, and one set for all, which suits many
+        small corners."""
         alone = (self.marks, self.bounds)
         together = PathBounds(*(bound.max(axis=0, keepdims=True) for bound in self.bounds))
-        return [alone, ([self.marks[0], self.marks[-1]], together)] if len(self.marks) > 2 else [alone]
+        return (
+            [alone, ([self.marks[0], self.marks[-1]], together)] if len(self.marks) > 2 else [alone]
+        )
 
 
 def _fastest(run: _Run, limits: Limits) -> list[Section]:
@@ -138,9 +164,14 @@ def _fastest(run: _Run, limits: Limits) -> list[Section]:
     least = np.inf
     for share in run.shares:
         for marks, bounds in run.ways():
-            stretches = [speed_limits(PathBounds(*piece), limits, share) for piece in zip(*bounds, strict=True)]
+            stretches = [
+                speed_limits(PathBounds(*piece), limits, share)
+                for piece in zip(*bounds, strict=True)
+            ]
             rows = list(_sections(marks, stretches))
-            time_s = math.fsum(row[0] for row in rows)  # exact: `sum` rounds otherwise from Python 3.12 on
+            time_s = math.fsum(
+                row[0] for row in rows
+            )  # exact: `sum` rounds otherwise from Python 3.12 on
             if time_s < least and len(rows) <= run.most_sections:
                 best = rows
                 least = time_s
@@ -148,10 +179,13 @@ def _fastest(run: _Run, limits: Limits) -> list[Section]:
 
 
 def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
-    """Yield the sections from rest at the first to rest at the last mark, each stretch with its limits."""
+    """Yield the sections from rest at the first to rest at the last mark, each stretch with its
+    limits."""
     lengths = [end - start for start, end in pairwise(marks)]
     speeds = boundary_speeds(lengths, limits)
-    for start, length, limit, (before, after) in zip(marks, lengths, limits, pairwise(speeds), strict=False):
+    for start, length, limit, (before, after) in zip(
+        marks, lengths, limits, pairwise(speeds), strict=False
+    ):
         if limit.acceleration > 0.0:
             wanted = ruckig.InputParameter(1)
             wanted.current_position = [start]
@@ -178,7 +212,8 @@ def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
 
 
 def _calculated(wanted: ruckig.InputParameter) -> list[Section]:
-    """Return the sections of ruckig's answer in one dimension. Raises `ArithmeticError` when it has none."""
+    """Return the sections of ruckig's answer in one dimension. Raises `ArithmeticError` when it has
+    none."""
     found = ruckig.Trajectory(1)
     result = ruckig.Ruckig(1).calculate(wanted, found)
     if result != ruckig.Result.Working:
@@ -199,7 +234,8 @@ def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
 
 
 def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
-    """Return whether every joint keeps its limits, by bounds of motion and path over each interval of time."""
+    """Return whether every joint keeps its limits, by bounds of motion and path over each interval
+    of time."""
     switches = stop.sections[:, 0]
     times = _checked_times(stop)
     s, ds, dds = stop.states(times)
@@ -214,7 +250,9 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     cubed = speed * speed * speed  # of an array, ** 3 is not the same on every processor
     room = 1.0 + LIMIT_ROUNDING
     return bool(
-        (ds > -LIMIT_ROUNDING).all()  # a jerk too small to end the present deceleration would reverse the motion
+        (
+            ds > -LIMIT_ROUNDING
+        ).all()  # a jerk too small to end the present deceleration would reverse the motion
         and (first * speed <= limits.velocity * room).all()
         and (second * speed**2 + first * most <= limits.acceleration * room).all()
         and (third * cubed + 3.0 * second * speed * most + first * jerk <= limits.jerk * room).all()
@@ -222,13 +260,16 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
 
 
 def _checked_times(stop: Trajectory) -> Array:
-    """Return the ends of the intervals: evenly spread, and wherever jerk or the sign of dds changes."""
+    """Return the ends of the intervals: evenly spread, and wherever jerk or the sign of dds
+    changes."""
     start = stop.sections[:, 0]
     dds = stop.sections[:, 3]
     jerk = stop.sections[:, 4]
     until_zero = np.divide(-dds, jerk, out=np.zeros(len(jerk)), where=jerk != 0.0)
     zeros = np.clip(start + until_zero, start, np.append(start[1:], stop.duration))
-    return np.unique(np.concatenate((start, zeros, np.linspace(0.0, stop.duration, STOP_INTERVALS + 1))))
+    return np.unique(
+        np.concatenate((start, zeros, np.linspace(0.0, stop.duration, STOP_INTERVALS + 1)))
+    )
 
 
 def _bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:

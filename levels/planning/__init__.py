@@ -1,1 +1,2 @@
-"""Planning for an arm: inverse kinematics, collisions, payloads, paths. Deterministic, in any process."""
+"""Planning for an arm: inverse kinematics, collisions, payloads, paths. Deterministic, in any
+process."""

@@ -1,6 +1,7 @@
 """Collisions of the arm and its load with the cell and with each other.
 
-MuJoCo finds the close pairs of geoms. A matrix of required distances, one entry per pair, decides which of them count.
+MuJoCo finds the close pairs of geoms. A matrix of required distances, one entry per pair, decides
+which of them count.
 """
 
 from __future__ import annotations
@@ -16,22 +17,29 @@ from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.engine import contact_views, mj_collision, mj_kinematics, mju_mat_to_quat, mju_mul_quat
+from rack.levels.robot.engine import (
+    contact_views,
+    mj_collision,
+    mj_kinematics,
+    mju_mat_to_quat,
+    mju_mul_quat,
+)
 from rack.levels.robot.lookup import geom_name
 from rack.levels.tables import SceneConfig
 
 MAX_TOUCH_DEPTH_M = 0.003
 """Depth of an intended contact: simulated bodies are soft and sensed poses are not exact."""
 MAX_HELD_DEPTH_M = 0.01
-"""Depth of a contact between a held object and its supports: the object slides by some millimetres in the gripper when
-it moves fast, and its support pushes it back as it is put down."""
+"""Depth of a contact between a held object and its supports: the object slides by some millimetres
+in the gripper when it moves fast, and its support pushes it back as it is put down."""
 
 ANY_DISTANCE = -np.inf
 """Required distance of a pair that may overlap."""
 
 
 def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
-    """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies, 4) as w, x, y, z."""
+    """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies,
+    4) as w, x, y, z."""
     for row, address in enumerate(cell.object_qpos):
         data.qpos[address : address + 3] = positions[row]
         data.qpos[address + 3 : address + 7] = quaternions[row]
@@ -43,9 +51,9 @@ def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions:
 class CollisionChecker:
     """Decides whether a configuration of the arm is free, on its own copy of the cell.
 
-    The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links may be close to
-    each other and to the body that carries the arm, but must not touch. One instance serves one task; a check takes
-    some microseconds.
+    The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links
+    may be close to each other and to the body that carries the arm, but must not touch. One
+    instance serves one task; a check takes some microseconds.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig) -> None:
@@ -56,18 +64,26 @@ class CollisionChecker:
         self._model = copy.copy(cell.model)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
-        self._row_geoms = [np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b) for b in cell.bodies]
+        self._row_geoms = [
+            np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b)
+            for b in cell.bodies
+        ]
         self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
         self._required = self._base.copy()
-        self._q, self._least = np.zeros(len(cell.qpos)), np.inf  # the last configuration checked, and its clearance
+        self._q, self._least = (
+            np.zeros(len(cell.qpos)),
+            np.inf,
+        )  # the last configuration checked, and its clearance
         m = self._model
         d = self._data
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         quaternion = np.zeros(4)
         arrays = self._q, cell.qpos.copy(), d.qpos, *tool, self._offset, quaternion, self._required
-        self._is_free = partial(is_free.load(), m._address, d._address, *arrays, *contact_views(m, d))
+        self._is_free = partial(
+            is_free.load(), m._address, d._address, *arrays, *contact_views(m, d)
+        )
 
     def tool_at(self, q: Array) -> Pose:
         """Return the tool's pose at `q` (joints,), rad."""
@@ -84,7 +100,9 @@ class CollisionChecker:
         if self.cell.linkage is not None:
             self.cell.linkage.set(self._data.qpos, opening)
 
-    def hold(self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)) -> None:
+    def hold(
+        self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)
+    ) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
         self.held = row
         self._offset[:3], self._offset[3:] = position, quaternion
@@ -94,17 +112,22 @@ class CollisionChecker:
         self._apply()
 
     def permit(self, row: int | None, touch: bool = True) -> None:
-        """Permit or forbid contact of object `row` with supports and gripper, and a gripper close to supports."""
+        """Permit or forbid contact of object `row` with supports and gripper, and a gripper close
+        to supports."""
         self._touched = row if touch else None
         self._apply()
 
     def free(self, q: Array, clearance: float | None = None) -> bool:
-        """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may lower the scene's."""
+        """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may
+        lower the scene's."""
         self._q[:], self._least = q, np.inf if clearance is None else float(clearance)
-        return self._is_free(-1 if self.held is None else self.cell.object_qpos[self.held], self._least)
+        return self._is_free(
+            -1 if self.held is None else self.cell.object_qpos[self.held], self._least
+        )
 
     def room(self, q: Array) -> float:
-        """Return the largest clearance, in m and at most the scene's, with which `q` is free; negative: with none."""
+        """Return the largest clearance, in m and at most the scene's, with which `q` is free;
+        negative: with none."""
         self.free(q)
         short = self._shortfalls()
         pairs = self._data.contact.geom
@@ -114,7 +137,8 @@ class CollisionChecker:
         return self.clearance - max(0.0, float(np.max(short, initial=0.0)))
 
     def why(self, q: Array, clearance: float | None = None) -> str:
-        """Name the pair of geoms that violates its distance most at `q`, and both distances; empty: `q` is free."""
+        """Name the pair of geoms that violates its distance most at `q`, and both distances; empty:
+        `q` is free."""
         self.free(q, clearance)
         return self.nearest()
 
@@ -131,27 +155,33 @@ class CollisionChecker:
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {least * 1e3:.1f} mm"
 
     def _shortfalls(self) -> Array:
-        """Return by how much each close pair of the last configuration falls short of its required distance, in m."""
+        """Return by how much each close pair of the last configuration falls short of its required
+        distance, in m."""
         contact = self._data.contact
         pairs = contact.geom
-        return np.asarray(np.minimum(self._required[pairs[:, 0], pairs[:, 1]], self._least) - contact.dist)
+        return np.asarray(
+            np.minimum(self._required[pairs[:, 0], pairs[:, 1]], self._least) - contact.dist
+        )
 
     def _filter_to_arm(self) -> NDArray[np.int32]:
-        """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work. Return the contact types."""
+        """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work. Return the
+        contact types."""
         m = self._model
         solid = (m.geom_contype | m.geom_conaffinity) != 0
         arm = np.zeros(m.ngeom, dtype=bool)
         arm[self.cell.arm_geoms] = True
         m.geom_contype[:] = arm & solid
         m.geom_conaffinity[:] = solid
-        # MuJoCo adds the margins of the two geoms: the arm's are zero, so that self-collision has none.
+        # MuJoCo adds the margins of the two geoms: the arm's are zero, so that self-collision has
+        # none.
         m.geom_margin[:] = np.where(arm, 0.0, self.clearance)
         m.geom_gap[:] = 0.0
         m.pair_margin[:] = self.clearance
         return np.array(m.geom_contype)
 
     def _required_distances(self) -> Array:
-        """Return (geoms, geoms), in m: the clearance between arm and cell, 0 between links that may collide."""
+        """Return (geoms, geoms), in m: the clearance between arm and cell, 0 between links that may
+        collide."""
         m = self.cell.model
         arm = self.cell.arm_geoms
         typ = m.geom_contype
@@ -162,13 +192,16 @@ class CollisionChecker:
         required[:, arm] = self.clearance
         own = np.union1d(arm, self._carriers())
         for some, others in ((arm, own), (own, arm)):
-            required[np.ix_(some, others)] = np.where(collide[np.ix_(some, others)], 0.0, ANY_DISTANCE)
+            required[np.ix_(some, others)] = np.where(
+                collide[np.ix_(some, others)], 0.0, ANY_DISTANCE
+            )
         # Links of a gripper meet at their pins, and its motion is not planned.
         required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = ANY_DISTANCE
         return required
 
     def _carriers(self) -> NDArray[np.int_]:
-        """Return the geoms of the fixed bodies that carry the arm: some links are always near them."""
+        """Return the geoms of the fixed bodies that carry the arm: some links are always near
+        them."""
         m = self.cell.model
         body = m.body_parentid[m.dof_bodyid[self.cell.dof[0]]]
         chain = []
@@ -219,16 +252,23 @@ def is_free(
     held: int,  # address of the held object in qpos; -1: none
     clearance: float,  # m: greatest distance that is required
 ) -> bool:
-    """Bring arm and load to a configuration; return whether all pairs of geoms keep their distances."""
+    """Bring arm and load to a configuration; return whether all pairs of geoms keep their
+    distances."""
     for j in range(len(joints)):
         qpos[joints[j]] = q[j]
     mj_kinematics(model, data)
     if held >= 0:
         for i in range(3):
-            along = turned[3 * i] * offset[0] + turned[3 * i + 1] * offset[1] + turned[3 * i + 2] * offset[2]
+            along = (
+                turned[3 * i] * offset[0]
+                + turned[3 * i + 1] * offset[1]
+                + turned[3 * i + 2] * offset[2]
+            )
             qpos[held + i] = tool[i] + along
         mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
-        mju_mul_quat(qpos[held + 3 : held + 7].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data)
+        mju_mul_quat(
+            qpos[held + 3 : held + 7].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data
+        )
         mj_kinematics(model, data)
     mj_collision(model, data)
     for pair in range(number[0]):
@@ -243,5 +283,14 @@ def preload() -> None:
     none = np.zeros(0)
     square = np.zeros((0, 0))
     room = contact_views(data.model, data)
-    arrays = none, np.zeros(0, dtype=int), none, np.zeros(3), np.zeros(9), np.zeros(7), np.zeros(4), square
+    arrays = (
+        none,
+        np.zeros(0, dtype=int),
+        none,
+        np.zeros(3),
+        np.zeros(9),
+        np.zeros(7),
+        np.zeros(4),
+        square,
+    )
     is_free.load()(data.model._address, data._address, *arrays, *room, -1, 0.0)

@@ -1,7 +1,9 @@
-"""Inverse kinematics: configurations that put the tool at a pose, by damped least squares with restarts.
+"""Inverse kinematics: configurations that put the tool at a pose, by damped least squares with
+restarts.
 
-A step is a quadratic program bounded by the joints' limits; MuJoCo solves it. Alternative considered: mink, which does
-the same on numpy and a solver of choice, but the bits of its matrix products depend on the processor.
+A step is a quadratic program bounded by the joints' limits; MuJoCo solves it. Alternative
+considered: mink, which does the same on numpy and a solver of choice, but the bits of its matrix
+products depend on the processor.
 """
 
 from __future__ import annotations
@@ -30,11 +32,13 @@ ANGLE_TOLERANCE_RAD = 1e-5
 SAME_RAD = 1e-2
 """Solutions closer than this in every joint count as one."""
 LIMIT_MARGIN_RAD = 1e-2
-"""Solutions stay this far inside the position limits: the limit gate of the servo level brakes there."""
+"""Solutions stay this far inside the position limits: the limit gate of the servo level brakes
+there."""
 MAX_BRANCH_STEP_RAD = 0.5
 """A warm start that ends farther away than this in a joint has left its branch."""
 DAMPING = 1e-6
-"""Damping of a step, in squared tool error per rad, and as much again for an error of 1 m or 1 rad."""
+"""Damping of a step, in squared tool error per rad, and as much again for an error of 1 m or 1
+rad."""
 LIMIT_PART = 0.95
 """Part of the way to a position limit that one step may take."""
 
@@ -62,15 +66,22 @@ class InverseKinematics:
         return pose(*site_pose(self._data, self._cell.tool))
 
     def reach(self, target: Pose, start: Array) -> Array | None:
-        """Return the configuration (joints,) at `target` found by one descent from `start`, or None."""
+        """Return the configuration (joints,) at `target` found by one descent from `start`, or
+        None."""
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
             error = self._error(target, q)
-            if max(abs(error[:3])) < POSITION_TOLERANCE_M and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD:
+            if (
+                max(abs(error[:3])) < POSITION_TOLERANCE_M
+                and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD
+            ):
                 return q
             errors.append(norm(error))
-            if len(errors) > STALLED_ITERATIONS and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]:
+            if (
+                len(errors) > STALLED_ITERATIONS
+                and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]
+            ):
                 return None
             step = self._step(error, q)
             if step is None:
@@ -79,12 +90,20 @@ class InverseKinematics:
         return None
 
     def nearby(self, target: Pose, start: Array) -> Array | None:
-        """Return the configuration at `target` on the branch of `start`; None: there is none nearby."""
+        """Return the configuration at `target` on the branch of `start`; None: there is none
+        nearby."""
         found = self.reach(target, start)
-        return found if found is not None and bool(np.all(np.abs(found - start) < MAX_BRANCH_STEP_RAD)) else None
+        return (
+            found
+            if found is not None and bool(np.all(np.abs(found - start) < MAX_BRANCH_STEP_RAD))
+            else None
+        )
 
-    def solutions(self, target: Pose, reference: Array, free: Callable[[Array], bool]) -> list[Array]:
-        """Return distinct free configurations at `target`, the quickest to reach from `reference` first.
+    def solutions(
+        self, target: Pose, reference: Array, free: Callable[[Array], bool]
+    ) -> list[Array]:
+        """Return distinct free configurations at `target`, the quickest to reach from `reference`
+        first.
 
         Empty when `target` is out of reach or everything there collides.
         """
@@ -106,7 +125,8 @@ class InverseKinematics:
         return sorted(found, key=lambda q: self.time_between(reference, q))
 
     def time_between(self, one: Array, other: Array) -> float:
-        """Return the time, in s, of the slowest joint from `one` to `other` at its velocity limit."""
+        """Return the time, in s, of the slowest joint from `one` to `other` at its velocity
+        limit."""
         return float(np.max(np.abs(one - other) * self._pace))
 
     def _starts(self, reference: Array, rng: np.random.Generator) -> Iterable[Array]:
@@ -115,7 +135,8 @@ class InverseKinematics:
             yield rng.uniform(self._low, self._high)
 
     def _error(self, target: Pose, q: Array) -> Array:
-        """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world frame."""
+        """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world
+        frame."""
         tool = self.tool_at(q)
         turn = np.zeros(3)
         error = np.zeros(6)
@@ -125,7 +146,8 @@ class InverseKinematics:
         return error
 
     def _step(self, error: Array, q: Array) -> Array | None:
-        """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there is none."""
+        """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there
+        is none."""
         m = self._cell.model
         d = self._data
         mujoco.mj_comPos(m, d)

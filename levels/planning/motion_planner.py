@@ -1,4 +1,5 @@
-"""The path of one elemental move: inverse kinematics, then a straight tool line or a search in joint space."""
+"""The path of one elemental move: inverse kinematics, then a straight tool line or a search in
+joint space."""
 
 from __future__ import annotations
 
@@ -23,11 +24,13 @@ CLOSE_PART = 0.9
 LOAD_STEP_RAD = 0.25
 """Spacing of the configurations at which the motors must carry the load."""
 AHEAD_PART = 0.5
-"""Part of the clearance that an earlier path must keep: sensed and predicted poses differ slightly."""
+"""Part of the clearance that an earlier path must keep: sensed and predicted poses differ
+slightly."""
 MAX_STRAY_M = 1e-3
 """Largest distance of the tool from a straight line that it follows."""
 LINES = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-"""Numbers of joint-space lines that are tried: the fewest that keep to the tool's line give the quickest path."""
+"""Numbers of joint-space lines that are tried: the fewest that keep to the tool's line give the
+quickest path."""
 STRAY_SAMPLES = 5
 """Points of every joint-space line at which the tool's distance from its line is measured."""
 
@@ -40,7 +43,8 @@ def preload() -> None:
 
 
 class MotionPlanner:
-    """Plans elemental moves for one arm. Pure: equal arguments give equal paths, in every process."""
+    """Plans elemental moves for one arm. Pure: equal arguments give equal paths, in every
+    process."""
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
         self.cell = cell
@@ -62,9 +66,10 @@ class MotionPlanner:
     ) -> Path:
         """Return the path of `move` from `start` (joints,), rad.
 
-        `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so that paths planned
-        from there remain valid. `searches` as in `PathPlanner.plan`. Raises `Refused`: UNREACHABLE when no
-        configuration serves, NO_PATH when all are blocked, OVERLOAD when the motors cannot carry the load along it.
+        `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so
+        that paths planned from there remain valid. `searches` as in `PathPlanner.plan`. Raises
+        `Refused`: UNREACHABLE when no configuration serves, NO_PATH when all are blocked, OVERLOAD
+        when the motors cannot carry the load along it.
         """
         self.lay_out(move, situation)
         if move.touches:
@@ -82,7 +87,8 @@ class MotionPlanner:
         situation.lay_out(self.checker, move.object if move.touches else None)
 
     def goal(self, move: Move, start: Array) -> Array:
-        """Return the configuration at the end of a free motion, with the checker as it is set. Raises `Refused`."""
+        """Return the configuration at the end of a free motion, with the checker as it is set.
+        Raises `Refused`."""
         if move.verb is Verb.MOVE_JOINTS:
             self._check_limits(move)
             return move.joints
@@ -107,18 +113,28 @@ class MotionPlanner:
         clearance = AHEAD_PART * self.clearance
         return self.paths.is_free(path, lambda q: self.checker.free(q, clearance))
 
-    def _path_to(self, move: Move, start: Array, goal: Array, *, attempt: int, searches: int) -> Path:
+    def _path_to(
+        self, move: Move, start: Array, goal: Array, *, attempt: int, searches: int
+    ) -> Path:
         clearance = self._clearance_at(start)
         path = self.paths.plan(
-            start, goal, lambda q: self.checker.free(q, clearance), attempt=attempt, searches=searches
+            start,
+            goal,
+            lambda q: self.checker.free(q, clearance),
+            attempt=attempt,
+            searches=searches,
         )
         if path is None:
             why = self._why_no_path(start, goal, clearance)
-            raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {in_metres(self.ik.tool_at(goal))}: {why}")
+            raise Refused(
+                Error.NO_PATH,
+                f"{VERB_NAMES[move.verb]} to {in_metres(self.ik.tool_at(goal))}: {why}",
+            )
         return path
 
     def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
-        """Return why a free motion has no path: start or goal is blocked, or the obstacle on the straight line."""
+        """Return why a free motion has no path: start or goal is blocked, or the obstacle on the
+        straight line."""
         why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
         if why:
             return why
@@ -138,11 +154,14 @@ class MotionPlanner:
         clearance = self._clearance_at(start)
         blocked = self.paths.first_blocked(path, lambda q: self.checker.free(q, clearance))
         if blocked is not None:
-            raise Refused(Error.NO_PATH, f"{name} to {place}: {self.checker.why(blocked, clearance)}")
+            raise Refused(
+                Error.NO_PATH, f"{name} to {place}: {self.checker.why(blocked, clearance)}"
+            )
         return path
 
     def _clearance_at(self, start: Array) -> float:
-        """Return the scene's clearance, or less where an obstacle has come closer to the resting arm."""
+        """Return the scene's clearance, or less where an obstacle has come closer to the resting
+        arm."""
         room = self.checker.room(start)
         return self.clearance if room >= self.clearance else max(CLOSE_PART * room, 0.0)
 
@@ -153,15 +172,18 @@ class MotionPlanner:
             j = int(beyond[0])
             name = self.cell.model.joint(self.cell.model.dof_jntid[self.cell.dof[j]]).name
             raise Refused(
-                Error.UNREACHABLE, f"joint '{name}' to {move.joints[j]:.4g} rad; valid: {low[j]:.4g} to {high[j]:.4g}"
+                Error.UNREACHABLE,
+                f"joint '{name}' to {move.joints[j]:.4g} rad; valid: {low[j]:.4g} to {high[j]:.4g}",
             )
 
 
 def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:
-    """Return a path along which the tool moves straight from its pose at `start` (joints,) to `target`.
+    """Return a path along which the tool moves straight from its pose at `start` (joints,) to
+    `target`.
 
-    The tool turns at a constant rate and strays at most `MAX_STRAY_M`. None when the line leaves the reach of the arm,
-    or continues only on another branch of the inverse kinematics. Collisions are not checked.
+    The tool turns at a constant rate and strays at most `MAX_STRAY_M`. None when the line leaves
+    the reach of the arm, or continues only on another branch of the inverse kinematics. Collisions
+    are not checked.
     """
     begin = ik.tool_at(start)
     for lines in LINES:
@@ -173,8 +195,11 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
     return None
 
 
-def _points_on(ik: InverseKinematics, points: list[Array], way: tuple[Pose, Pose], lines: int) -> Array | None:
-    """Return `points` continued along `way` on one branch, (lines + 1, joints), rad; None: it leaves the branch."""
+def _points_on(
+    ik: InverseKinematics, points: list[Array], way: tuple[Pose, Pose], lines: int
+) -> Array | None:
+    """Return `points` continued along `way` on one branch, (lines + 1, joints), rad; None: it
+    leaves the branch."""
     begin, target = way
     for k in range(1, lines + 1):
         q = ik.nearby(begin.towards(target, k / lines), points[-1])

@@ -95,7 +95,8 @@ class Situation:
         return self
 
     def holding(self, row: int | None, grip: Pose | None) -> Situation:
-        """Return this situation with object `row` in the gripper at `grip` in the tool's frame; None: nothing held."""
+        """Return this situation with object `row` in the gripper at `grip` in the tool's frame;
+        None: nothing held."""
         return replace(self, held=row, grip=grip)
 
     def with_body(self, row: int, at: Pose) -> Situation:

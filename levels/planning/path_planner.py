@@ -1,7 +1,9 @@
-"""Collision-free paths between two configurations: straight where that is free, else sampled, with rounded corners.
+"""Collision-free paths between two configurations: straight where that is free, else sampled, with
+rounded corners.
 
-The search is OMPL's RRTConnect, then short cuts. It ends by the number of configurations checked, never by time, and
-every call seeds the random numbers anew: equal arguments give equal paths, in every process.
+The search is OMPL's RRTConnect, then short cuts. It ends by the number of configurations checked,
+never by time, and every call seeds the random numbers anew: equal arguments give equal paths, in
+every process.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ MIN_LEVER_M = 0.05
 LEVER_SAMPLES = 64
 """Random configurations over which the longest lever is taken."""
 BLENDS = (1.0, 0.6, 0.35, 0.2, 0.1)
-"""Parts of the largest blend that are tried at a corner; when all collide, the motion stops there."""
+"""Parts of the largest blend that are tried at a corner; when all collide, the motion stops
+there."""
 END_PART = 0.9
 """Part of the first and the last line that a blend may take."""
 BRANCH_PART = 0.2
@@ -43,7 +46,8 @@ BRANCH_PART = 0.2
 ENDLESS_RAD = 2.0 * np.pi
 """Range beyond start and goal of a joint without limits."""
 BOUND_ROUNDING = 1e-9
-"""Margin of the space's bounds, in scaled length, so that start and goal are inside in spite of rounding."""
+"""Margin of the space's bounds, in scaled length, so that start and goal are inside in spite of
+rounding."""
 
 util.setLogLevel(util.LOG_NONE)
 
@@ -55,19 +59,26 @@ class PathPlanner:
         self._limits = cell.limits
         self._seed = seed
         levers = np.maximum(lever_arms(cell, seed), MIN_LEVER_M)
-        # sum |lever_j dq_j| <= |lever| |dq|: a step of this length moves no point farther than intended.
+        # sum |lever_j dq_j| <= |lever| |dq|: a step of this length moves no point farther than
+        # intended.
         self.step_rad = STEP_PART * clearance / norm(levers)
         low, high = cell.limits.position.T
         resolution = STEP_PART * clearance / float(np.sqrt(len(levers)))
         self._search = SampledSearch(low, high, levers, resolution)
 
     def plan(
-        self, start: Array, goal: Array, free: Free, *, attempt: int = 0, searches: int = MAX_SEARCHES
+        self,
+        start: Array,
+        goal: Array,
+        free: Free,
+        *,
+        attempt: int = 0,
+        searches: int = MAX_SEARCHES,
     ) -> Path | None:
         """Return the quickest path found from `start` to `goal` (joints,), rad, or None.
 
-        Another `attempt` uses other random numbers, for another try in the same world. With fewer `searches` the path
-        is found sooner and is never quicker than with more.
+        Another `attempt` uses other random numbers, for another try in the same world. With fewer
+        `searches` the path is found sooner and is never quicker than with more.
         """
         if not (free(start) and free(goal)):
             return None
@@ -131,7 +142,8 @@ class Query(NamedTuple):
 
 
 class SampledSearch:
-    """Searches joint space scaled by `weights` (joints,) for polylines checked every `resolution` of scaled length."""
+    """Searches joint space scaled by `weights` (joints,) for polylines checked every `resolution`
+    of scaled length."""
 
     def __init__(self, low: Array, high: Array, weights: Array, resolution: float) -> None:
         self._low = low
@@ -140,7 +152,8 @@ class SampledSearch:
         self._resolution = resolution
 
     def search(self, query: Query, seed: int, budget: int) -> tuple[Array | None, int]:
-        """Return a free polyline (k, joints), rad, or None, and the number of configurations checked.
+        """Return a free polyline (k, joints), rad, or None, and the number of configurations
+        checked.
 
         `budget` bounds the checks of the search; the short cuts add a few.
         """
@@ -158,7 +171,9 @@ class SampledSearch:
 
         information = self._space(start, goal, valid)
         problem = base.ProblemDefinition(information)
-        problem.setStartAndGoalStates(self._state(information, start), self._state(information, goal))
+        problem.setStartAndGoalStates(
+            self._state(information, start), self._state(information, goal)
+        )
         planner = geometric.RRTConnect(information)
         planner.setRange(BRANCH_PART * information.getMaximumExtent())
         planner.setProblemDefinition(problem)
@@ -173,7 +188,9 @@ class SampledSearch:
         polyline[0], polyline[-1] = start, goal
         return polyline, count
 
-    def _space(self, start: Array, goal: Array, valid: Callable[[base.State], bool]) -> base.SpaceInformation:
+    def _space(
+        self, start: Array, goal: Array, valid: Callable[[base.State], bool]
+    ) -> base.SpaceInformation:
         joints = len(start)
         low = np.where(np.isfinite(self._low), self._low, np.minimum(start, goal) - ENDLESS_RAD)
         high = np.where(np.isfinite(self._high), self._high, np.maximum(start, goal) + ENDLESS_RAD)
@@ -181,8 +198,12 @@ class SampledSearch:
         bounds = base.RealVectorBounds(joints)
         for j in range(joints):
             # The arm may rest slightly beyond a limit: the start counts as inside.
-            bounds.setLow(j, float(min(low[j], start[j], goal[j]) * self._weights[j]) - BOUND_ROUNDING)
-            bounds.setHigh(j, float(max(high[j], start[j], goal[j]) * self._weights[j]) + BOUND_ROUNDING)
+            bounds.setLow(
+                j, float(min(low[j], start[j], goal[j]) * self._weights[j]) - BOUND_ROUNDING
+            )
+            bounds.setHigh(
+                j, float(max(high[j], start[j], goal[j]) * self._weights[j]) + BOUND_ROUNDING
+            )
         space.setBounds(bounds)
         information = base.SpaceInformation(space)
         information.setStateValidityChecker(valid)
@@ -197,7 +218,9 @@ class SampledSearch:
         return state
 
 
-def _simplified(information: base.SpaceInformation, path: geometric.PathGeometric) -> geometric.PathGeometric:
+def _simplified(
+    information: base.SpaceInformation, path: geometric.PathGeometric
+) -> geometric.PathGeometric:
     simplifier = geometric.PathSimplifier(information)
     simplifier.reduceVertices(path)
     simplifier.partialShortcutPath(path)
@@ -207,7 +230,8 @@ def _simplified(information: base.SpaceInformation, path: geometric.PathGeometri
 
 
 def _largest_blends(waypoints: Array) -> Array:
-    """Return blends (k,) that do not overlap: up to half of an inner line, most of the first and the last."""
+    """Return blends (k,) that do not overlap: up to half of an inner line, most of the first and
+    the last."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     room = 0.5 * lengths
     room[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
@@ -217,7 +241,8 @@ def _largest_blends(waypoints: Array) -> Array:
 
 
 def lever_arms(cell: Cell, seed: int) -> Array:
-    """Return (joints,): the farthest that 1 rad (or 1 m) of each joint moves any geom that it carries, in m.
+    """Return (joints,): the farthest that 1 rad (or 1 m) of each joint moves any geom that it
+    carries, in m.
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
     """

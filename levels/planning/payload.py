@@ -1,8 +1,10 @@
-"""Whether the arm can carry an object: its weight against the friction of the grip and the torques of the motors.
+"""Whether the arm can carry an object: its weight against the friction of the grip and the torques
+of the motors.
 
-The grip is known if a straight line through the tool's origin, along its y axis, hits the object and a finger on
-either side, as in every grasp that the task level plans. Virtual work over the linkage, of any kind, gives the force
-there from the actuator's. If the line misses, the grip is unknown and only the motors are checked.
+The grip is known if a straight line through the tool's origin, along its y axis, hits the object
+and a finger on either side, as in every grasp that the task level plans. Virtual work over the
+linkage, of any kind, gives the force there from the actuator's. If the line misses, the grip is
+unknown and only the motors are checked.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 
 MIN_GRIP_FACTOR = 1.5
-"""Grip required per weight of an object, to hold it while the arm accelerates: the PUMA loses one at 1.22."""
+"""Grip required per weight of an object, to hold it while the arm accelerates: the PUMA loses one
+at 1.22."""
 MAX_MOTOR_PART = 0.9
 """Part of a motor's torque that weights may take: the rest moves the arm."""
 RAY_RANGE_M = 1.0
@@ -48,11 +51,14 @@ class Payloads:
         self._data = cell.start()
         self._rest = np.zeros(len(cell.home))
         model = cell.model
-        self._objects = [np.flatnonzero(model.body_rootid[model.geom_bodyid] == body) for body in cell.bodies]
+        self._objects = [
+            np.flatnonzero(model.body_rootid[model.geom_bodyid] == body) for body in cell.bodies
+        ]
         self._jaws = self._closing()
 
     def check_grip(self, row: int, grip: Pose) -> None:
-        """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the tool's frame."""
+        """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the
+        tool's frame."""
         needed = MIN_GRIP_FACTOR * self._mass(row) * self._gravity
         holds = self._holding_force(row, grip)
         if holds is not None and holds < needed:
@@ -60,7 +66,8 @@ class Payloads:
             raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
-        """Raise `Refused` with both torques if a motor cannot carry object `row` at one of (k, joints), rad."""
+        """Raise `Refused` with both torques if a motor cannot carry object `row` at one of (k,
+        joints), rad."""
         model = self._cell.model
         centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
         payload = Payload(self._mass(row), centre.position)
@@ -70,7 +77,9 @@ class Payloads:
             worst = int(np.argmax(load - limit))
             if load[worst] > limit[worst]:
                 joint = model.joint(int(model.dof_jntid[self._cell.dof[worst]])).name
-                why = f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
+                why = (
+                    f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
+                )
                 raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
 
     @property
@@ -86,7 +95,9 @@ class Payloads:
     def _holding_force(self, row: int, grip: Pose) -> float | None:
         """Return the friction, N, that can carry object `row`; None: unknown."""
         surfaces = self._surfaces(row, grip)
-        wide, narrow = self._around(surfaces[0] + surfaces[1]) if surfaces is not None else (None, None)
+        wide, narrow = (
+            self._around(surfaces[0] + surfaces[1]) if surfaces is not None else (None, None)
+        )
         if surfaces is None or wide is None or narrow is None or wide.gap <= narrow.gap:
             return None
         model = self._cell.model
@@ -97,17 +108,21 @@ class Payloads:
         force = min(most, cell.gripper_stiffness * abs(narrow.opening - cell.gripper_closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
         parts = self._objects[row]
-        return normal * sum(max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms)
+        return normal * sum(
+            max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms
+        )
 
     def _around(self, width: float) -> tuple[Jaws | None, Jaws | None]:
-        """Return the last jaws wider than `width`, m, and the first that are not; None: there are no such jaws."""
+        """Return the last jaws wider than `width`, m, and the first that are not; None: there are
+        no such jaws."""
         for wide, narrow in zip(self._jaws, self._jaws[1:], strict=False):
             if wide.gap > width >= narrow.gap:
                 return wide, narrow
         return None, None
 
     def _surfaces(self, row: int, grip: Pose) -> tuple[float, float] | None:
-        """Return how far the object reaches from the tool to either side, m; None: the line misses it."""
+        """Return how far the object reaches from the tool to either side, m; None: the line misses
+        it."""
         cell = self._cell
         data = self._data
         address = cell.object_qpos[row]
@@ -129,7 +144,8 @@ class Payloads:
         openings = cell.linkage.openings
         hand = cell.model.jnt_bodyid[cell.model.jnt_qposadr == cell.gripper_qpos]
         fingers = np.setdiff1d(
-            cell.gripper_geoms, np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand])
+            cell.gripper_geoms,
+            np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
         jaws: list[Jaws] = []
         for opening in openings if openings[0] == cell.gripper_open else openings[::-1]:
@@ -137,7 +153,8 @@ class Payloads:
             mujoco.mj_fwdPosition(cell.model, data)
             sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]
-            # When closed, the tool's origin is inside a finger, and the line leaves it on the far side.
+            # When closed, the tool's origin is inside a finger, and the line leaves it on the far
+            # side.
             if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
                 break
             length = float(data.actuator_length[cell.gripper_actuator])
@@ -145,7 +162,8 @@ class Payloads:
         return jaws
 
     def _nearest(self, geoms: NDArray[np.int_], start: float, way: float) -> tuple[float, int]:
-        """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf: none."""
+        """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf:
+        none."""
         model = self._cell.model
         data = self._data
         tool = self._cell.tool
@@ -167,7 +185,8 @@ class Payloads:
 
 
 def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
-    """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0: frictionless."""
+    """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0:
+    frictionless."""
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
     else:

@@ -1,4 +1,5 @@
-"""The executor of the primitive level: a joint set point every cycle, from paths that its planner has timed."""
+"""The executor of the primitive level: a joint set point every cycle, from paths that its planner
+has timed."""
 
 from __future__ import annotations
 
@@ -21,8 +22,21 @@ from rack.levels.planning import collision
 from rack.levels.primitive.guard import Guard, Sight
 from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.primitive.planner import Plans
-from rack.levels.primitive.segment import Memory, MotionSegment, SegmentFault, read_segment, recall, window
-from rack.levels.primitive.tracking import LEAD_CYCLES, MAX_UNEXPLAINED_CYCLES, SEEN_CYCLES, Straying, Tracking
+from rack.levels.primitive.segment import (
+    Memory,
+    MotionSegment,
+    SegmentFault,
+    read_segment,
+    recall,
+    window,
+)
+from rack.levels.primitive.tracking import (
+    LEAD_CYCLES,
+    MAX_UNEXPLAINED_CYCLES,
+    SEEN_CYCLES,
+    Straying,
+    Tracking,
+)
 from rack.levels.primitive.work import GripperWork, PathWork, PrimitiveParams, WorkCycle, WorkRules
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import read_params
@@ -30,15 +44,17 @@ from rack.levels.tables import read_params
 Work = PathWork | GripperWork
 
 DELAY_CYCLES = SEEN_CYCLES + LEAD_CYCLES - 1
-"""Cycles from the sensing of the world model to the set point commanded last: bodies keep moving in that time."""
+"""Cycles from the sensing of the world model to the set point commanded last: bodies keep moving in
+that time."""
 
 
 class PrimitiveExecutor(Executor):
-    """Executes the segments of the window, oldest first, each from rest to rest, while the next one is planned.
+    """Executes the segments of the window, oldest first, each from rest to rest, while the next one
+    is planned.
 
-    The set point written at tick T is due `LEAD_CYCLES` later. After a restart the level restores its state from its
-    own last messages. It rests on its path while the board above is lost, and on `hold` from above or from an operator;
-    while the servo does not follow, it waits.
+    The set point written at tick T is due `LEAD_CYCLES` later. After a restart the level restores
+    its state from its own last messages. It rests on its path while the board above is lost, and on
+    `hold` from above or from an operator; while the servo does not follow, it waits.
     """
 
     inputs = {
@@ -61,20 +77,28 @@ class PrimitiveExecutor(Executor):
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
         self._gripper = context.robot.gripper
-        self._sight = Sight(self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies))
+        self._sight = Sight(
+            self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies)
+        )
         self._tracking = Tracking()
-        self._straying = Straying(context.robot.joints, params.following, self._rules.cycles(params.straying))
+        self._straying = Straying(
+            context.robot.joints, params.following, self._rules.cycles(params.straying)
+        )
         self._silent_cycles = self._rules.cycles(params.silent)
         self._plans = Plans()
         self._orders = Orders(self.commands)
-        self._memory: Memory | None = None  # None until this level, restarts included, was first in step with the servo
+        self._memory: Memory | None = (
+            None  # None until this level, restarts included, was first in step with the servo
+        )
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
         self._begun = 0  # serial of the last segment begun
         self._position = cell.home.copy()  # (joints,), rad: the last one commanded
         self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
         self._tick: int | None = None  # of the last cycle
-        self._displaced = False  # the servo was out of step since the last path: the arm may not be at its end
+        self._displaced = (
+            False  # the servo was out of step since the last path: the arm may not be at its end
+        )
 
     @classmethod
     def preload(cls) -> None:
@@ -82,7 +106,8 @@ class PrimitiveExecutor(Executor):
         collision.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Read command, status, plan and world model; write the next set point and this level's status."""
+        """Read command, status, plan and world model; write the next set point and this level's
+        status."""
         if self._tick is None:
             self._tick, self._memory = tick - self.context.every, recall(read)
         passed_s = (tick - self._tick) * self.context.tick_s
@@ -127,7 +152,11 @@ class PrimitiveExecutor(Executor):
 
     def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish, drop, begin or advance it."""
-        hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.standing is Operation.HOLD
+        hold = (
+            bool(read.command.value.hold)
+            or read.command.is_lost
+            or self._orders.standing is Operation.HOLD
+        )
         if read.status.is_new:
             self._finish(read.status.value, tick)
             self._straying.update(read.status.value)
@@ -140,7 +169,13 @@ class PrimitiveExecutor(Executor):
         if self._fault is None:
             self._fault = work.fault or self._plans.refusal(work.segment.id) or self._straying.fault
         if isinstance(work, PathWork):
-            hold = hold or withdrawn or self._fault is not None or self._straying.strays or bool(self._sight.lacks)
+            hold = (
+                hold
+                or withdrawn
+                or self._fault is not None
+                or self._straying.strays
+                or bool(self._sight.lacks)
+            )
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
             work.step(WorkCycle(hold, plan, read.world.value, due_s, passed_s))
@@ -158,7 +193,8 @@ class PrimitiveExecutor(Executor):
         self._work = None
 
     def _withdraw(self, serials: list[int]) -> bool:
-        """Drop work and fault that have left the window; return whether the work must first ramp to rest."""
+        """Drop work and fault that have left the window; return whether the work must first ramp to
+        rest."""
         serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
             return False
@@ -211,7 +247,8 @@ class PrimitiveExecutor(Executor):
         return work
 
     def _wanted(self, read: Ports, serials: list[int]) -> tuple[int, float]:
-        """Return the segment for which a trajectory is wanted, and the path parameter of its start; 0: none."""
+        """Return the segment for which a trajectory is wanted, and the path parameter of its start;
+        0: none."""
         work = self._work
         done = self._memory.done if self._memory is not None else 0
         kinds = read.command.value.segments["kind"].tolist()
@@ -258,16 +295,25 @@ class PrimitiveExecutor(Executor):
         if read.status.is_there:
             status.opening = read.status.value.opening
         status.position[:] = self._position
-        status.progress = path_work.progress if path_work is not None else memory.progress * bool(interrupted)
-        status.operated = self._orders.standing is not Operation.NONE or read.status.value.standing > 0
+        status.progress = (
+            path_work.progress if path_work is not None else memory.progress * bool(interrupted)
+        )
+        status.operated = (
+            self._orders.standing is not Operation.NONE or read.status.value.standing > 0
+        )
         # Out of step, the world is not the reason why motion holds.
         status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
         status.resting = path_work is None or path_work.motion.resting
-        status.ends = path_work.ends_s(self._due(tick) * self.context.tick_s) if path_work is not None else 0.0
+        status.ends = (
+            path_work.ends_s(self._due(tick) * self.context.tick_s)
+            if path_work is not None
+            else 0.0
+        )
         status.wants, status.begin = self._wanted(read, serials)
 
     def _reason_to_wait(self, read: Ports) -> str:
-        """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
+        """Return the reason why the level waits, and the condition that ends the wait; empty: it
+        does not."""
         work = self._work
         command = read.command
         if not self._tracking.in_step:
@@ -285,7 +331,11 @@ class PrimitiveExecutor(Executor):
         if command.value.hold:
             return HELD_FROM_ABOVE
         unplanned = work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES
-        return f"segment {work.segment.id} waits for its trajectory from the planner" if work and unplanned else ""
+        return (
+            f"segment {work.segment.id} waits for its trajectory from the planner"
+            if work and unplanned
+            else ""
+        )
 
     def _answer(self, write: Ports, above: int) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""

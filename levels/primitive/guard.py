@@ -1,4 +1,5 @@
-"""The guard checks the remaining path in every cycle; sight checks that the world model is recent enough for motion."""
+"""The guard checks the remaining path in every cycle; sight checks that the world model is recent
+enough for motion."""
 
 from __future__ import annotations
 
@@ -32,13 +33,15 @@ MAX_REST_M_S = 0.01
 class Guard:
     """Watches one path at a time against the world model.
 
-    In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated by its velocity to
-    the time at which the arm arrives, and a few configurations of the whole remaining path against all bodies as they
-    are. The latter count only while no obstacle moves: a moving one may be gone by then. At most 13 checks per cycle.
+    In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated
+    by its velocity to the time at which the arm arrives, and a few configurations of the whole
+    remaining path against all bodies as they are. The latter count only while no obstacle moves: a
+    moving one may be gone by then. At most 13 checks per cycle.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
-        """Look `lookahead_s` ahead; `delay_s` is the time from sensing the world to the set point commanded last."""
+        """Look `lookahead_s` ahead; `delay_s` is the time from sensing the world to the set point
+        commanded last."""
         self._checker = CollisionChecker(cell, scene)
         self._clearance = CLEARANCE_PART * scene.clearance
         self._rows = len(scene.bodies)
@@ -54,7 +57,8 @@ class Guard:
         self.obstacle = ""  # the last pair of geoms found too close, with distance and bound
 
     def carry(self, row: int, q: Array, world: Message) -> None:
-        """Carry object `row` with the tool, from its pose in `world` while the arm is at `q` (joints,), rad."""
+        """Carry object `row` with the tool, from its pose in `world` while the arm is at `q`
+        (joints,), rad."""
         seen = Pose(world.position[row], world.quaternion[row])
         self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ seen))
 
@@ -62,7 +66,9 @@ class Guard:
         """Carry no object."""
         self._checker.hold(None)
 
-    def watch(self, segment: MotionSegment, path: BlendedPath, opening: float, world: Message) -> None:
+    def watch(
+        self, segment: MotionSegment, path: BlendedPath, opening: float, world: Message
+    ) -> None:
         """Begin to watch the path of a segment, with the gripper at `opening`, in m."""
         self._checker.open_gripper(opening)
         self._checker.permit(segment.object, segment.touch and segment.object is not None)
@@ -74,8 +80,11 @@ class Guard:
         self._cursor = 0.0
         self.obstacle = ""
 
-    def is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message) -> bool:
-        """Return, by this cycle's share of the checks, whether the path is clear from `time_s` on."""
+    def is_clear(
+        self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message
+    ) -> bool:
+        """Return, by this cycle's share of the checks, whether the path is clear from `time_s`
+        on."""
         begin = trajectory.at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
@@ -84,8 +93,11 @@ class Guard:
         near_clear = self._near_is_clear(path, trajectory, time_s, None if still else world)
         return near_clear and (far_clear or not still)
 
-    def _near_is_clear(self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: Message | None) -> bool:
-        """Check the path within the look-ahead; `moving` is the world model while an obstacle moves."""
+    def _near_is_clear(
+        self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: Message | None
+    ) -> bool:
+        """Check the path within the look-ahead; `moving` is the world model while an obstacle
+        moves."""
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
@@ -123,14 +135,16 @@ class Guard:
 
 
 class Sight:
-    """Holds motion while the world model is stale, and gives the guard the pose of an object in the gripper.
+    """Holds motion while the world model is stale, and gives the guard the pose of an object in the
+    gripper.
 
-    The model may be stale because its board is lost, or because it receives no scene: what counts is the time at which
-    the scene was sensed.
+    The model may be stale because its board is lost, or because it receives no scene: what counts
+    is the time at which the scene was sensed.
     """
 
     def __init__(self, guard: Guard, blind_ticks: int, has_bodies: bool) -> None:
-        """Treat a scene older than `blind_ticks` as unseen; without bodies there is nothing to see."""
+        """Treat a scene older than `blind_ticks` as unseen; without bodies there is nothing to
+        see."""
         self._guard = guard
         self._blind_ticks = blind_ticks
         self._has_bodies = has_bodies
@@ -138,7 +152,8 @@ class Sight:
         self._waiting: tuple[int, int] | None = None
 
     def carry(self, row: int | None, since: int) -> None:
-        """Carry object `row` from its pose in a scene sensed at tick `since` or later; None: carry nothing."""
+        """Carry object `row` from its pose in a scene sensed at tick `since` or later; None: carry
+        nothing."""
         self._waiting = (row, since) if row is not None else None
         if row is None:
             self._guard.carry_nothing()

@@ -1,4 +1,5 @@
-"""Motion of the set point along one path: begun, held, resumed, ended; always at rest or on a trajectory."""
+"""Motion of the set point along one path: begun, held, resumed, ended; always at rest or on a
+trajectory."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ class JointSetPoint(NamedTuple):
 class PathMotion:
     """The motion along one path.
 
-    The arm may begin slightly off the path: the motion removes the offset over its first `bridging_s`.
+    The arm may begin slightly off the path: the motion removes the offset over its first
+    `bridging_s`.
     """
 
     def __init__(self, path: BlendedPath, braking: Limits, bridging_s: float) -> None:
@@ -40,7 +42,9 @@ class PathMotion:
         self._offset = np.zeros(path.joints)
         self._bridged_s = bridging_s
         # Commanded by the last `advance`.
-        self.set_point = JointSetPoint(path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints))
+        self.set_point = JointSetPoint(
+            path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints)
+        )
         self._scratch = np.zeros(path.joints)
 
     @property
@@ -59,20 +63,26 @@ class PathMotion:
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
-        """Rest at the start of the path, at `position` (joints,); return the largest joint distance between them."""
+        """Rest at the start of the path, at `position` (joints,); return the largest joint distance
+        between them."""
         return self._rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
-        """Rest at `position` (joints,), near the closest point of the path; return their largest joint distance.
+        """Rest at `position` (joints,), near the closest point of the path; return their largest
+        joint distance.
 
-        Of points equally close, as on a path that returns to itself, the one nearest to `progress`, 0 to 1, counts.
+        Of points equally close, as on a path that returns to itself, the one nearest to `progress`,
+        0 to 1, counts.
         """
         points = self.path.sample(NEAREST_STEP_RAD)
         away = np.linalg.norm(points - position, axis=1)
         before = np.append(np.inf, away[:-1])
         after = np.append(away[1:], np.inf)
-        near = np.flatnonzero((away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD))
-        # `linspace` ends exactly: rounding must not lead beyond the end, where no trajectory begins.
+        near = np.flatnonzero(
+            (away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD)
+        )
+        # `linspace` ends exactly: rounding must not lead beyond the end, where no trajectory
+        # begins.
         places = np.linspace(0.0, self.path.length, len(points))[near]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._rest(float(places[nearest]), position)
@@ -84,7 +94,8 @@ class PathMotion:
         self.stopping = False
 
     def hold(self) -> None:
-        """Begin to ramp to rest on the path as soon as the braking limits permit; call in every cycle."""
+        """Begin to ramp to rest on the path as soon as the braking limits permit; call in every
+        cycle."""
         if self.trajectory is None or self.stopping:
             return
         stop = make_stop(self.path, self._braking, self.trajectory.at(self.time_s))
@@ -94,7 +105,8 @@ class PathMotion:
             self.stopping = True
 
     def advance(self, duration_s: float) -> JointSetPoint:
-        """Advance by `duration_s`; return the new set point. The next call overwrites its arrays."""
+        """Advance by `duration_s`; return the new set point. The next call overwrites its
+        arrays."""
         position, velocity, acceleration = self.set_point
         if self.trajectory is None:
             velocity.fill(0.0)
@@ -138,7 +150,8 @@ class PathMotion:
         self.set_point.acceleration.fill(0.0)
 
     def _bridge(self, duration_s: float) -> None:
-        """Add the remaining distance to the path: a quintic from one to zero, at rest at both ends."""
+        """Add the remaining distance to the path: a quintic from one to zero, at rest at both
+        ends."""
         self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
         u = self._bridged_s / self._bridging_s
         per_s = 1.0 / self._bridging_s

@@ -1,4 +1,5 @@
-"""The planner of the primitive level: times the next path, in the background, while the executor moves."""
+"""The planner of the primitive level: times the next path, in the background, while the executor
+moves."""
 
 from __future__ import annotations
 
@@ -18,9 +19,13 @@ from rack.levels.tables import read_params
 
 
 class PrimitivePlanner(Planner):
-    """Makes the trajectory that the executor's status requests: of the next segment, or from where a path was held."""
+    """Makes the trajectory that the executor's status requests: of the next segment, or from where
+    a path was held."""
 
-    inputs = {"command": Input(MOVE_COMMAND, "above.command"), "status": Input(PRIMITIVE_STATUS, "own.status")}
+    inputs = {
+        "command": Input(MOVE_COMMAND, "above.command"),
+        "status": Input(PRIMITIVE_STATUS, "own.status"),
+    }
     output = TRAJECTORY
     params = PrimitiveParams
 
@@ -38,7 +43,8 @@ class PrimitivePlanner(Planner):
         status = read.status.value
         if status.wants not in window(read.command.value):
             return False
-        # The status shows a plan one cycle later. If it is still wanted after that, it was lost with the board.
+        # The status shows a plan one cycle later. If it is still wanted after that, it was lost
+        # with the board.
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
@@ -66,13 +72,17 @@ class PrimitivePlanner(Planner):
         write.error, write.reason, write.earliest = fault or (0, "", write.earliest)
 
     def _path(self, segment: MotionSegment) -> BlendedPath:
-        """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a joint's range."""
+        """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a
+        joint's range."""
         path = segment.path()
         low, high = self._positions.T
         outside = np.argwhere((path.waypoints < low) | (path.waypoints > high))
         if len(outside):
             k, j = outside[0]
-            place = f"waypoint {k}, joint '{self.context.robot.joints[j]}' at {path.waypoints[k, j]:.4f} rad"
+            place = (
+                f"waypoint {k}, joint '{self.context.robot.joints[j]}' at"
+                f" {path.waypoints[k, j]:.4f} rad"
+            )
             raise ValueError(f"{place}; valid: {low[j]:.4f} to {high[j]:.4f}")
         return path
 
@@ -85,11 +95,16 @@ class PrimitivePlanner(Planner):
         write.sections[: len(sections)] = sections
         write.earliest = start_s + trajectory.duration + self._rules.latency_s
         fresh = trajectory.begin == 0.0
-        return segment.too_late(write.earliest) if fresh and 0.0 < segment.by < write.earliest else None
+        return (
+            segment.too_late(write.earliest)
+            if fresh and 0.0 < segment.by < write.earliest
+            else None
+        )
 
 
 class Plans:
-    """The executor's copies of plans: the newest trajectory, or refusal, of every segment in the window."""
+    """The executor's copies of plans: the newest trajectory, or refusal, of every segment in the
+    window."""
 
     def __init__(self) -> None:
         self._trajectories: dict[int, Trajectory] = {}
@@ -105,9 +120,13 @@ class Plans:
         if not plan.is_new or serial not in window:
             return
         if message.error:
-            self._refusals[serial] = SegmentFault(Error(message.error), message.reason, message.earliest)
+            self._refusals[serial] = SegmentFault(
+                Error(message.error), message.reason, message.earliest
+            )
         else:
-            self._trajectories[serial] = Trajectory(message.sections[: message.count].copy(), message.duration)
+            self._trajectories[serial] = Trajectory(
+                message.sections[: message.count].copy(), message.duration
+            )
             self._refusals.pop(serial, None)
 
     def trajectory(self, serial: int, begin: float) -> Trajectory | None:
@@ -116,7 +135,8 @@ class Plans:
         return trajectory if trajectory is not None and trajectory.begin == begin else None
 
     def lacks(self, serial: int, begin: float) -> bool:
-        """Return whether there is neither a trajectory from `begin` nor a refusal of the segment."""
+        """Return whether there is neither a trajectory from `begin` nor a refusal of the
+        segment."""
         return self.trajectory(serial, begin) is None and serial not in self._refusals
 
     def refusal(self, serial: int) -> SegmentFault | None:

@@ -44,7 +44,9 @@ class MotionSegment:
     def too_late(self, earliest_s: float) -> SegmentFault:
         """Return the fault of a segment that cannot be done before `earliest_s`."""
         earliest_s = ceil(earliest_s * 1e3) / 1e3  # rounded up: the time printed here can be met
-        reason = f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
+        reason = (
+            f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
+        )
         return SegmentFault(Error.TOO_LATE, reason, earliest_s)
 
 
@@ -82,7 +84,8 @@ def read_segment(command: Message, serial: int) -> MotionSegment:
 
 @dataclass
 class Memory:
-    """The state with which the executor continues after a restart of its board; its own last messages hold it."""
+    """The state with which the executor continues after a restart of its board; its own last
+    messages hold it."""
 
     done: int = 0  # newest segment done
     interrupted: int = 0  # segment that was interrupted; 0: none

@@ -14,7 +14,8 @@ from rack.levels.primitive.segment import SegmentFault
 LEAD_CYCLES = 2
 """Cycles from the release that makes a set point to the tick at which it is due.
 
-One cycle of logical execution time brings it to the servo, which then interpolates to it over a second one."""
+One cycle of logical execution time brings it to the servo, which then interpolates to it over a
+second one."""
 SEEN_CYCLES = 2
 """Cycles by which the world model lags the servo."""
 HANDOVER_CYCLES = 4
@@ -30,8 +31,9 @@ MAX_UNEXPLAINED_CYCLES = 50
 class Tracking:
     """Decides from the servo's status whether it is in step with this level.
 
-    They fall out of step when either restarts, or misses so many cycles that the servo holds by itself. They get back
-    into step when the servo holds the arm at rest and is not stopped; motion continues from there.
+    They fall out of step when either restarts, or misses so many cycles that the servo holds by
+    itself. They get back into step when the servo holds the arm at rest and is not stopped; motion
+    continues from there.
     """
 
     def __init__(self) -> None:
@@ -49,11 +51,16 @@ class Tracking:
         left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
         if self.silent_cycles > MAX_MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False
-        self._unexplained_cycles = 0 if self.in_step or servo.stopped else self._unexplained_cycles + 1
+        self._unexplained_cycles = (
+            0 if self.in_step or servo.stopped else self._unexplained_cycles + 1
+        )
         if self.in_step or not heard or not servo.holding or servo.stopped:
             return False
         # Written so that NaN does not count as rest.
-        if not np.abs(servo.target_velocity).max() <= MAX_REST_RAD_S or not np.isfinite(servo.target).all():
+        if (
+            not np.abs(servo.target_velocity).max() <= MAX_REST_RAD_S
+            or not np.isfinite(servo.target).all()
+        ):
             return False
         self.in_step = True
         self._cycles_in_step = 0
@@ -75,7 +82,8 @@ class Tracking:
 
 
 class Straying:
-    """Counts cycles in which the arm is off its set point: a few are permitted, and motion holds meanwhile."""
+    """Counts cycles in which the arm is off its set point: a few are permitted, and motion holds
+    meanwhile."""
 
     def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
         self._joints = joints
@@ -106,4 +114,6 @@ class Straying:
         joint = int(away.argmax())
         self.place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
         if self._cycles > self._permitted_cycles:
-            self.fault = SegmentFault(Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad")
+            self.fault = SegmentFault(
+                Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad"
+            )

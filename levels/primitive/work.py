@@ -1,7 +1,7 @@
 """Execution of segments.
 
-A path starts when it is planned and clear, holds on command or for the guard, and is done when the arm has settled. A
-gripper segment is done when the gripper rests.
+A path starts when it is planned and clear, holds on command or for the guard, and is done when the
+arm has settled. A gripper segment is done when the gripper rests.
 """
 
 from __future__ import annotations
@@ -26,29 +26,54 @@ from rack.levels.robot.limits import Limits
 from rack.levels.tables import GripperConfig, Positive, Table
 
 ANSWER_CYCLES = 3
-"""Cycles from the end of a trajectory until its segment is reported done, in addition to those of settling.
+"""Cycles from the end of a trajectory until its segment is reported done, in addition to those of
+settling.
 
-In these the last set point becomes due, the servo's status shows it, and this level's status becomes visible."""
+In these the last set point becomes due, the servo's status shows it, and this level's status
+becomes visible."""
 
 
 class PrimitiveParams(Table):
     """Bounds of following, settling and guarding, in `[board.<name>.params]`."""
 
-    following: Positive = Field(0.05, description="largest distance of a joint from its set point under way, rad")
-    straying: Positive = Field(0.1, description="time that a joint may be farther than that before it is an error, s")
-    settled: Positive = Field(0.003, description="largest distance of a settled joint from its goal, rad")
-    settled_opening: Positive = Field(0.002, description="largest speed of a settled gripper, m/s")
-    settled_cycles: int = Field(3, ge=1, le=100, description="consecutive cycles that a settled arm stays so")
-    settling: Positive = Field(3.0, description="longest time that arm or gripper may take to settle, s")
-    astray: Positive = Field(0.02, description="largest distance of a joint from the path when motion begins, rad")
-    bridging: Positive = Field(0.5, description="time in which such a distance is removed, s")
-    silent: Positive = Field(10.0, description="time without status from below, restarts included, that is an error, s")
-    blind: Positive = Field(0.2, description="time without a new scene in the world model after which motion holds, s")
-    braking: float = Field(
-        1.5, ge=1.0, le=3.0, description="multiple of the planned acceleration and jerk limits that a hold may use"
+    following: Positive = Field(
+        0.05, description="largest distance of a joint from its set point under way, rad"
     )
-    lookahead: Positive = Field(2.0, description="time ahead of the arm that the guard watches in every cycle, s")
-    clear: Positive = Field(0.5, description="time that the way must be clear before held motion continues, s")
+    straying: Positive = Field(
+        0.1, description="time that a joint may be farther than that before it is an error, s"
+    )
+    settled: Positive = Field(
+        0.003, description="largest distance of a settled joint from its goal, rad"
+    )
+    settled_opening: Positive = Field(0.002, description="largest speed of a settled gripper, m/s")
+    settled_cycles: int = Field(
+        3, ge=1, le=100, description="consecutive cycles that a settled arm stays so"
+    )
+    settling: Positive = Field(
+        3.0, description="longest time that arm or gripper may take to settle, s"
+    )
+    astray: Positive = Field(
+        0.02, description="largest distance of a joint from the path when motion begins, rad"
+    )
+    bridging: Positive = Field(0.5, description="time in which such a distance is removed, s")
+    silent: Positive = Field(
+        10.0, description="time without status from below, restarts included, that is an error, s"
+    )
+    blind: Positive = Field(
+        0.2, description="time without a new scene in the world model after which motion holds, s"
+    )
+    braking: float = Field(
+        1.5,
+        ge=1.0,
+        le=3.0,
+        description="multiple of the planned acceleration and jerk limits that a hold may use",
+    )
+    lookahead: Positive = Field(
+        2.0, description="time ahead of the arm that the guard watches in every cycle, s"
+    )
+    clear: Positive = Field(
+        0.5, description="time that the way must be clear before held motion continues, s"
+    )
 
 
 @dataclass(frozen=True)
@@ -80,7 +105,8 @@ class WorkRules:
 
 
 class Quiet:
-    """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it will never settle."""
+    """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it
+    will never settle."""
 
     def __init__(self, wanted_cycles: int, most_cycles: int) -> None:
         self._wanted_cycles = wanted_cycles
@@ -113,7 +139,9 @@ class WorkCycle(NamedTuple):
 class PathWork:
     """One PATH segment."""
 
-    def __init__(self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules) -> None:
+    def __init__(
+        self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules
+    ) -> None:
         self.segment = segment
         self.motion = PathMotion(path, rules.braking, rules.params.bridging)
         self.fault: SegmentFault | None = None  # why it cannot be done
@@ -152,7 +180,9 @@ class PathWork:
         motion = self.motion
         waits = self.begin_wanted is not None
         if motion.trajectory is not None and not motion.stopping:
-            self._block(not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world))
+            self._block(
+                not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world)
+            )
             if cycle.hold or self.blocked:
                 motion.hold()
         elif waits and cycle.plan is not None:
@@ -170,7 +200,10 @@ class PathWork:
             joint = int(away.argmax())
             permitted = self._rules.params.settled
             name = self._rules.joints[joint]
-            reason = f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most {permitted} rad"
+            reason = (
+                f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most"
+                f" {permitted} rad"
+            )
             self.fault = SegmentFault(Error.FOLLOWING, reason)
         return settled
 
@@ -187,7 +220,8 @@ class PathWork:
         return self.motion.s / length if length > 0.0 else 1.0
 
     def ends_s(self, due_s: float) -> float:
-        """Return the simulated time at which the segment should be done if the set point is due at `due_s`, or 0."""
+        """Return the simulated time at which the segment should be done if the set point is due at
+        `due_s`, or 0."""
         if self.motion.stopping or (self.motion.resting and not self.motion.finished):
             return 0.0
         return due_s + self.motion.remaining_s + self._rules.latency_s
@@ -211,7 +245,8 @@ class PathWork:
         self.blocked = blocked
 
     def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
-        """Stretch the trajectory to end just in time; before the start, refuse one that is too late."""
+        """Stretch the trajectory to end just in time; before the start, refuse one that is too
+        late."""
         if not self.segment.by or not trajectory.duration:
             return trajectory
         available = self.segment.by - self._rules.latency_s - due_s
@@ -232,13 +267,15 @@ class GripperWork:
         self.begin()
 
     def begin(self) -> None:
-        """Start waiting until the gripper rests: at the start, and when the servo is back in step."""
+        """Start waiting until the gripper rests: at the start, and when the servo is back in
+        step."""
         self._cycles = 0
         self._quiet = self._rules.quiet()
 
     @property
     def held_after(self) -> int | None:
-        """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed than to open."""
+        """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed
+        than to open."""
         return self.segment.object if self._closes else None
 
     def done(self, status: Message) -> bool:

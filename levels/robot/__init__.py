@@ -1,4 +1,6 @@
-"""Robot and cell, built from `[robot]` and `[scene]`: model, limits, linkage of the gripper, dynamics.
+"""Robot and cell, built from `[robot]` and `[scene]`: model, limits, linkage of the gripper,
+dynamics.
 
-No exports: importing MuJoCo takes half a second, and not every importer of a module here needs all of them.
+No exports: importing MuJoCo takes half a second, and not every importer of a module here needs all
+of them.
 """

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
 from rack.levels.robot.hand import Hand, find_hand, fit_tendons
-from rack.levels.robot.limits import Bounds, Encoders, Limits, MotorPatience, joint_bounds, patience_of, planned_limits
+from rack.levels.robot.limits import (
+    Bounds,
+    Encoders,
+    Limits,
+    MotorPatience,
+    joint_bounds,
+    patience_of,
+    planned_limits,
+)
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.robot.wrist import Wrist, find_wrist
@@ -28,8 +36,8 @@ class Cell:
     """A compiled cell. Indices are addresses in `model`."""
 
     model: mujoco.MjModel
-    """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons. Keyframe 0 is the
-    start: the arm at home, the gripper open."""
+    """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
+    Keyframe 0 is the start: the arm at home, the gripper open."""
     qpos: NDArray[np.int_]  # (joints,), the arm's joints in qpos
     dof: NDArray[np.int_]  # (joints,), the same in qvel
     actuators: NDArray[np.int_]  # (joints,), their motors in ctrl; of a hand, its flexors
@@ -57,7 +65,8 @@ class Cell:
     patience: MotorPatience  # of its motors, or valves
 
     def start(self) -> mujoco.MjData:
-        """Return data of the start: the arm at home, the gripper open, objects where the model puts them."""
+        """Return data of the start: the arm at home, the gripper open, objects where the model puts
+        them."""
         data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, data, 0)
         mujoco.mj_forward(self.model, data)
@@ -65,12 +74,14 @@ class Cell:
 
 
 def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps. Each caller gets a model of its own.
+    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps. Each caller gets a
+    model of its own.
 
-    The crate builds it once, before it forks the boards; in the same process only the model is copied from then on.
+    The crate builds it once, before it forks the boards; in the same process only the model is
+    copied from then on.
 
-    Raises `RobotError`, one line, for a file, joint, site, body or geom that is missing or of the wrong kind, a list of
-    the wrong length, a home outside the limits or in unintended contact.
+    Raises `RobotError`, one line, for a file, joint, site, body or geom that is missing or of the
+    wrong kind, a list of the wrong length, a home outside the limits or in unintended contact.
     """
     cell = _compiled(robot, scene, clock_ns)
     return replace(cell, model=copy(cell.model))
@@ -92,7 +103,8 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 
 
 def sizes(cell: Cell) -> dict[str, int]:
-    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state; fingers of a hand."""
+    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state; fingers
+    of a hand."""
     found = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
@@ -102,9 +114,14 @@ def sizes(cell: Cell) -> dict[str, int]:
 
 
 def index(
-    model: mujoco.MjModel, robot: RobotConfig, scene: SceneConfig, motors: list[str], torque: NDArray[np.float64]
+    model: mujoco.MjModel,
+    robot: RobotConfig,
+    scene: SceneConfig,
+    motors: list[str],
+    torque: NDArray[np.float64],
 ) -> Cell:
-    """Find everything that the config names in the compiled model, the torques of a hand there. Raises `RobotError`."""
+    """Find everything that the config names in the compiled model, the torques of a hand there.
+    Raises `RobotError`."""
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
@@ -124,7 +141,10 @@ def index(
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
     wrist = find_wrist(model, robot.wrist, moved)
     data = mujoco.MjData(model)
-    data.qpos[model.jnt_qposadr[joints]], data.qvel[model.jnt_dofadr[joints]] = robot.home, robot.velocity
+    data.qpos[model.jnt_qposadr[joints]], data.qvel[model.jnt_dofadr[joints]] = (
+        robot.home,
+        robot.velocity,
+    )
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_energyVel(model, data)
     return Cell(
@@ -140,9 +160,11 @@ def index(
         gripper_open=None if gripper is None else gripper.open,
         gripper_closed=None if gripper is None else gripper.closed,
         gripper_stiffness=None if gripper is None else gripper.stiffness,
-        linkage=None
-        if gripper is None or joint is None
-        else solve_linkage(model, joint, linked, (gripper.open, gripper.closed)),
+        linkage=(
+            None
+            if gripper is None or joint is None
+            else solve_linkage(model, joint, linked, (gripper.open, gripper.closed))
+        ),
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
@@ -169,9 +191,9 @@ def unintended_pairs(
 ) -> NDArray[np.bool_]:
     """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
 
-    Intended are an object on a support, an object in the gripper, the parts of one object and the fingers on each
-    other; and, see `pressed_pairs`, a tool on a support. Every other contact of arm or object is unintended; the rest
-    of the cell is ignored.
+    Intended are an object on a support, an object in the gripper, the parts of one object and the
+    fingers on each other; and, see `pressed_pairs`, a tool on a support. Every other contact of arm
+    or object is unintended; the rest of the cell is ignored.
     """
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     ours = np.union1d(arm, objects)
@@ -183,8 +205,11 @@ def unintended_pairs(
     return touch
 
 
-def pressed_pairs(model: mujoco.MjModel, wrist: Wrist | None, supports: NDArray[np.int_]) -> NDArray[np.bool_]:
-    """Return (ngeom, ngeom), True for a support and what hangs on the wrist sensor: their contact is measured."""
+def pressed_pairs(
+    model: mujoco.MjModel, wrist: Wrist | None, supports: NDArray[np.int_]
+) -> NDArray[np.bool_]:
+    """Return (ngeom, ngeom), True for a support and what hangs on the wrist sensor: their contact
+    is measured."""
     pressed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     if wrist is not None:
         tool = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
@@ -200,7 +225,8 @@ def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArra
 
 
 def start_qpos(cell: Cell) -> NDArray[np.float64]:
-    """Return qpos of the start: arm at home, gripper and its linkage open, the rest as in the model."""
+    """Return qpos of the start: arm at home, gripper and its linkage open, the rest as in the
+    model."""
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = cell.home
     if cell.linkage is not None and cell.gripper_open is not None:
@@ -209,21 +235,29 @@ def start_qpos(cell: Cell) -> NDArray[np.float64]:
 
 
 def check_start(cell: Cell, robot: RobotConfig) -> None:
-    """Raise `RobotError` when home is outside the limits, too heavy to hold, in unintended contact, or not finite."""
+    """Raise `RobotError` when home is outside the limits, too heavy to hold, in unintended contact,
+    or not finite."""
     for name, q, (low, high) in zip(robot.joints, cell.home, cell.limits.position, strict=True):
         if not low <= q <= high:
-            raise RobotError(f"robot.home: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid")
+            raise RobotError(
+                f"robot.home: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid"
+            )
     data = cell.start()
     if not np.isfinite(data.qacc).all():
-        raise RobotError(f"model '{robot.model}': acceleration at home is not finite; check masses, inertias, gravity")
+        raise RobotError(
+            f"model '{robot.model}': acceleration at home is not finite; check masses, inertias,"
+            " gravity"
+        )
     load = np.abs(data.qfrc_bias - data.qfrc_passive)[cell.dof]
     for name, needed, limit in zip(robot.joints, load, cell.bounds.torque, strict=True):
         if needed > limit:
             raise RobotError(
-                f"robot.home: joint '{name}' carries {needed:.4g} N m there; its torque limit is {limit:g}"
+                f"robot.home: joint '{name}' carries {needed:.4g} N m there; its torque limit is"
+                f" {limit:g}"
             )
     for pair in unintended_contacts(data, cell.touch):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
-            f"robot.home: '{first}' touches '{second}'; move home or the object, name a support, or exclude the pair"
+            f"robot.home: '{first}' touches '{second}'; move home or the object, name a support, or"
+            " exclude the pair"
         )

@@ -1,7 +1,8 @@
-"""The arm's equation of motion, as a controller knows it: torque = M(q) qdd + bias(q, qd) + friction.
+"""The arm's equation of motion, as a controller knows it: torque = M(q) qdd + bias(q, qd) +
+friction.
 
-Evaluated on separate data, with contacts and constraints off: a pure function of its arguments, not of a simulation.
-(`qfrc_bias` of a simulation belongs to the state before its last step.)
+Evaluated on separate data, with contacts and constraints off: a pure function of its arguments, not
+of a simulation. (`qfrc_bias` of a simulation belongs to the state before its last step.)
 """
 
 from __future__ import annotations
@@ -31,9 +32,14 @@ from rack.levels.robot.engine import (
 )
 
 FRICTION_SPEED = 0.01
-"""Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at zero speed would excite the arm."""
+"""Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at zero speed would
+excite the arm."""
 
-OFF = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_SENSOR
+OFF = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT
+    | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    | mujoco.mjtDisableBit.mjDSBL_SENSOR
+)
 
 
 class Payload(NamedTuple):
@@ -47,7 +53,8 @@ class Terms(NamedTuple):
     """The equation at one state; dry friction is separate."""
 
     inertia: Array  # (joints, joints), kg m2
-    bias: Array  # (joints,), N m: gravity, Coriolis and centrifugal torques, springs, viscous friction
+    # (joints,), N m: gravity, Coriolis and centrifugal torques, springs, viscous friction
+    bias: Array
 
 
 STATE_ROWS = 2
@@ -57,7 +64,8 @@ INERTIA_ROW = 3
 
 
 class Dynamics:
-    """Evaluates the equation of motion of a cell's arm, its fingers open; the same state again costs nothing."""
+    """Evaluates the equation of motion of a cell's arm, its fingers open; the same state again
+    costs nothing."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -66,9 +74,12 @@ class Dynamics:
         self._data = d = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, d, 0)
         joints = len(cell.dof)
-        # One array, and not eight, for the compiled functions: each costs more than the arithmetic on it.
+        # One array, and not eight, for the compiled functions: each costs more than the arithmetic
+        # on it.
         self._evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
-        self.newest, given = self._evaluations  # the first is not to be written to, the second has the payload
+        self.newest, given = (
+            self._evaluations
+        )  # the first is not to be written to, the second has the payload
         self.newest[:STATE_ROWS] = np.nan  # there is none
         self._terms = Terms(given[INERTIA_ROW:], given[BIAS_ROW])
         self._position, self._velocity = given[:STATE_ROWS]
@@ -84,7 +95,8 @@ class Dynamics:
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
-        """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until the next call."""
+        """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until
+        the next call."""
         self._position[:], self._velocity[:] = q, qd
         self._evaluate(*self._evaluating)
         if payload is not None and payload.mass > 0.0:
@@ -102,7 +114,8 @@ class Dynamics:
         return np.asarray(self.dry * each(math.tanh, velocity / FRICTION_SPEED))
 
     def pose(self, q: Array) -> tuple[Array, Array]:
-        """Return position (3,), m, and rotation (3, 3) of the tool at `q`. The arrays are valid until the next call."""
+        """Return position (3,), m, and rotation (3, 3) of the tool at `q`. The arrays are valid
+        until the next call."""
         m = self._model
         d = self._data
         self.newest[:STATE_ROWS] = np.nan
@@ -111,27 +124,40 @@ class Dynamics:
         return d.site_xpos[self._cell.tool], d.site_xmat[self._cell.tool].reshape(3, 3)
 
 
-def addresses(model: mujoco.MjModel, data: mujoco.MjData, cell: Cell) -> tuple[NDArray[np.int64], Array]:
-    """Return where an evaluation reads and writes, (4 + joints, joints), and the memory of `data` that this indexes.
+def addresses(
+    model: mujoco.MjModel, data: mujoco.MjData, cell: Cell
+) -> tuple[NDArray[np.int64], Array]:
+    """Return where an evaluation reads and writes, (4 + joints, joints), and the memory of `data`
+    that this indexes.
 
-    The rows are position, velocity, bias, passive force, and those of the inertia: -1 where it is always zero.
+    The rows are position, velocity, bias, passive force, and those of the inertia: -1 where it is
+    always zero.
     """
     memory, (qpos, qvel, bias, passive, inertia) = one_view(
         data.qpos, data.qvel, data.qfrc_bias, data.qfrc_passive, data.M
     )
-    below = np.full((model.nv, model.nv), -1)  # MuJoCo keeps what is not zero of a lower triangle, row by row
+    below = np.full(
+        (model.nv, model.nv), -1
+    )  # MuJoCo keeps what is not zero of a lower triangle, row by row
     for row, (first, count) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
         entries = np.arange(first, first + count)
         below[row, model.M_colind[entries]] = inertia + entries
     whole = np.maximum(below, below.T)[np.ix_(cell.dof, cell.dof)]
-    return np.vstack((qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, whole)), memory
+    return (
+        np.vstack((qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, whole)),
+        memory,
+    )
 
 
 @compiled
-def evaluate(model: int, data: int, places: NDArray[np.int64], memory: Array, evaluations: Array) -> None:
-    """Evaluate the equation at the state in the second of `evaluations`, unless the first is of that state already.
+def evaluate(
+    model: int, data: int, places: NDArray[np.int64], memory: Array, evaluations: Array
+) -> None:
+    """Evaluate the equation at the state in the second of `evaluations`, unless the first is of
+    that state already.
 
-    Both are (3 + joints, joints), and equal afterwards; `places` are addresses in `memory`, see `addresses`.
+    Both are (3 + joints, joints), and equal afterwards; `places` are addresses in `memory`, see
+    `addresses`.
     """
     newest = evaluations[0]
     given = evaluations[1]
@@ -142,7 +168,9 @@ def evaluate(model: int, data: int, places: NDArray[np.int64], memory: Array, ev
             same &= newest[row, joint] == given[row, joint]
             newest[row, joint] = memory[places[row, joint]] = given[row, joint]
     if not same:
-        mj_kinematics(model, data)  # with the next five, all that `mj_fwdPosition` does for inertia and bias
+        mj_kinematics(
+            model, data
+        )  # with the next five, all that `mj_fwdPosition` does for inertia and bias
         mj_com_pos(model, data)
         mj_flex(model, data)
         mj_tendon(model, data)
@@ -206,4 +234,6 @@ def preload() -> None:
     place = np.zeros(3)
     evaluate.load()(*at, places, none, evaluations)
     jacobians = np.zeros((2, 3, 0))
-    carry.load()(0.0, place, *at, places[0], 0, place, np.zeros(9), place, jacobians, evaluations[0])
+    carry.load()(
+        0.0, place, *at, places[0], 0, place, np.zeros(9), place, jacobians, evaluations[0]
+    )

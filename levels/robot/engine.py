@@ -1,11 +1,12 @@
 """MuJoCo's own functions and memory, for compiled code.
 
-Called from Python, a step of MuJoCo costs 2 us more than it takes, and a look at its contacts half a microsecond: both
-happen at every step. Compiled code calls the C library directly, on the addresses of model and data. Called as Python,
-the same code reaches the same functions through ctypes.
+Called from Python, a step of MuJoCo costs 2 us more than it takes, and a look at its contacts half
+a microsecond: both happen at every step. Compiled code calls the C library directly, on the
+addresses of model and data. Called as Python, the same code reaches the same functions through
+ctypes.
 
-Of an error that MuJoCo calls fatal (its memory is exhausted) the bindings would make an exception; here it ends the
-process, as the exception would have ended the board.
+Of an error that MuJoCo calls fatal (its memory is exhausted) the bindings would make an exception;
+here it ends the process, as the exception would have ended the board.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionStrin
 
 
 class native(compiled[..., None]):  # noqa: N801  # stands for a function
-    """A function of MuJoCo that returns nothing. Arguments are integers: addresses, sizes and flags."""
+    """A function of MuJoCo that returns nothing. Arguments are integers: addresses, sizes and
+    flags."""
 
     def __init__(self, name: str, arguments: int) -> None:
         function = getattr(ctypes.CDLL(str(LIBRARY)), name)
@@ -42,7 +44,9 @@ class native(compiled[..., None]):  # noqa: N801  # stands for a function
             from numba import types
 
             binding.load_library_permanently(str(LIBRARY))
-            self._machine = types.ExternalFunction(self._name, types.void(*[types.intp] * self._arguments))
+            self._machine = types.ExternalFunction(
+                self._name, types.void(*[types.intp] * self._arguments)
+            )
         return self._machine
 
 
@@ -65,7 +69,8 @@ mj_set_state = native("mj_setState", 4)
 
 
 def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the memory from the first to the last of some arrays of one `MjData`, and where in it each begins.
+    """Return the memory from the first to the last of some arrays of one `MjData`, and where in it
+    each begins.
 
     It is valid as long as the data.
     """
@@ -73,7 +78,10 @@ def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     ends = [int(begin) + array.nbytes for begin, array in zip(begins, arrays, strict=True)]
     first = int(begins.min())
     item = np.dtype(np.float64).itemsize
-    return _view(first, np.float64, ((max(ends) - first) // item,), (item,)), (begins - first) // item
+    return (
+        _view(first, np.float64, ((max(ends) - first) // item,), (item,)),
+        (begins - first) // item,
+    )
 
 
 class ContactViews(NamedTuple):
@@ -85,10 +93,11 @@ class ContactViews(NamedTuple):
 
 
 def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
-    """Return views of the contacts. Raises `RuntimeError` for a MuJoCo that keeps them in another place.
+    """Return views of the contacts. Raises `RuntimeError` for a MuJoCo that keeps them in another
+    place.
 
-    The bindings give a copy of their number, and views of the contacts of one moment. But contacts always begin the
-    arena, and their number follows warnings and timers (mjdata.h).
+    The bindings give a copy of their number, and views of the contacts of one moment. But contacts
+    always begin the arena, and their number follows warnings and timers (mjdata.h).
     """
     state = np.zeros(mujoco.mj_stateSize(model, STATE))
     mujoco.mj_getState(model, data, state, STATE)
@@ -97,9 +106,14 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     end = warnings.ctypes.data - warnings.itemsize + len(warnings) * warnings.strides[0]
     number = _view(end + len(timers) * timers.strides[0], np.int32, (1,), (4,))
     before = int(number[0])
-    mujoco.mj_addContact(model, data, mujoco.MjContact())  # where there are no contacts, they have no address
+    mujoco.mj_addContact(
+        model, data, mujoco.MjContact()
+    )  # where there are no contacts, they have no address
     if not before + 1 == number[0] == data.ncon:
-        raise RuntimeError(f"MuJoCo {mujoco.mj_versionString()} does not keep the number of contacts where 4.0 does")
+        raise RuntimeError(
+            f"MuJoCo {mujoco.mj_versionString()} does not keep the number of contacts where 4.0"
+            " does"
+        )
     geoms = data.contact.geom
     distance = data.contact.dist
     room = data.narena // geoms.strides[0]
@@ -114,7 +128,9 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     return views
 
 
-def _view(address: int, kind: type, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
+def _view(
+    address: int, kind: type, shape: tuple[int, ...], strides: tuple[int, ...]
+) -> NDArray[Any]:
     """Return the array at `address`."""
     memory = (ctypes.c_char * (shape[0] * strides[0])).from_address(address)
     return np.ndarray(shape, kind, memoryview(memory), 0, strides)

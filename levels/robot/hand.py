@@ -1,8 +1,8 @@
 """A hand: fingers whose joints are driven by pairs of tendons, from `[robot.hand]` and its model.
 
-The tension of a tendon is the control of its actuator. A positive one shortens the tendon, and none can be negative: so
-it can only pull. The two of a joint pull it opposite ways, over equal arms that do not vary, and turn no other joint:
-torque = arm (flexor's tension - extensor's).
+The tension of a tendon is the control of its actuator. A positive one shortens the tendon, and none
+can be negative: so it can only pull. The two of a joint pull it opposite ways, over equal arms that
+do not vary, and turn no other joint: torque = arm (flexor's tension - extensor's).
 """
 
 from __future__ import annotations
@@ -28,11 +28,14 @@ NET_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1
 
 @dataclass(frozen=True)
 class Hand:
-    """The hand of a cell. Vectors of joints are in the order of `robot.joints`, rows of two: flexors, extensors."""
+    """The hand of a cell. Vectors of joints are in the order of `robot.joints`, rows of two:
+    flexors, extensors."""
 
     names: tuple[str, ...]  # of the fingers
     tips: NDArray[np.int_]  # (fingers,), sites at their tips
-    forces: NDArray[np.int_]  # (fingers, 3), in sensordata: of contacts on the body of the tip, in the world's frame
+    forces: NDArray[
+        np.int_
+    ]  # (fingers, 3), in sensordata: of contacts on the body of the tip, in the world's frame
     fingers: NDArray[np.bool_]  # (fingers, joints), True where a joint is the finger's
     actuators: NDArray[np.int_]  # (2, joints), of the tendons, in ctrl
     arms: NDArray[np.float64]  # (joints,), m: of both tendons of a joint, without sign
@@ -43,52 +46,74 @@ class Hand:
 
     @property
     def torque(self) -> NDArray[np.float64]:
-        """Largest torque of a joint either way, (joints,), N m: one tendon at most, the other at least."""
+        """Largest torque of a joint either way, (joints,), N m: one tendon at most, the other at
+        least."""
         return np.asarray(self.arms * self.most - self.arms * self.least)
 
 
 def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
-    """Raise `RobotError` for a mistake of `[robot.hand]` in itself: lengths of lists, joints of fingers, tensions."""
+    """Raise `RobotError` for a mistake of `[robot.hand]` in itself: lengths of lists, joints of
+    fingers, tensions."""
     if robot.gripper is not None:
-        raise RobotError("robot.hand: a hand stands in place of an arm and has no gripper; leave out robot.gripper")
+        raise RobotError(
+            "robot.hand: a hand stands in place of an arm and has no gripper; leave out"
+            " robot.gripper"
+        )
     if robot.torque is not None:
         raise RobotError("robot.torque: torques of a hand follow from its tendons; leave it out")
     for row in ROWS:
         given = getattr(hand, row)
         if len(given) != len(robot.joints):
-            raise RobotError(f"robot.hand.{row}: {len(given)} values; one per joint: {len(robot.joints)}")
+            raise RobotError(
+                f"robot.hand.{row}: {len(given)} values; one per joint: {len(robot.joints)}"
+            )
     both = hand.flexors + hand.extensors
     for name in both:
         if both.count(name) > 1:
-            raise RobotError(f"robot.hand: actuator '{name}' is named {both.count(name)} times; once is valid")
+            raise RobotError(
+                f"robot.hand: actuator '{name}' is named {both.count(name)} times; once is valid"
+            )
     names = [finger.name for finger in hand.finger]
     for finger in hand.finger:
         if names.count(finger.name) > 1:
-            raise RobotError(f"robot.hand.finger: {names.count(finger.name)} fingers are named '{finger.name}'")
+            raise RobotError(
+                f"robot.hand.finger: {names.count(finger.name)} fingers are named '{finger.name}'"
+            )
         for joint in finger.joints:
             if joint not in robot.joints:
                 have = listed(list(robot.joints))
-                raise RobotError(f"robot.hand.finger: '{joint}' of '{finger.name}' is not in robot.joints: {have}")
+                raise RobotError(
+                    f"robot.hand.finger: '{joint}' of '{finger.name}' is not in robot.joints:"
+                    f" {have}"
+                )
     for joint in robot.joints:
         owners = [finger.name for finger in hand.finger for own in finger.joints if own == joint]
         if len(owners) != 1:
             named = ", ".join(f"'{name}'" for name in owners) or "none"
-            raise RobotError(f"robot.hand.finger: joint '{joint}' must be of one finger; it is of {named}")
+            raise RobotError(
+                f"robot.hand.finger: joint '{joint}' must be of one finger; it is of {named}"
+            )
     if not hand.least < hand.rest:
-        raise RobotError(f"robot.hand.rest: {hand.rest:g} N; above robot.hand.least = {hand.least:g} N is valid")
+        raise RobotError(
+            f"robot.hand.rest: {hand.rest:g} N; above robot.hand.least = {hand.least:g} N is valid"
+        )
 
 
 def fit_tendons(
     spec: mujoco.MjSpec, robot: RobotConfig, hand: HandConfig, step_s: float
 ) -> tuple[list[str], NDArray[np.float64]]:
-    """Remove the drives of the hand's joints other than its tendons; return the flexors and the joints' torque limits.
+    """Remove the drives of the hand's joints other than its tendons; return the flexors and the
+    joints' torque limits.
 
-    The limits, (joints,), N m, are not known before the model is compiled: those of the `Hand` replace them. Actuators
-    that delay their controls get room to remember them, in steps of `step_s`. Each tip gets a sensor of force.
+    The limits, (joints,), N m, are not known before the model is compiled: those of the `Hand`
+    replace them. Actuators that delay their controls get room to remember them, in steps of
+    `step_s`. Each tip gets a sensor of force.
     """
     check_hand(robot, hand)
     tendons = hand.flexors + hand.extensors
-    remove(spec, [a for a in spec.actuators if a.name not in tendons and drives_arm(spec, a, robot)])
+    remove(
+        spec, [a for a in spec.actuators if a.name not in tendons and drives_arm(spec, a, robot)]
+    )
     for name in robot.joints:
         joint = spec.joint(name)
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -102,7 +127,9 @@ def fit_tendons(
             site.parent.name = site.parent.name or f"tip of {finger.name}"
             kind = mujoco.mjtSensor.mjSENS_CONTACT
             body = mujoco.mjtObj.mjOBJ_BODY
-            sensor = spec.add_sensor(name=_force_of(finger), type=kind, reftype=body, refname=site.parent.name)
+            sensor = spec.add_sensor(
+                name=_force_of(finger), type=kind, reftype=body, refname=site.parent.name
+            )
             sensor.intprm[:3] = NET_FORCE
     return list(hand.flexors), np.full(len(robot.joints), np.inf)
 
@@ -115,13 +142,21 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
     """Find everything that `[robot.hand]` names in the compiled model. Raises `RobotError`."""
     kind = mujoco.mjtObj
     actuators = np.stack(
-        [lookup.find_all(model, kind.mjOBJ_ACTUATOR, getattr(hand, r), f"robot.hand.{r}") for r in ROWS]
+        [
+            lookup.find_all(model, kind.mjOBJ_ACTUATOR, getattr(hand, r), f"robot.hand.{r}")
+            for r in ROWS
+        ]
     )
     sites = tuple(finger.tip for finger in hand.finger)
     tips = lookup.find_all(model, kind.mjOBJ_SITE, sites, "robot.hand.finger.tip")
     for finger, tip in zip(hand.finger, tips, strict=True):
-        if not lookup.below(model, model.jnt_bodyid[[model.joint(finger.joints[-1]).id]])[model.site_bodyid[tip]]:
-            raise RobotError(f"robot.hand.finger: joint '{finger.joints[-1]}' does not move the tip '{finger.tip}'")
+        if not lookup.below(model, model.jnt_bodyid[[model.joint(finger.joints[-1]).id]])[
+            model.site_bodyid[tip]
+        ]:
+            raise RobotError(
+                f"robot.hand.finger: joint '{finger.joints[-1]}' does not move the tip"
+                f" '{finger.tip}'"
+            )
     for row, found in zip(ROWS, actuators, strict=True):
         for actuator in map(int, found):
             why = _no_tension(model, actuator, hand.least)
@@ -131,15 +166,23 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
     for joint, (first, second) in zip(robot.joints, most.T, strict=True):
         if first != second:
             raise RobotError(
-                f"robot.hand: tendons of joint '{joint}' pull at most {first:g} and {second:g} N; equal is valid"
+                f"robot.hand: tendons of joint '{joint}' pull at most {first:g} and {second:g} N;"
+                " equal is valid"
             )
     if not hand.rest < most.min():
-        raise RobotError(f"robot.hand.rest: {hand.rest:g} N; below the largest tension, {most.min():g} N, is valid")
+        raise RobotError(
+            f"robot.hand.rest: {hand.rest:g} N; below the largest tension, {most.min():g} N, is"
+            " valid"
+        )
     return Hand(
         names=tuple(finger.name for finger in hand.finger),
         tips=tips,
-        fingers=np.array([[joint in finger.joints for joint in robot.joints] for finger in hand.finger]),
-        forces=np.array([model.sensor(_force_of(finger)).adr[0] + np.arange(3) for finger in hand.finger]),
+        fingers=np.array(
+            [[joint in finger.joints for joint in robot.joints] for finger in hand.finger]
+        ),
+        forces=np.array(
+            [model.sensor(_force_of(finger)).adr[0] + np.arange(3) for finger in hand.finger]
+        ),
         actuators=actuators,
         arms=_arms(model, robot, actuators),
         least=hand.least,
@@ -150,30 +193,48 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
 
 
 def _no_tension(model: mujoco.MjModel, actuator: int, least: float) -> str:
-    """Return why the control of an actuator is not the tension of a tendon that only pulls; empty: it is."""
+    """Return why the control of an actuator is not the tension of a tendon that only pulls; empty:
+    it is."""
     low, high = model.actuator_ctrlrange[actuator]
-    gain = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED, model.actuator_gainprm[actuator, 0]
+    gain = (
+        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED,
+        model.actuator_gainprm[actuator, 0],
+    )
     if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
         return "drives no tendon"
     if gain != (True, 1.0) or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
         return "must have its tension as its control: a fixed gain of 1, and no bias"
     if model.actuator_gear[actuator, 0] != -1.0:
-        return f"cannot pull: its gear is {model.actuator_gear[actuator, 0]:g}; -1, which shortens the tendon, is valid"
+        return (
+            f"cannot pull: its gear is {model.actuator_gear[actuator, 0]:g}; -1, which shortens the"
+            " tendon, is valid"
+        )
     if not model.actuator_ctrllimited[actuator]:
         return "pushes as well: its control has no range; one from 0 or more is valid"
     if low < 0.0:
         return f"pushes as well: its control is {low:g} to {high:g} N; from 0 or more is valid"
     if not high > least:
-        return f"cannot pull: its largest tension is {high:g} N; above robot.hand.least = {least:g} N is valid"
+        return (
+            f"cannot pull: its largest tension is {high:g} N; above robot.hand.least = {least:g} N"
+            " is valid"
+        )
     return ""
 
 
-def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: NDArray[np.int_]) -> NDArray[np.float64]:
-    """Return the moment arms (joints,), m. Raises `RobotError` where two tendons are no pair of a joint."""
+def _arms(
+    model: mujoco.MjModel, robot: RobotConfig, actuators: NDArray[np.int_]
+) -> NDArray[np.float64]:
+    """Return the moment arms (joints,), m. Raises `RobotError` where two tendons are no pair of a
+    joint."""
     joints = np.array([model.joint(name).id for name in robot.joints])
     limited = model.jnt_limited[joints, None]
-    places = np.array(robot.home), *np.where(limited, model.jnt_range[joints], np.array(robot.home)[:, None]).T
-    at = [_moments(model, joints, place)[actuators] for place in places]  # each (2, joints, joints), m
+    places = (
+        np.array(robot.home),
+        *np.where(limited, model.jnt_range[joints], np.array(robot.home)[:, None]).T,
+    )
+    at = [
+        _moments(model, joints, place)[actuators] for place in places
+    ]  # each (2, joints, joints), m
     arms = np.zeros(len(joints))
     for number, joint in enumerate(robot.joints):
         for row, sign in enumerate((1.0, -1.0)):
@@ -185,14 +246,16 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: NDArray[np.int_]
                 raise RobotError(f"robot.hand.{ROWS[row]}: '{name}' {why}")
             if row and abs(sign * arm - arms[number]) > SAME_ARM * arms[number]:
                 raise RobotError(
-                    f"robot.hand: arms on joint '{joint}' are {arms[number]:g} and {-arm:g} m; equal ones are valid"
+                    f"robot.hand: arms on joint '{joint}' are {arms[number]:g} and {-arm:g} m;"
+                    " equal ones are valid"
                 )
             arms[number] = sign * arm
     return arms
 
 
 def _no_arm(robot: RobotConfig, joint: str, own: list[NDArray[np.float64]], sign: float) -> str:
-    """Return why a tendon does not suit its joint, by its moments (joints,) at several positions; empty: it does."""
+    """Return why a tendon does not suit its joint, by its moments (joints,) at several positions;
+    empty: it does."""
     number = robot.joints.index(joint)
     arm = float(own[0][number])
     if abs(arm) < SAME_ARM:
@@ -201,18 +264,29 @@ def _no_arm(robot: RobotConfig, joint: str, own: list[NDArray[np.float64]], sign
         if other != number:
             return f"turns joint '{robot.joints[other]}' in addition to '{joint}'"
     if arm * sign < 0.0:
-        return f"turns joint '{joint}' the wrong way: flexors turn it in positive direction, extensors back"
+        return (
+            f"turns joint '{joint}' the wrong way: flexors turn it in positive direction, extensors"
+            " back"
+        )
     spread = [float(moments[number]) for moments in own]
     if max(spread) - min(spread) > SAME_ARM * abs(arm):
-        return f"has an arm of {min(spread):g} to {max(spread):g} m on joint '{joint}'; one that does not vary is valid"
+        return (
+            f"has an arm of {min(spread):g} to {max(spread):g} m on joint '{joint}'; one that does"
+            " not vary is valid"
+        )
     return ""
 
 
-def _moments(model: mujoco.MjModel, joints: NDArray[np.int_], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the moments of all actuators on `joints` at a position of these, (actuators, joints), m."""
+def _moments(
+    model: mujoco.MjModel, joints: NDArray[np.int_], position: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the moments of all actuators on `joints` at a position of these, (actuators, joints),
+    m."""
     data = mujoco.MjData(model)
     moments = np.zeros((model.nu, model.nv))
     data.qpos[model.jnt_qposadr[joints]] = position
     mujoco.mj_fwdPosition(model, data)
-    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    mujoco.mju_sparse2dense(
+        moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+    )
     return np.asarray(moments[:, model.jnt_dofadr[joints]])

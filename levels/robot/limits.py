@@ -13,27 +13,34 @@ from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig
 
 VELOCITY_ROOM = 0.05
-"""Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the limit gate."""
+"""Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the
+limit gate."""
 POSITION_ROOM_RAD = 0.005
 """Distance that planned motion keeps from the ends of a joint's range, for the same reason."""
 EDGE_TIMING_S = 0.1
-"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges, which is far finer than
-the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no filter's lag."""
+"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges,
+which is far finer than the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no
+filter's lag."""
 MAX_CONTACT_PART = 0.2
-"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a third more than observed
-in tasks."""
+"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a
+third more than observed in tasks."""
 MAX_RESTING_CONTACT_PART = 0.1
-"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all joints but one."""
+"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all
+joints but one."""
 MIN_TURNING_JOINTS = 2
 """Fewest turning joints at which an arm moves enough for a push to show."""
 PATIENCE_PART = 0.25
-"""Largest part by which motors that keep their last torque may add to a stop from full speed; see `patience_of`."""
+"""Largest part by which motors that keep their last torque may add to a stop from full speed; see
+`patience_of`."""
 LEAST_CYCLES = 2
-"""Torque cycles for which motors keep their last torque by default, at least: one late cycle must not brake the arm."""
+"""Torque cycles for which motors keep their last torque by default, at least: one late cycle must
+not brake the arm."""
 MAX_PATIENCE_S = 0.01
-"""Longest time by default, however slow or weak the arm: no torque for so long is no stall of a cycle or two."""
+"""Longest time by default, however slow or weak the arm: no torque for so long is no stall of a
+cycle or two."""
 SIGMAS = 6.0
-"""Standard deviations of noise that a monitor allows for: less than one sample in a billion exceeds them."""
+"""Standard deviations of noise that a monitor allows for: less than one sample in a billion exceeds
+them."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +50,17 @@ class Bounds:
     Slides have m and N where hinges have rad and N m.
     """
 
-    position: NDArray[np.float64]  # (joints, 2), rad: low and high; -inf and inf for a joint without
+    position: NDArray[
+        np.float64
+    ]  # (joints, 2), rad: low and high; -inf and inf for a joint without
     velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
     torque: NDArray[np.float64]  # (joints,), N m, both ways
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of planned motion: the bounds, less some room for tracking, and the config's smoothness."""
+    """Limits of planned motion: the bounds, less some room for tracking, and the config's
+    smoothness."""
 
     position: NDArray[np.float64]  # (joints, 2), rad: low and high
     velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
@@ -61,7 +71,8 @@ class Limits:
 
 @dataclass(frozen=True)
 class Encoders:
-    """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over `EDGE_TIMING_S`."""
+    """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over
+    `EDGE_TIMING_S`."""
 
     resolution: NDArray[np.float64]  # (joints,), rad: step of a position
     noise: NDArray[np.float64]  # (joints,), rad: standard deviation of a position
@@ -71,7 +82,9 @@ class Encoders:
         """Return the encoders of a `[robot]` table."""
         joints = len(robot.joints)
         sensors = robot.sensors
-        return cls(np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints))
+        return cls(
+            np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints)
+        )
 
     @property
     def exact(self) -> bool:
@@ -97,22 +110,27 @@ class MotorPatience(NamedTuple):
 
     def ticks(self, every: int, tick_s: float) -> int:
         """Return it in ticks: whole torque cycles of `every` ticks of `tick_s` each."""
-        # A millionth of a cycle more: 5 ms are two cycles of 2.5 ms, whichever way those are rounded.
+        # A millionth of a cycle more: 5 ms are two cycles of 2.5 ms, whichever way those are
+        # rounded.
         return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.least)
 
 
 def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
-    """Return the patience of an arm whose joints, all at full speed at home, have kinetic energy `energy_j`.
+    """Return the patience of an arm whose joints, all at full speed at home, have kinetic energy
+    `energy_j`.
 
-    By default it is the time in which a stop from full speed grows by at most `PATIENCE_PART`: by what the joints turn
-    at that speed, of the angle in which the brakes stop them; and by what all motors put in at full torque, of the
-    energy that the brakes take in any case. (The limits hold without it: the limit gate passes every tick.)
+    By default it is the time in which a stop from full speed grows by at most `PATIENCE_PART`: by
+    what the joints turn at that speed, of the angle in which the brakes stop them; and by what all
+    motors put in at full torque, of the energy that the brakes take in any case. (The limits hold
+    without it: the limit gate passes every tick.)
     """
     if robot.patience_ms is not None:
         return MotorPatience(robot.patience_ms * 1e-3, 1)
     stops_s = 0.5 * np.min(bounds.velocity / robot.acceleration)
     gains_s = energy_j / np.sum(bounds.torque * bounds.velocity)
-    return MotorPatience(min(PATIENCE_PART * float(min(stops_s, gains_s)), MAX_PATIENCE_S), LEAST_CYCLES)
+    return MotorPatience(
+        min(PATIENCE_PART * float(min(stops_s, gains_s)), MAX_PATIENCE_S), LEAST_CYCLES
+    )
 
 
 def joint_bounds(
@@ -125,10 +143,14 @@ def joint_bounds(
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf])
     if robot.position is not None:
         given = np.array(robot.position)
-        ranges = np.stack((np.maximum(ranges[:, 0], given[:, 0]), np.minimum(ranges[:, 1], given[:, 1])), axis=1)
+        ranges = np.stack(
+            (np.maximum(ranges[:, 0], given[:, 0]), np.minimum(ranges[:, 1], given[:, 1])), axis=1
+        )
     for name, (low, high) in zip(robot.joints, ranges, strict=True):
         if not high - low > 2 * POSITION_ROOM_RAD:
-            raise RobotError(f"robot.position: joint '{name}' has no room from {low:g} to {high:g} rad")
+            raise RobotError(
+                f"robot.position: joint '{name}' has no room from {low:g} to {high:g} rad"
+            )
     return Bounds(position=ranges, velocity=np.array(robot.velocity), torque=torque)
 
 

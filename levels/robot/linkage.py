@@ -1,9 +1,11 @@
-"""The linkage of a gripper: one joint is driven, the others that the arm carries follow it by the model's equalities.
+"""The linkage of a gripper: one joint is driven, the others that the arm carries follow it by the
+model's equalities.
 
-MuJoCo writes every equality (a gear, a loop closed by `connect` or `weld`, a coupled tendon), and every joint stop
-that is exceeded, as rows of residual and Jacobian. Gauss-Newton over them, with the joints' springs as weak rows,
-finds where the linkage settles. It is solved once for a number of openings; a pose in between is interpolated, which
-costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order: equal models give equal poses.
+MuJoCo writes every equality (a gear, a loop closed by `connect` or `weld`, a coupled tendon), and
+every joint stop that is exceeded, as rows of residual and Jacobian. Gauss-Newton over them, with
+the joints' springs as weak rows, finds where the linkage settles. It is solved once for a number of
+openings; a pose in between is interpolated, which costs a cycle some microseconds. MuJoCo's own
+kernels add up in a fixed order: equal models give equal poses.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from rack.levels.errors import RobotError
 OPENINGS = 33
 """Openings at which the linkage is solved, evenly from one end to the other."""
 APPROACH_STEPS = 8
-"""Steps from the model's reference pose to the nearest opening: a loop must not flip over on the way."""
+"""Steps from the model's reference pose to the nearest opening: a loop must not flip over on the
+way."""
 ITERATIONS = 60
 STEP_TOLERANCE = 1e-10
 SPRING_PART = 1e-6
@@ -52,11 +55,14 @@ class Linkage:
             qpos[address] = np.interp(opening, self.openings, positions)
 
 
-def solve_linkage(model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_], ends: tuple[float, float]) -> Linkage:
-    """Return the linkage driven by `joint` in the bodies `hand` (nbody,), between the openings `ends`.
+def solve_linkage(
+    model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_], ends: tuple[float, float]
+) -> Linkage:
+    """Return the linkage driven by `joint` in the bodies `hand` (nbody,), between the openings
+    `ends`.
 
-    Joints with their own motor do not follow. Raises `RobotError` with the equality that cannot be kept, or the joint
-    that nothing determines.
+    Joints with their own motor do not follow. Raises `RobotError` with the equality that cannot be
+    kept, or the joint that nothing determines.
     """
     solver = _Solver(model, joint, hand)
     openings = np.linspace(min(ends), max(ends), OPENINGS)
@@ -85,7 +91,8 @@ class _Solver:
         self._data = mujoco.MjData(self._model)
         motors = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
         carried = hand[model.jnt_bodyid]
-        # The body that carries the linkage may be moved by a joint of the arm itself: that has a motor.
+        # The body that carries the linkage may be moved by a joint of the arm itself: that has a
+        # motor.
         carried[motors] = carried[joint] = False
         self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
         follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
@@ -138,22 +145,25 @@ class _Solver:
         if away > RESIDUAL:
             name = _equality_name(self._model, int(data.efc_id[worst]))
             raise RobotError(
-                f"robot.gripper: equality {name} is {away:.4f} m or rad off with the gripper at {opening:g}; "
-                f"at most {RESIDUAL:g} can be planned with"
+                f"robot.gripper: equality {name} is {away:.4f} m or rad off with the gripper at"
+                f" {opening:g}; at most {RESIDUAL:g} can be planned with"
             )
 
     def check_all_follow(self) -> None:
         """Raise `RobotError` for a joint that neither an equality nor a spring determines."""
         for joint in (*self._others, *self._follow[self._loose]):
             name = (
-                self._model.joint(int(joint)).name or f"of body {self._model.body(self._model.jnt_bodyid[joint]).name}"
+                self._model.joint(int(joint)).name
+                or f"of body {self._model.body(self._model.jnt_bodyid[joint]).name}"
             )
             raise RobotError(
-                f"robot.gripper: joint '{name}' follows nothing; give it an equality with the driven joint, or a spring"
+                f"robot.gripper: joint '{name}' follows nothing; give it an equality with the"
+                " driven joint, or a spring"
             )
 
     def _rows(self) -> tuple[Array, Array]:
-        """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops that are exceeded."""
+        """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops
+        that are exceeded."""
         data = self._data
         jacobian = self._jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)
@@ -171,7 +181,10 @@ def _equality_name(model: mujoco.MjModel, equality: int) -> str:
     if name := model.equality(equality).name:
         return f"'{name}'"
     kind = mujoco.mjtEq(int(model.eq_type[equality]))
-    objects = {mujoco.mjtEq.mjEQ_JOINT: mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtEq.mjEQ_TENDON: mujoco.mjtObj.mjOBJ_TENDON}
+    objects = {
+        mujoco.mjtEq.mjEQ_JOINT: mujoco.mjtObj.mjOBJ_JOINT,
+        mujoco.mjtEq.mjEQ_TENDON: mujoco.mjtObj.mjOBJ_TENDON,
+    }
     of = objects.get(kind, mujoco.mjtObj(int(model.eq_objtype[equality])))
     ids = [int(k[equality]) for k in (model.eq_obj1id, model.eq_obj2id)]
     ends = [f"'{mujoco.mj_id2name(model, of, k) or k}'" for k in ids if k >= 0]

@@ -1,4 +1,5 @@
-"""Look up the names of a config in a compiled model. Every mistake is one `RobotError` that lists the valid names."""
+"""Look up the names of a config in a compiled model. Every mistake is one `RobotError` that lists
+the valid names."""
 
 from __future__ import annotations
 
@@ -26,18 +27,27 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
     found = mujoco.mj_name2id(model, kind, name)
     if found >= 0:
         return int(found)
-    counts = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom, "joint": model.njnt, "actuator": model.nu}
+    counts = {
+        "site": model.nsite,
+        "body": model.nbody,
+        "geom": model.ngeom,
+        "joint": model.njnt,
+        "actuator": model.nu,
+    }
     have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(counts[NOUNS[kind]])])
     raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
 
 
-def find_all(model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str) -> NDArray[np.int_]:
+def find_all(
+    model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str
+) -> NDArray[np.int_]:
     """Return the ids of named elements. Raises `RobotError`."""
     return np.array([find(model, kind, name, place) for name in names], dtype=int)
 
 
 def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
-    """Yield a line for every name in the config that the model lacks. Raises `RobotError` for a broken model."""
+    """Yield a line for every name in the config that the model lacks. Raises `RobotError` for a
+    broken model."""
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
     wanted = [(kind.mjOBJ_JOINT, name, "robot.joints") for name in robot.joints]
@@ -46,9 +56,13 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     if robot.gripper is not None:
         wanted.append((kind.mjOBJ_JOINT, robot.gripper.joint, "robot.gripper.joint"))
     if robot.hand is not None:
-        wanted += [(kind.mjOBJ_SITE, finger.tip, "robot.hand.finger.tip") for finger in robot.hand.finger]
+        wanted += [
+            (kind.mjOBJ_SITE, finger.tip, "robot.hand.finger.tip") for finger in robot.hand.finger
+        ]
         wanted += [(kind.mjOBJ_ACTUATOR, name, "robot.hand.flexors") for name in robot.hand.flexors]
-        wanted += [(kind.mjOBJ_ACTUATOR, name, "robot.hand.extensors") for name in robot.hand.extensors]
+        wanted += [
+            (kind.mjOBJ_ACTUATOR, name, "robot.hand.extensors") for name in robot.hand.extensors
+        ]
     wanted += [(kind.mjOBJ_BODY, name, "scene.objects") for name in scene.objects]
     wanted += [(kind.mjOBJ_BODY, name, "scene.obstacles") for name in scene.obstacles]
     wanted += [(kind.mjOBJ_GEOM, name, "scene.supports") for name in scene.supports]
@@ -60,7 +74,8 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
 
 
 def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None) -> int:
-    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm; None: on any.
+    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm; None: on
+    any.
 
     Raises `RobotError`.
     """
@@ -70,7 +85,9 @@ def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None)
     return tool
 
 
-def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.bool_]) -> int | None:
+def gripper_joint(
+    model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.bool_]
+) -> int | None:
     """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
     if robot.gripper is None:
         return None
@@ -78,7 +95,8 @@ def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.b
     joint = find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
     if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
         raise RobotError(
-            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the arm's own"
+            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the"
+            " arm's own"
         )
     return joint
 
@@ -91,7 +109,11 @@ def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> N
     if gripper is None:
         return np.zeros(model.nbody, dtype=bool)
     body = model.jnt_bodyid[gripper]
-    while (parent := model.body_parentid[body]) and model.body_jntnum[parent] and parent not in model.jnt_bodyid[arm]:
+    while (
+        (parent := model.body_parentid[body])
+        and model.body_jntnum[parent]
+        and parent not in model.jnt_bodyid[arm]
+    ):
         body = parent
     return below(model, model.body_parentid[[body]])
 
@@ -101,7 +123,10 @@ def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.i
     joints = model.body_jntadr[bodies]
     for body, joint in zip(bodies, joints, strict=True):
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-            raise RobotError(f"scene.objects: body '{model.body(body).name}' has no free joint; give it <freejoint/>")
+            raise RobotError(
+                f"scene.objects: body '{model.body(body).name}' has no free joint; give it"
+                " <freejoint/>"
+            )
     return np.asarray(joints, dtype=int)
 
 
@@ -110,7 +135,9 @@ def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int
     for body in bodies:
         if model.body_mocapid[body] < 0:
             name = model.body(body).name
-            raise RobotError(f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'")
+            raise RobotError(
+                f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'"
+            )
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 
 

@@ -1,4 +1,5 @@
-"""Read an MJCF file and fit it to the servo level: torque motors, integrator, time step, tool, keyframe.
+"""Read an MJCF file and fit it to the servo level: torque motors, integrator, time step, tool,
+keyframe.
 
 The file is not trusted: every mistake is one `RobotError`, in bounded time and memory.
 """
@@ -18,7 +19,8 @@ from rack.levels.errors import RobotError
 from rack.levels.tables import GripperConfig, RobotConfig
 
 GRID_CELLS = 4_000_000
-"""Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x 20000 takes 10 s)."""
+"""Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
+20000 takes 10 s)."""
 MODEL_BYTES = 16_000_000
 """Size of one XML file, at most."""
 LONGEST_STEP_S = 0.1
@@ -31,8 +33,8 @@ SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 def load_spec(path: Path) -> mujoco.MjSpec:
     """Return the parsed, not yet compiled, MJCF file.
 
-    Raises `RobotError` for a file that is missing, malformed, too large, includes a file outside its own folder, holds
-    a NaN, or has an invalid time step.
+    Raises `RobotError` for a file that is missing, malformed, too large, includes a file outside
+    its own folder, holds a NaN, or has an invalid time step.
     """
     path = Path(path)
     screen(path, path.resolve().parent, set())
@@ -42,7 +44,10 @@ def load_spec(path: Path) -> mujoco.MjSpec:
         raise RobotError(f"model '{path}': {one_line(problem)}") from None
     step = float(spec.option.timestep)
     if not 0 < step <= LONGEST_STEP_S:
-        raise RobotError(f"model '{path}': timestep {step:g} s is not valid; above 0, at most {LONGEST_STEP_S:g} s")
+        raise RobotError(
+            f"model '{path}': timestep {step:g} s is not valid; above 0, at most"
+            f" {LONGEST_STEP_S:g} s"
+        )
     return spec
 
 
@@ -55,7 +60,8 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
-    """Raise `RobotError` for a list of the wrong length, and for a joint that is missing, not scalar or named twice."""
+    """Raise `RobotError` for a list of the wrong length, and for a joint that is missing, not
+    scalar or named twice."""
     wanted = len(robot.joints)
     for name in ("home", "velocity", "acceleration", "jerk", "torque", "position"):
         values = getattr(robot, name)
@@ -64,7 +70,8 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
     for name, given in robot.sensors:
         if isinstance(given, tuple) and len(given) != wanted:
             raise RobotError(
-                f"robot.sensors.{name}: {len(given)} values; one for all joints, or one per joint: {wanted}"
+                f"robot.sensors.{name}: {len(given)} values; one for all joints, or one per joint:"
+                f" {wanted}"
             )
     for name in robot.joints:
         joint = spec.joint(name)
@@ -75,16 +82,20 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
             kind = joint.type.name.removeprefix("mjJNT_").lower()
             raise RobotError(f"robot.joints: '{name}' is a {kind} joint; valid: hinge, slide")
         if robot.joints.count(name) > 1:
-            raise RobotError(f"robot.joints: '{name}' is named {robot.joints.count(name)} times; once is valid")
+            raise RobotError(
+                f"robot.joints: '{name}' is named {robot.joints.count(name)} times; once is valid"
+            )
 
 
 def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
-    """Set what the servo level needs in any model: integrator, time step, drive inertia, tool, gripper, keyframe."""
+    """Set what the servo level needs in any model: integrator, time step, drive inertia, tool,
+    gripper, keyframe."""
     option = spec.option
     option.timestep = clock_ns * 1e-9 / robot.substeps
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    # A reset to t = 0 would hide a broken state; a sleeping body keeps state outside mjSTATE_INTEGRATION.
+    # A reset to t = 0 would hide a broken state; a sleeping body keeps state outside
+    # mjSTATE_INTEGRATION.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     for name in robot.joints:
@@ -101,37 +112,48 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
 
 
 def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], NDArray[np.float64]]:
-    """Replace the drives of the arm's joints in `spec`; return the motors' names and torque limits (joints,), N m.
+    """Replace the drives of the arm's joints in `spec`; return the motors' names and torque limits
+    (joints,), N m.
 
-    A limit comes from `robot.torque`, else it is the tightest of the joint's actuatorfrcrange and the ranges of its
-    actuators. Raises `RobotError` when neither has one.
+    A limit comes from `robot.torque`, else it is the tightest of the joint's actuatorfrcrange and
+    the ranges of its actuators. Raises `RobotError` when neither has one.
     """
     drives = [a for a in spec.actuators if drives_arm(spec, a, robot)]
-    limits = np.array([torque_limit(spec, name, k, robot, drives) for k, name in enumerate(robot.joints)])
+    limits = np.array(
+        [torque_limit(spec, name, k, robot, drives) for k, name in enumerate(robot.joints)]
+    )
     remove(spec, drives)
     names = [f"torque of {joint}" for joint in robot.joints]
     for name, joint, limit in zip(names, robot.joints, limits, strict=True):
         drive = spec.joint(joint)
         drive.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        # With actgravcomp the motor would carry a torque that nobody commanded; a passive force is in the model's bias.
+        # With actgravcomp the motor would carry a torque that nobody commanded; a passive force is
+        # in the model's bias.
         drive.actgravcomp = False
         add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, joint, limit)
     return names, limits
 
 
 def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
-    """Make the gripper's actuator a force motor on the joint or tendon that it drives, limited to `gripper.force`.
+    """Make the gripper's actuator a force motor on the joint or tendon that it drives, limited to
+    `gripper.force`.
 
-    Raises `RobotError` when the model has no such actuator, or it drives neither a joint nor a tendon.
+    Raises `RobotError` when the model has no such actuator, or it drives neither a joint nor a
+    tendon.
     """
     old = spec.actuator(gripper.actuator)
     if old is None:
         have = listed([a.name for a in spec.actuators])
-        raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; actuators: {have}")
+        raise RobotError(
+            f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; actuators: {have}"
+        )
     kind = old.trntype
     target = old.target
     if kind not in (*JOINT_DRIVES, mujoco.mjtTrn.mjTRN_TENDON):
-        raise RobotError(f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; valid: on a joint or tendon")
+        raise RobotError(
+            f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; valid: on a joint or"
+            " tendon"
+        )
     remove(spec, [old])
     add_motor(spec, gripper.actuator, kind, target, gripper.force)
 
@@ -140,14 +162,22 @@ def drives_arm(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotCo
     """Say whether an actuator drives a joint of the arm, by itself or through a fixed tendon."""
     if actuator.trntype in JOINT_DRIVES:
         return actuator.target in robot.joints
-    tendon = spec.tendon(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON else None
+    tendon = (
+        spec.tendon(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON else None
+    )
     if tendon is None:
         return False
-    return any(w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target.name in robot.joints for w in tendon.path)
+    return any(
+        w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target.name in robot.joints for w in tendon.path
+    )
 
 
 def torque_limit(
-    spec: mujoco.MjSpec, joint: str, index: int, robot: RobotConfig, drives: list[mujoco.MjsActuator]
+    spec: mujoco.MjSpec,
+    joint: str,
+    index: int,
+    robot: RobotConfig,
+    drives: list[mujoco.MjsActuator],
 ) -> float:
     """Return the torque limit of one joint, N m. Raises `RobotError` when there is none."""
     if robot.torque is not None:
@@ -157,7 +187,10 @@ def torque_limit(
     found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
     limit = min((x for x in found if x > 0), default=0.0)
     if not (limit > 0 and np.isfinite(limit)):
-        raise RobotError(f"joint '{joint}': the model gives no torque limit; give robot.torque, N m, one value a joint")
+        raise RobotError(
+            f"joint '{joint}': the model gives no torque limit; give robot.torque, N m, one value a"
+            " joint"
+        )
     return limit
 
 
@@ -165,9 +198,14 @@ def drive_limit(actuator: mujoco.MjsActuator) -> float:
     """Return the torque limit that an actuator on a joint implies, N m; 0: none."""
     gear = abs(float(actuator.gear[0]))
     limits = [reach(actuator.forcelimited, actuator.forcerange) * gear]
-    direct = actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
+    direct = (
+        actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
+        and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
+    )
     if direct and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED:
-        limits.append(reach(actuator.ctrllimited, actuator.ctrlrange) * abs(float(actuator.gainprm[0])) * gear)
+        limits.append(
+            reach(actuator.ctrllimited, actuator.ctrlrange) * abs(float(actuator.gainprm[0])) * gear
+        )
     return min((x for x in limits if x > 0), default=0.0)
 
 
@@ -178,7 +216,9 @@ def reach(limited: mujoco.mjtLimited, span: NDArray[np.float64]) -> float:
     return max(0.0, min(-float(span[0]), float(span[1])))
 
 
-def add_motor(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, target: str, limit: float) -> None:
+def add_motor(
+    spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, target: str, limit: float
+) -> None:
     """Add a motor of gear 1 whose control is its force, N or N m, within `limit` both ways."""
     motor = spec.add_actuator(name=name, trntype=kind, target=target)
     motor.set_to_motor()
@@ -201,7 +241,9 @@ def screen(path: Path, folder: Path, seen: set[Path]) -> None:
     if not path.is_file():
         raise RobotError(f"model '{path}': no such file")
     if path.stat().st_size > MODEL_BYTES:
-        raise RobotError(f"model '{path}': {path.stat().st_size} bytes; at most {MODEL_BYTES} are read")
+        raise RobotError(
+            f"model '{path}': {path.stat().st_size} bytes; at most {MODEL_BYTES} are read"
+        )
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, ValueError) as problem:
@@ -213,7 +255,9 @@ def screen(path: Path, folder: Path, seen: set[Path]) -> None:
         if element.tag == "include":
             included = (folder / element.get("file", "")).resolve()
             if not included.is_relative_to(folder):
-                raise RobotError(f"model '{path}': include '{element.get('file')}' leaves the model's folder")
+                raise RobotError(
+                    f"model '{path}': include '{element.get('file')}' leaves the model's folder"
+                )
             if included not in seen:
                 screen(included, folder, seen)
 
@@ -224,9 +268,14 @@ def mistakes(element: ElementTree.Element) -> Iterator[str]:
         if name != "name" and "nan" in value.lower() and any(math.isnan(x) for x in numbers(value)):
             yield f"<{element.tag}> '{element.get('name', '')}': {name} = '{value}' is not a number"
     for first, second in GRIDS:
-        cells = math.prod(max(numbers(element.get(key, "0")), default=0.0) for key in (first, second))
+        cells = math.prod(
+            max(numbers(element.get(key, "0")), default=0.0) for key in (first, second)
+        )
         if cells > GRID_CELLS:
-            yield f"<{element.tag}> '{element.get('name', '')}': {first} x {second} = {cells:g}; at most {GRID_CELLS}"
+            yield (
+                f"<{element.tag}> '{element.get('name', '')}': {first} x {second} = {cells:g}; at"
+                f" most {GRID_CELLS}"
+            )
 
 
 def numbers(text: str) -> list[float]:

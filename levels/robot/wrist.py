@@ -1,4 +1,5 @@
-"""The wrist sensor of an arm, as the model describes it: where it is, its range, and the limits on contact."""
+"""The wrist sensor of an arm, as the model describes it: where it is, its range, and the limits on
+contact."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ UNITS = {"force": "N", "torque": "N m"}
 
 
 class Wrist(NamedTuple):
-    """A force/torque sensor at a site. Forces are N, torques N m; of two values the first is the force's."""
+    """A force/torque sensor at a site. Forces are N, torques N m; of two values the first is the
+    force's."""
 
     site: int
     addresses: NDArray[np.int_]  # (6,), of its numbers in sensordata
@@ -26,8 +28,11 @@ class Wrist(NamedTuple):
     noise: tuple[float, float]  # standard deviation of a component
 
 
-def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: NDArray[np.bool_]) -> Wrist | None:
-    """Return the sensor on one of the bodies `moved` (nbody,) by the arm; None: there is none. Raises `RobotError`."""
+def find_wrist(
+    model: mujoco.MjModel, config: WristConfig | None, moved: NDArray[np.bool_]
+) -> Wrist | None:
+    """Return the sensor on one of the bodies `moved` (nbody,) by the arm; None: there is none.
+    Raises `RobotError`."""
     if config is None:
         return None
     names = {"force": config.force, "torque": config.torque}
@@ -35,18 +40,25 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: NDArray
     force, torque = (int(model.sensor_objid[sensor]) for sensor in sensors.values())
     if force != torque:
         sites = f"'{model.site(force).name}' and '{model.site(torque).name}'"
-        raise RobotError(f"robot.wrist: force and torque are sensed at two sites, {sites}; one is valid")
+        raise RobotError(
+            f"robot.wrist: force and torque are sensed at two sites, {sites}; one is valid"
+        )
     if not moved[model.site_bodyid[force]]:
-        raise RobotError(f"robot.wrist: site '{model.site(force).name}' is on a body that the arm does not move")
+        raise RobotError(
+            f"robot.wrist: site '{model.site(force).name}' is on a body that the arm does not move"
+        )
     most = {"force": config.most_force, "torque": config.most_torque}
     for key, sensor in sensors.items():
         reach = float(model.sensor_cutoff[sensor])
         unit = UNITS[key]
         if not reach > 0.0:
-            raise RobotError(f"robot.wrist.{key}: sensor '{names[key]}' has no range; give it a cutoff, {unit}")
+            raise RobotError(
+                f"robot.wrist.{key}: sensor '{names[key]}' has no range; give it a cutoff, {unit}"
+            )
         if most[key] > reach:
             raise RobotError(
-                f"robot.wrist.most_{key}: {most[key]:g} {unit} is beyond the sensor's range; at most {reach:g} is valid"
+                f"robot.wrist.most_{key}: {most[key]:g} {unit} is beyond the sensor's range; at"
+                f" most {reach:g} is valid"
             )
     first = model.sensor_adr[list(sensors.values())]
     ranges = model.sensor_cutoff[list(sensors.values())]
@@ -64,6 +76,10 @@ def _sensor(model: mujoco.MjModel, key: str, name: str) -> int:
     found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if found >= 0 and model.sensor_type[found] == KINDS[key]:
         return int(found)
-    have = listed([model.sensor(k).name for k in range(model.nsensor) if model.sensor_type[k] == KINDS[key]])
-    why = f"sensor '{name}' is no {key} sensor" if found >= 0 else f"no sensor '{name}' in the model"
+    have = listed(
+        [model.sensor(k).name for k in range(model.nsensor) if model.sensor_type[k] == KINDS[key]]
+    )
+    why = (
+        f"sensor '{name}' is no {key} sensor" if found >= 0 else f"no sensor '{name}' in the model"
+    )
     raise RobotError(f"robot.wrist.{key}: {why}; it has these {key} sensors: {have}")

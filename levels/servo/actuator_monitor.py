@@ -16,17 +16,21 @@ from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 NOISE_PART = 0.005
-"""Part of a torque limit that the equation of motion may leave unexplained: ten times that of faultless runs."""
+"""Part of a torque limit that the equation of motion may leave unexplained: ten times that of
+faultless runs."""
 LACKING_PART = 0.02
 """Part of its torque limit that a motor must lack to be at fault."""
 SURE_CYCLES = 4
-"""Cycles needed to distinguish a motor whose torque does not rise with its command from a load on the arm."""
+"""Cycles needed to distinguish a motor whose torque does not rise with its command from a load on
+the arm."""
 RISE_PART = 0.3
 """Least part of a rise in torque that a sound motor gives."""
 DEAD_PART = 0.5
-"""Part of its torque that a motor must lack to count as dead where dry friction hides its torque."""
+"""Part of its torque that a motor must lack to count as dead where dry friction hides its
+torque."""
 URGENT_SPEED_PART = 0.99
-"""Part of a velocity limit: if a joint may reach it while motors lack torque, there is no time to be certain."""
+"""Part of a velocity limit: if a joint may reach it while motors lack torque, there is no time to
+be certain."""
 TURNING = 2.0
 """Speed, in `FRICTION_SPEED`, up to which dry friction may be anything up to its full value."""
 
@@ -34,16 +38,18 @@ TURNING = 2.0
 EXPLAINED = 0
 LEFT_OVER = 1
 ASTRAY = 2
-"""Verdicts on a cycle: nothing, or some torque, is left unexplained; a joint has strayed from its set points."""
+"""Verdicts on a cycle: nothing, or some torque, is left unexplained; a joint has strayed from its
+set points."""
 
 
 class ActuatorMonitor:
     """Compares the torques that a motion took with the torques commanded for it.
 
-    A difference comes from motors that gave less than commanded, or from an external push: in that case, until the
-    difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has failed. For a cycle or two, a pulling
-    load looks like a motor that lacks torque; but under load, a motor commanded more gives more. A motor has also
-    failed when the arm strays from its set points by more than `following`, rad.
+    A difference comes from motors that gave less than commanded, or from an external push: in that
+    case, until the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has
+    failed. For a cycle or two, a pulling load looks like a motor that lacks torque; but under load,
+    a motor commanded more gives more. A motor has also failed when the arm strays from its set
+    points by more than `following`, rad.
     """
 
     def __init__(self, cell: Cell, following: float, period_s: float) -> None:
@@ -57,8 +63,8 @@ class ActuatorMonitor:
         self.torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
         self._left, self._noise, *self._friction, self._velocity = self._table[8:13]
         self._dry[:] = model.dof_frictionloss[dof]
-        # Simulated friction slows a joint as a damper of that time constant does: if the joint brakes harder, the
-        # friction changes sign before the velocity does.
+        # Simulated friction slows a joint as a damper of that time constant does: if the joint
+        # brakes harder, the friction changes sign before the velocity does.
         early[:] = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
         least[:] = NOISE_PART * self._limits
         # The change in velocity that the encoders' errors may simulate.
@@ -67,8 +73,13 @@ class ActuatorMonitor:
         self._judge = partial(left_over.load(), self._table, 0.5 / period_s, following)
         self._begun = False
         self._pushed = False  # weak motors do not explain the difference
-        self._cycles, self._joint = 0, -1  # cycles for which a motor has lacked torque, and its joint
-        self._commanded = self._given = self._most = 0.0  # N m: commanded and given at first, most given since
+        self._cycles, self._joint = (
+            0,
+            -1,
+        )  # cycles for which a motor has lacked torque, and its joint
+        self._commanded = self._given = self._most = (
+            0.0  # N m: commanded and given at first, most given since
+        )
         self._alone = True  # it is the only motor that lacks torque
 
     def begin(self) -> None:
@@ -81,10 +92,12 @@ class ActuatorMonitor:
         self._cycles = 0
 
     def look(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
-        """Judge the cycle that ends now, at a state, rad and rad/s, where the set points are at `wanted`, rad.
+        """Judge the cycle that ends now, at a state, rad and rad/s, where the set points are at
+        `wanted`, rad.
 
-        `wanted` and `state` begin with a row of positions, (joints,); then follow velocities. `holds`: the gripper
-        holds a part, which may touch something. Velocity and terms are kept for the cycle that may begin.
+        `wanted` and `state` begin with a row of positions, (joints,); then follow velocities.
+        `holds`: the gripper holds a part, which may touch something. Velocity and terms are kept
+        for the cycle that may begin.
         """
         verdict = self._judge(wanted, state, terms.inertia, terms.bias)
         if not self._begun:
@@ -100,7 +113,8 @@ class ActuatorMonitor:
         return self._lacking(self._left, state[1], holds)
 
     def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
-        """Follow cycles in which motors that lack torque explain the difference, until it is certain."""
+        """Follow cycles in which motors that lack torque explain the difference, until it is
+        certain."""
         commanded = np.abs(self.torque)
         lacks = left * np.sign(self.torque)
         explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
@@ -109,10 +123,23 @@ class ActuatorMonitor:
             self._cycles = 0
         share = np.where(explained, lacks / self._limits, 0.0)
         # While a joint turns, its dry friction is known, and any push shows.
-        rests = np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise) < MIN_TURNING_JOINTS
-        part = MAX_CONTACT_PART if self._pushed else MAX_RESTING_CONTACT_PART if rests and holds else LACKING_PART
+        rests = (
+            np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise)
+            < MIN_TURNING_JOINTS
+        )
+        part = (
+            MAX_CONTACT_PART
+            if self._pushed
+            else MAX_RESTING_CONTACT_PART
+            if rests and holds
+            else LACKING_PART
+        )
         least = np.maximum(part, self._noise / self._limits)
-        joint = self._joint if self._cycles and share[self._joint] > least[self._joint] else int(share.argmax())
+        joint = (
+            self._joint
+            if self._cycles and share[self._joint] > least[self._joint]
+            else int(share.argmax())
+        )
         if share[joint] <= least[joint]:
             self._cycles = 0
             return None
@@ -135,8 +162,8 @@ class ActuatorMonitor:
     def _sure(self, joint: int, commanded: float, lacks: float) -> bool:
         """Return whether it is certain that the motor has failed.
 
-        It gives nothing, or no more when commanded more, or it lacks more than a push may take. Dry friction that
-        changes sign may look like torque of a dead motor, up to twice its value.
+        It gives nothing, or no more when commanded more, or it lacks more than a push may take. Dry
+        friction that changes sign may look like torque of a dead motor, up to twice its value.
         """
         if self._cycles < SURE_CYCLES:
             return False
@@ -159,11 +186,19 @@ def left_over(
     inertia: Array,  # (joints, joints), kg m2: now
     bias: Array,  # (joints,), N m: now
 ) -> int:
-    """Compare the torques that a motion took with those commanded; keep the present state for the next cycle."""
-    velocity_before, bias_before, torque = table[0], table[1], table[2]  # rad/s, N m, N m: at the cycle's beginning
+    """Compare the torques that a motion took with those commanded; keep the present state for the
+    next cycle."""
+    velocity_before, bias_before, torque = (
+        table[0],
+        table[1],
+        table[2],
+    )  # rad/s, N m, N m: at the cycle's beginning
     inertia_before = table[13:]  # kg m2
     dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s
-    noise, uncertain = table[5], table[6]  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
+    noise, uncertain = (
+        table[5],
+        table[6],
+    )  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
     off = table[7]  # rad: error of the positions
     position = state[0]
     velocity = state[1]
@@ -172,7 +207,9 @@ def left_over(
         left = torque[j] - 0.5 * (bias_before[j] + bias[j])
         unsure = noise[j]
         for k in range(len(velocity)):
-            left -= (inertia_before[j, k] + inertia[j, k]) * (half_rate * (velocity[k] - velocity_before[k]))
+            left -= (inertia_before[j, k] + inertia[j, k]) * (
+                half_rate * (velocity[k] - velocity_before[k])
+            )
             unsure += abs(inertia[j, k]) * uncertain[k]
         ahead = velocity[j] + early[j] * (half_rate * (velocity[j] - velocity_before[j]))
         slowest = min(ahead, velocity_before[j])
@@ -197,4 +234,6 @@ def left_over(
 def preload() -> None:
     """Load this module's compiled functions."""
     square = np.zeros((1, 1))
-    left_over.load()(np.zeros((14, 1)), 1.0, 1.0, np.zeros((3, 1)), np.zeros((2, 1)), square, np.zeros(1))
+    left_over.load()(
+        np.zeros((14, 1)), 1.0, 1.0, np.zeros((3, 1)), np.zeros((2, 1)), square, np.zeros(1)
+    )

@@ -1,4 +1,5 @@
-"""Control modifications for any arm: a dead zone before the law, PD control in its place, a notch after it."""
+"""Control modifications for any arm: a dead zone before the law, PD control in its place, a notch
+after it."""
 
 from __future__ import annotations
 
@@ -16,11 +17,14 @@ from rack.levels.tables import Positive, Table, read_params
 class DeadZoneParams(Table):
     """Parameters of `DeadZone`."""
 
-    width: Positive = Field(description="position error up to which a joint counts as at its set point, rad")
+    width: Positive = Field(
+        description="position error up to which a joint counts as at its set point, rad"
+    )
 
 
 class DeadZone(Modification):
-    """Hides small position errors from the law, and reduces larger ones by as much: sticking joints do not hunt."""
+    """Hides small position errors from the law, and reduces larger ones by as much: sticking joints
+    do not hunt."""
 
     hook = Hook.BEFORE
     params = DeadZoneParams
@@ -38,13 +42,19 @@ class DeadZone(Modification):
 class JointPdParams(Table):
     """Parameters of `JointPd`."""
 
-    bandwidth: Positive = Field(40.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
+    bandwidth: Positive = Field(
+        40.0, le=400.0, description="natural frequency of the error in every joint, rad/s"
+    )
     damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
-    load: bool = Field(True, description="add the torque of gravity and motion; without it joints sag under their load")
+    load: bool = Field(
+        True,
+        description="add the torque of gravity and motion; without it joints sag under their load",
+    )
 
 
 class JointPd(Modification):
-    """Controls every joint by itself: PD on its error, without acceleration, coupling or friction."""
+    """Controls every joint by itself: PD on its error, without acceleration, coupling or
+    friction."""
 
     hook = Hook.INSTEAD
     params = JointPdParams
@@ -67,7 +77,9 @@ class JointPd(Modification):
 class NotchParams(Table):
     """Parameters of `Notch`."""
 
-    frequency: Positive = Field(description="frequency that is removed from the torque, Hz; below half the law's rate")
+    frequency: Positive = Field(
+        description="frequency that is removed from the torque, Hz; below half the law's rate"
+    )
     quality: Positive = Field(1.0, le=100.0, description="frequency over the width of the notch")
 
 
@@ -84,15 +96,20 @@ class Notch(Modification):
         half_hz = 0.5 / context.period_s
         if params.frequency >= half_hz:
             raise LevelError(
-                f"params.frequency = {params.frequency:g} Hz: permitted: below half the law's rate, {half_hz:g} Hz"
+                f"params.frequency = {params.frequency:g} Hz: permitted: below half the law's rate,"
+                f" {half_hz:g} Hz"
             )
         angle = 2.0 * math.pi * params.frequency * context.period_s
         cosine = math.cos(angle)
         alpha = math.sin(angle) / (2.0 * params.quality)
         self._feed = np.array([1.0, -2.0 * cosine, 1.0]) / (1.0 + alpha)
         self._back = np.array([-2.0 * cosine, 1.0 - alpha]) / (1.0 + alpha)
-        self._given: Array = np.zeros((2, len(context.joints)))  # N m: the last two torques of the law, newest first
-        self._made: Array = np.zeros((2, len(context.joints)))  # N m: likewise, without the frequency
+        self._given: Array = np.zeros(
+            (2, len(context.joints))
+        )  # N m: the last two torques of the law, newest first
+        self._made: Array = np.zeros(
+            (2, len(context.joints))
+        )  # N m: likewise, without the frequency
 
     def begin(self, sample: LawSample) -> None:
         """Start as if the torque had always been the present one."""

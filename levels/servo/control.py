@@ -1,4 +1,5 @@
-"""The servo level's loops: computed torque for the joints, a position loop with limited force for the gripper."""
+"""The servo level's loops: computed torque for the joints, a position loop with limited force for
+the gripper."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ Reacting = Literal["hold", "stop", "brake"]
 class LoopGains(Table):
     """Gains of the joint loop."""
 
-    bandwidth: Positive = Field(60.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
+    bandwidth: Positive = Field(
+        60.0, le=400.0, description="natural frequency of the error in every joint, rad/s"
+    )
     damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
 
 
@@ -33,21 +36,37 @@ class ArmParams(Table):
     """The arm that a board drives, and its reactions to faults of sensors and motors."""
 
     following: Positive = Field(
-        0.02, description="distance of a joint from its set point at which a motor counts as failed, rad"
+        0.02,
+        description="distance of a joint from its set point at which a motor counts as failed, rad",
     )
     on_sensor_fault: Reacting = Field(
-        "brake", description="ramp to rest and hold, or ramp and brake, or brake; without known velocities always brake"
+        "brake",
+        description=(
+            "ramp to rest and hold, or ramp and brake, or brake; without known velocities always"
+            " brake"
+        ),
     )
-    on_actuator_fault: Reacting = Field("brake", description="ramp to rest and hold, or ramp and brake, or brake")
-    good_cycles: int = Field(20, ge=1, le=10_000, description="good cycles in a row after which a fault is over")
+    on_actuator_fault: Reacting = Field(
+        "brake", description="ramp to rest and hold, or ramp and brake, or brake"
+    )
+    good_cycles: int = Field(
+        20, ge=1, le=10_000, description="good cycles in a row after which a fault is over"
+    )
     retry: Positive = Field(
-        0.5, description="time after which a motor that gave too little is retried, or a struck arm resumes, s"
+        0.5,
+        description=(
+            "time after which a motor that gave too little is retried, or a struck arm resumes, s"
+        ),
     )
     patience: Positive = Field(
-        5.0, description="time for which faults may keep the arm from its set points before they are latched, s"
+        5.0,
+        description=(
+            "time for which faults may keep the arm from its set points before they are latched, s"
+        ),
     )
     arm: str = Field(
-        "rack.levels.arm:SimulatedArm", description="class of the arm, package.module:Class; see rack.levels.arm.Arm"
+        "rack.levels.arm:SimulatedArm",
+        description="class of the arm, package.module:Class; see rack.levels.arm.Arm",
     )
 
     @field_validator("arm")
@@ -58,13 +77,16 @@ class ArmParams(Table):
 
 
 class ServoParams(ModifiableParams, ArmParams, LoopGains):
-    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of sensors and motors."""
+    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of
+    sensors and motors."""
 
 
 class ComputedTorque:
-    """torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction; M is the planner's.
+    """torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction;
+    M is the planner's.
 
-    Every joint's error is that of a damped oscillator in every state of the arm. Torques stay within their limits.
+    Every joint's error is that of a damped oscillator in every state of the arm. Torques stay
+    within their limits.
     """
 
     def __init__(self, cell: Cell, params: ServoParams, dynamics: Dynamics) -> None:
@@ -87,11 +109,13 @@ class ComputedTorque:
         self._inertia = plan.inertia.copy()
 
     def terms(self, position: Array, velocity: Array) -> Terms:
-        """Return the equation of motion at rad, rad/s, with the held object. Valid until the next call."""
+        """Return the equation of motion at rad, rad/s, with the held object. Valid until the next
+        call."""
         return self._dynamics.terms(position, velocity, self._payload)
 
     def torque(self, wanted: Motion, state: Array, terms: Terms) -> Array:
-        """Return the torques, (joints,), N m, for the wanted motion at `state`, rad, rad/s. Valid until the next call.
+        """Return the torques, (joints,), N m, for the wanted motion at `state`, rad, rad/s. Valid
+        until the next call.
 
         The rows of `state` are positions and velocities, (2, joints).
         """
@@ -110,7 +134,12 @@ def set_torque(
     bias: Array,  # (joints,), N m
 ) -> bool:
     """Set the torques of `ComputedTorque`; return whether a limit cut one."""
-    stiffness, damping, dry, limits = table[0], table[1], table[2], table[3]  # 1/s2, 1/s, N m (friction), N m
+    stiffness, damping, dry, limits = (
+        table[0],
+        table[1],
+        table[2],
+        table[3],
+    )  # 1/s2, 1/s, N m (friction), N m
     torque = table[4]  # N m: set
     cut = False
     for j in range(len(torque)):
@@ -128,7 +157,8 @@ def set_torque(
 
 
 class Grip:
-    """The gripper's force, N: a spring and damper to the commanded opening, limited to the commanded force.
+    """The gripper's force, N: a spring and damper to the commanded opening, limited to the
+    commanded force.
 
     Before the first set point the gripper opens or, after `keep`, keeps its force.
     """
@@ -143,7 +173,8 @@ class Grip:
         self._kept: float | None = None
 
     def keep(self, force: float) -> None:
-        """Keep `force`, N, until the first set point: the grip on an object must survive a restart of the board."""
+        """Keep `force`, N, until the first set point: the grip on an object must survive a restart
+        of the board."""
         self._kept = force
 
     def take(self, command: Message) -> None:

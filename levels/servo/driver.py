@@ -1,4 +1,5 @@
-"""The part of a level that drives an arm, whatever it drives it to: sense, decide, drive or brake, report."""
+"""The part of a level that drives an arm, whatever it drives it to: sense, decide, drive or brake,
+report."""
 
 from __future__ import annotations
 
@@ -50,11 +51,12 @@ class SteadyStatus(NamedTuple):
 
 
 class ArmDriver(Executor):
-    """Drives an arm and advances its time; subclasses give the motion wanted, and the torques for it.
+    """Drives an arm and advances its time; subclasses give the motion wanted, and the torques for
+    it.
 
-    A cycle first advances the arm by the ticks since the last one: its time is the clock's, even if cycles were missed.
-    Safety comes first: on a demand, and while sensors or motors are at fault, the arm holds, stops or is braked;
-    afterwards motion resumes from where it is.
+    A cycle first advances the arm by the ticks since the last one: its time is the clock's, even if
+    cycles were missed. Safety comes first: on a demand, and while sensors or motors are at fault,
+    the arm holds, stops or is braked; afterwards motion resumes from where it is.
 
     A subclass reads its last state as "before", and writes "status", "state" and "scene".
     """
@@ -67,22 +69,32 @@ class ArmDriver(Executor):
         super().__init__(context)
         every = context.every
         self.cell = cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self.arm: Arm = find_arm(params.arm)(cell, context.scene, context.clock_ns, every, context.seed)
+        self.arm: Arm = find_arm(params.arm)(
+            cell, context.scene, context.clock_ns, every, context.seed
+        )
         self._faulty = FaultyLink(self.arm, cell, every, self.acted)
-        self._link: Link = self.arm  # the path to the arm; through `_faulty` while faults are injected
+        self._link: Link = (
+            self.arm
+        )  # the path to the arm; through `_faulty` while faults are injected
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
         self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
         self._brakes = BrakeLog(self.arm, every)
-        self._wanted = np.zeros((2, len(cell.home)))  # the motion wanted in the last cycle begins with: rad, rad/s
+        self._wanted = np.zeros(
+            (2, len(cell.home))
+        )  # the motion wanted in the last cycle begins with: rad, rad/s
         self._wanted[0] = cell.home
-        self._numbers: tuple[Array, Array, Array] | None = None  # set in every cycle: the first arguments of `show`
+        self._numbers: tuple[Array, Array, Array] | None = (
+            None  # set in every cycle: the first arguments of `show`
+        )
         self._show_numbers = show.load()
         self._shown: SteadyStatus | None = None  # in the last status
         self._started = False  # the first cycle has begun
         self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
-        self.command = self.rests_on = 0  # serials of the newest command, and of the operator's that it rests on
+        self.command = self.rests_on = (
+            0  # serials of the newest command, and of the operator's that it rests on
+        )
 
     @classmethod
     def preload(cls) -> None:
@@ -99,7 +111,11 @@ class ArmDriver(Executor):
     ) -> Iterable[tuple[str, Any, str]]:
         """Yield a hand, whose tendons have a board of another kind."""
         if context.robot.hand is not None:
-            yield "executor", cls.__name__, "it drives an arm with motors; [robot.hand] is a hand of tendons"
+            yield (
+                "executor",
+                cls.__name__,
+                "it drives an arm with motors; [robot.hand] is a hand of tendons",
+            )
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
@@ -112,7 +128,8 @@ class ArmDriver(Executor):
 
     @abstractmethod
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
-        """Return the motion wanted in this cycle; None: there is none, brake. `missed`: cycles before it were missed.
+        """Return the motion wanted in this cycle; None: there is none, brake. `missed`: cycles
+        before it were missed.
 
         After braking (`abandoned`) it begins where the arm is; with a reaction it comes to rest.
         """
@@ -136,7 +153,8 @@ class ArmDriver(Executor):
 
     @property
     def has_work(self) -> bool:
-        """Whether the level has work from which it can be kept. Default: once there was a command."""
+        """Whether the level has work from which it can be kept. Default: once there was a
+        command."""
         return self.command > 0
 
     @property
@@ -145,10 +163,12 @@ class ArmDriver(Executor):
         return ""
 
     def feel(self, tick: int) -> None:
-        """Sense more than the joints, before it is decided whether the arm stops. Default: nothing."""
+        """Sense more than the joints, before it is decided whether the arm stops. Default:
+        nothing."""
 
     def started(self) -> None:
-        """React to the start of a board whose arm was restored from its last state. Default: nothing."""
+        """React to the start of a board whose arm was restored from its last state. Default:
+        nothing."""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
@@ -157,7 +177,9 @@ class ArmDriver(Executor):
         sensed = self._link.sense()
         sensors = self.sensors
         contact = self.arm.contact
-        sensors.look(sensed, tick, None if missed or self.abandoned else self._wanted, contact is not None)
+        sensors.look(
+            sensed, tick, None if missed or self.abandoned else self._wanted, contact is not None
+        )
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
         self.feel(tick)
@@ -168,7 +190,9 @@ class ArmDriver(Executor):
             self._drive(sensed, reaction, missed, tick)
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
-        self._brakes.after_cycle(tick, self.findings, BY_DEMAND if self.demand else self.stopping.cause)
+        self._brakes.after_cycle(
+            tick, self.findings, BY_DEMAND if self.demand else self.stopping.cause
+        )
         self._report(write, sensed, reaction)
         self.orders.report(write.status, self.rests_on)
         self.arm.save(write.state)
@@ -177,7 +201,8 @@ class ArmDriver(Executor):
             self.arm.look(write.scene)
 
     def _catch_up(self, before: Reading, tick: int) -> bool:
-        """Advance the arm to `tick`; return whether cycles were missed. A restarted board first restores the arm."""
+        """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
+        restores the arm."""
         if not self._started:
             self._start(before.value if before.is_there else None, tick)
             return False
@@ -209,7 +234,8 @@ class ArmDriver(Executor):
         self.abandoned = True
 
     def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
-        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is complete."""
+        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is
+        complete."""
         wanted = self.next_motion(reaction, missed, tick)
         if wanted is None:
             return self.brake()
@@ -239,7 +265,8 @@ class ArmDriver(Executor):
         self.brake()
 
     def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
-        """Fill the status, and the estimate in the state; the steady fields only when they change."""
+        """Fill the status, and the estimate in the state; the steady fields only when they
+        change."""
         arm = self.arm
         status = write.status
         if self._numbers is None:
@@ -248,7 +275,13 @@ class ArmDriver(Executor):
             self._numbers = moving, kept, self.motors.torque
         _, _, opening, opening_velocity, _ = sensed
         self._show_numbers(
-            *self._numbers, self.sensors.estimate, self._wanted, arm.torque, opening, opening_velocity, arm.grip_force
+            *self._numbers,
+            self.sensors.estimate,
+            self._wanted,
+            arm.torque,
+            opening,
+            opening_velocity,
+            arm.grip_force,
         )
         shown = (
             *self.course(reaction),
@@ -289,13 +322,16 @@ class ArmDriver(Executor):
         else:
             resting = State.IDLE if shown.holding else State.EXECUTING
             status.state = State.HOLDING if kept and self.has_work else resting
-            status.error = Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
+            status.error = (
+                Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
+            )
             broken = self.arm.first_violation if shown.violations else self.arm.first_touch
             status.reason = kept or broken or shown.note
 
 
 def numbers(message: Message, first: str, last: str) -> Array:
-    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one array."""
+    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one
+    array."""
     fields = message.record.dtype.fields
     assert fields is not None
     begin = fields[first][1]
@@ -321,6 +357,9 @@ def show(
         for row in range(3):
             state[row * joints + j] = estimate[row, j]
         for row in range(2):
-            status[row * joints + j], status[(3 + row) * joints + j] = estimate[row, j], wanted[row, j]
+            status[row * joints + j], status[(3 + row) * joints + j] = (
+                estimate[row, j],
+                wanted[row, j],
+            )
         status[2 * joints + j] = begun[j] = torque[j]
     status[-3], status[-2], status[-1] = opening, opening_velocity, grip_force

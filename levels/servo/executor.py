@@ -27,7 +27,8 @@ from rack.levels.tables import read_params
 
 
 class ServoExecutor(ArmDriver):
-    """Follows joint set points with torques. Safety comes first, an operator's command second, the level above third.
+    """Follows joint set points with torques. Safety comes first, an operator's command second, the
+    level above third.
 
     See `ArmDriver`.
     """
@@ -51,7 +52,9 @@ class ServoExecutor(ArmDriver):
         self.given = params = read_params(self.params, context.params)
         super().__init__(context, params)
         cell = self.cell
-        self.reference = Reference(cell.bounds, cell.limits, context.tick_s)  # set points, interpolated
+        self.reference = Reference(
+            cell.bounds, cell.limits, context.tick_s
+        )  # set points, interpolated
         self._loop = ComputedTorque(cell, params, self.arm.dynamics)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         joints = context.robot.joints

@@ -1,14 +1,16 @@
 """Control modifications ("cmods"): a user's own function before, in place of, or after a servo law.
 
-A modification is a class in the user's own package, named in the parameters of a board with a servo law:
+A modification is a class in the user's own package, named in the parameters of a board with a servo
+law:
 
     [board.servo.params.modifications.friction]
     class = "my_package.my_module:Friction"
     on = false
     params = { torque = 2.0 }
 
-It is put in and taken out between two samples, by `on` at the start and by an operator's command at a tick. See
-`rack.levels.servo.modified_law` for the switch without a step, and for what happens to one that fails.
+It is put in and taken out between two samples, by `on` at the start and by an operator's command at
+a tick. See `rack.levels.servo.modified_law` for the switch without a step, and for what happens to
+one that fails.
 """
 
 from __future__ import annotations
@@ -48,9 +50,11 @@ class LawContext(NamedTuple):
 
 
 class LawSample:
-    """One sample of a servo law. Vectors are (joints,), of all joints of the arm; assigning to one fills it.
+    """One sample of a servo law. Vectors are (joints,), of all joints of the arm; assigning to one
+    fills it.
 
-    Joints that the board does not drive have values without a meaning; what becomes of them is ignored.
+    Joints that the board does not drive have values without a meaning; what becomes of them is
+    ignored.
     """
 
     __slots__ = (
@@ -69,16 +73,23 @@ class LawSample:
 
     def __init__(self, joints: int) -> None:
         self.tick = 0  # of the sample
-        self.seen: Array = np.zeros((5, joints))  # what the law sees: the next five, which are its rows
-        self.wanted_position, self.wanted_velocity, self.wanted_acceleration = self.seen[:3]  # rad, rad/s, rad/s2
+        self.seen: Array = np.zeros(
+            (5, joints)
+        )  # what the law sees: the next five, which are its rows
+        self.wanted_position, self.wanted_velocity, self.wanted_acceleration = self.seen[
+            :3
+        ]  # rad, rad/s, rad/s2
         self.position, self.velocity = self.seen[3:]  # rad, rad/s: sensed
         self.motion = Motion(self.seen[:3])
         self.inertia: Array = np.zeros(joints)  # kg m2: diagonal of the joint-space inertia
-        self.load: Array = np.zeros(joints)  # N m: torque of gravity and motion, without acceleration and dry friction
+        self.load: Array = np.zeros(
+            joints
+        )  # N m: torque of gravity and motion, without acceleration and dry friction
         self.torque: Array = np.zeros(joints)  # N m: the law's; NaN before it, and in its place
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Fill a vector in place: `sample.torque = 0.9 * sample.torque` changes what the law's caller sees."""
+        """Fill a vector in place: `sample.torque = 0.9 * sample.torque` changes what the law's
+        caller sees."""
         if isinstance(getattr(self, name, None), np.ndarray):
             getattr(self, name)[...] = value
         else:
@@ -103,21 +114,31 @@ class Modification(ABC):
     def modify(self, sample: LawSample) -> None:
         """Change one sample, in bounded time: what the law sees, or the torque, by the hook.
 
-        An exception, or a value that is not finite, undoes the change and takes the modification out.
+        An exception, or a value that is not finite, undoes the change and takes the modification
+        out.
         """
 
 
 class ModificationConfig(Table):
-    """`[board.<name>.params.modifications.<modification>]`: one modification of the board's servo law."""
+    """`[board.<name>.params.modifications.<modification>]`: one modification of the board's servo
+    law."""
 
-    cls: str = Field(alias="class", description="subclass of rack.levels.servo.Modification, package.module:Class")
+    cls: str = Field(
+        alias="class",
+        description="subclass of rack.levels.servo.Modification, package.module:Class",
+    )
     on: bool = Field(False, description="put in from the start")
-    params: dict[str, Any] = Field({}, description="parameters of the modification, declared by its class")
+    params: dict[str, Any] = Field(
+        {}, description="parameters of the modification, declared by its class"
+    )
 
     @field_validator("cls")
     @classmethod
     def _has_a_hook(cls, reference: str) -> str:
-        hook, known = getattr(named_class(reference, Modification), "hook", None), [str(hook) for hook in Hook]
+        hook, known = (
+            getattr(named_class(reference, Modification), "hook", None),
+            [str(hook) for hook in Hook],
+        )
         if hook not in known:
             name = reference.partition(":")[2]
             raise ValueError(f"class '{name}' has the hook {hook!r}; permitted: {', '.join(known)}")
@@ -142,7 +163,9 @@ class ModificationConfig(Table):
         return named_class(self.cls, Modification)
 
 
-ModificationName = Annotated[str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{NAME_BYTES - 1}}}$")]
+ModificationName = Annotated[
+    str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{NAME_BYTES - 1}}}$")
+]
 
 
 class ModifiableParams(Table):
@@ -152,27 +175,34 @@ class ModifiableParams(Table):
         {}, description="control modifications by name, in the order in which they act"
     )
     transfer: Positive = Field(
-        0.05, le=10.0, description="time in which the torque goes over to that of a law modified otherwise, s"
+        0.05,
+        le=10.0,
+        description="time in which the torque goes over to that of a law modified otherwise, s",
     )
 
     @field_validator("modifications")
     @classmethod
     def _one_instead(cls, found: dict[str, ModificationConfig]) -> dict[str, ModificationConfig]:
-        first = [name for name, entry in found.items() if entry.on and entry.kind.hook == Hook.INSTEAD]
+        first = [
+            name for name, entry in found.items() if entry.on and entry.kind.hook == Hook.INSTEAD
+        ]
         if len(first) > 1:
             raise ValueError(f"{', '.join(first)} are on in place of the law; permitted: one")
         return found
 
 
 def names_of(params: Mapping[str, Any]) -> Sequence[str]:
-    """Return the names of the modifications in a board's parameters, valid or not: see `Executor.names`."""
+    """Return the names of the modifications in a board's parameters, valid or not: see
+    `Executor.names`."""
     found = params.get("modifications")
     return tuple(found) if isinstance(found, Mapping) else ()
 
 
 def misfits_of(context: LevelContext) -> Iterable[tuple[str, Any, str]]:
     """Yield the modifications of a board that do not suit its law: see `Executor.misfits`."""
-    params = read_params(ModifiableParams, {"modifications": context.params.get("modifications", {})})
+    params = read_params(
+        ModifiableParams, {"modifications": context.params.get("modifications", {})}
+    )
     if not params.modifications:
         return
     torque = build_cell(context.robot, context.scene, context.clock_ns).bounds.torque

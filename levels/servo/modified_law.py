@@ -1,13 +1,15 @@
-"""A servo law with control modifications, which are switched between two samples without a step in the torque.
+"""A servo law with control modifications, which are switched between two samples without a step in
+the torque.
 
-In the first sample after a switch the torque is that of the sample before it. Its difference from the torque of the law
-as now modified decays to zero, with zero slope at both ends, while the new law is already in force. So a switch adds
-nothing to the torque but this difference, whatever the modifications compute; limits apply to the sum. Alternatives
-considered: to evaluate old and new law in one sample (a modification with state would act twice), and a ramp of gains
-(it must know what is inside the law).
+In the first sample after a switch the torque is that of the sample before it. Its difference from
+the torque of the law as now modified decays to zero, with zero slope at both ends, while the new
+law is already in force. So a switch adds nothing to the torque but this difference, whatever the
+modifications compute; limits apply to the sum. Alternatives considered: to evaluate old and new law
+in one sample (a modification with state would act twice), and a ramp of gains (it must know what is
+inside the law).
 
-A modification that raises an exception, or whose result is not finite, is undone and taken out in the same sample: the
-law goes on without it, and the torque goes over to it in the same way.
+A modification that raises an exception, or whose result is not finite, is undone and taken out in
+the same sample: the law goes on without it, and the torque goes over to it in the same way.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from rack.levels.algebra import Array
 from rack.levels.level import Finding, LevelContext
 from rack.levels.operator import Goal
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.modification import Hook, LawContext, LawSample, ModifiableParams, Modification
+from rack.levels.servo.modification import (
+    Hook,
+    LawContext,
+    LawSample,
+    ModifiableParams,
+    Modification,
+)
 
 Law = Callable[[Motion, Array], Array]
 """Returns torques, (joints,), N m, for a wanted motion at a state, (2, joints), rad, rad/s."""
@@ -50,7 +58,8 @@ class Modified:
         self.begins = True  # the next sample is its first
 
     def act(self, sample: LawSample, changed: Array, kept: Array) -> str:
-        """Modify a sample; return why that failed, empty: it did not. `kept` is room for the array that it changes."""
+        """Modify a sample; return why that failed, empty: it did not. `kept` is room for the array
+        that it changes."""
         kept[:] = changed
         why = ""
         try:
@@ -71,20 +80,34 @@ class Modified:
 class ModifiedLaw:
     """Modifies one law. `reason` says which modifications are in, and which have failed."""
 
-    def __init__(self, context: LevelContext, params: ModifiableParams, torque: Array, findings: list[Finding]) -> None:
+    def __init__(
+        self,
+        context: LevelContext,
+        params: ModifiableParams,
+        torque: Array,
+        findings: list[Finding],
+    ) -> None:
         """Limit torques to `torque`, (joints,), N m; report failures as `findings`."""
         joints = context.robot.joints
         period_s = context.period_s
         self.exists = bool(params.modifications)  # without one, `torque` is the law's
         self._all = {
-            name: Modified(number, name, entry.kind(LawContext(joints, period_s, torque, entry.params)), entry.on)
+            name: Modified(
+                number,
+                name,
+                entry.kind(LawContext(joints, period_s, torque, entry.params)),
+                entry.on,
+            )
             for number, (name, entry) in enumerate(params.modifications.items())
         }
         self._ticks = max(round(params.transfer / context.tick_s), context.every)
         self._torque = torque
         self._findings = findings
         self._sample = LawSample(len(joints))
-        self._kept = np.zeros_like(self._sample.seen), np.zeros(len(joints))  # room for `Modified.act`
+        self._kept = (
+            np.zeros_like(self._sample.seen),
+            np.zeros(len(joints)),
+        )  # room for `Modified.act`
         self._last = np.zeros(len(joints))  # N m: torque of the last sample
         self._difference = np.zeros(len(joints))  # N m: from the law's torque to it, at the switch
         self._since: int | None = None  # tick of the switch; None: the difference has decayed
@@ -94,7 +117,8 @@ class ModifiedLaw:
         self._arrange()
 
     def obey(self, command: Message) -> str:
-        """Put a modification in, or take it out, with the next sample; return why that is refused, empty: it is not."""
+        """Put a modification in, or take it out, with the next sample; return why that is refused,
+        empty: it is not."""
         one = self._all.get(command.name)
         is_on = command.goal == Goal.ON
         if one is None:

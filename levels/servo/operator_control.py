@@ -1,4 +1,5 @@
-"""An operator's commands to the servo level: hold, or move the joints to a set point, and later return the same way."""
+"""An operator's commands to the servo level: hold, or move the joints to a set point, and later
+return the same way."""
 
 from __future__ import annotations
 
@@ -20,8 +21,9 @@ Mask = NDArray[np.bool_]
 class OperatorControl:
     """Follows the operator.
 
-    To resume, the arm returns through the places from which it set out: that way was free, and the level above finds
-    the arm on its path. A restarted board has lost these places: the level above then continues from where the arm is.
+    To resume, the arm returns through the places from which it set out: that way was free, and the
+    level above finds the arm on its path. A restarted board has lost these places: the level above
+    then continues from where the arm is.
     """
 
     def __init__(
@@ -33,7 +35,8 @@ class OperatorControl:
         *,
         modify: Callable[[Message], str],
     ) -> None:
-        """Permit set points of the joints `driven`, (joints,), default all, within `ranges` (joints, 2), rad.
+        """Permit set points of the joints `driven`, (joints,), default all, within `ranges`
+        (joints, 2), rad.
 
         `modify` obeys a command to modify the law, or returns why not.
         """
@@ -45,7 +48,9 @@ class OperatorControl:
         self._modify = modify
         self._position = np.zeros(len(joints))  # (joints,), rad: of the arm, at the newest command
         self._goal: Array | None = None  # (joints,), rad
-        self._way: list[Array] = []  # (joints,), rad each: places from which the arm set out, oldest first
+        self._way: list[
+            Array
+        ] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
     def take(self, operator: Reading, position: Array) -> None:
         """Accept new commands, with the arm at `position`, (joints,), rad."""
@@ -63,7 +68,11 @@ class OperatorControl:
             return ""
         if self.orders.standing is Operation.NONE:
             return "returning to where the operator took over, then follows the level above"
-        what = "held" if self.orders.standing is Operation.HOLD else f"at the {self.orders.standing.name.lower()}"
+        what = (
+            "held"
+            if self.orders.standing is Operation.HOLD
+            else f"at the {self.orders.standing.name.lower()}"
+        )
         return f"{what} by the operator; `resume` releases it"
 
     def _judge(self, command: Message) -> None:

@@ -42,7 +42,11 @@ class ServoPlanner(Planner):
     def plan(self, read: Ports, write: Message, tick: int) -> None:
         """Fill a `SERVO_PLAN`."""
         command: Message = read.command.value
-        held = command.held if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects else -1
+        held = (
+            command.held
+            if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects
+            else -1
+        )
         payload = Payload(0.0, np.zeros(3)) if held < 0 else self._payload(read.scene.value, held)
         write.inertia = self._dynamics.terms(self._position(read), self._rest, payload).inertia
         write.held = held
@@ -50,7 +54,8 @@ class ServoPlanner(Planner):
         write.payload_offset = payload.offset
 
     def _position(self, read: Ports) -> Array:
-        """Return the joint positions to plan for: the set point due, else where the arm is, else home."""
+        """Return the joint positions to plan for: the set point due, else where the arm is, else
+        home."""
         if read.command.value.due != 0 and np.isfinite(read.command.value.position).all():
             return np.asarray(read.command.value.position)
         return np.asarray(read.status.value.position) if read.status.is_there else self._home

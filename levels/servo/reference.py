@@ -1,8 +1,8 @@
 """The set point of every servo cycle, interpolated between the set points of the level above.
 
-A set point is to be reached at its `due` tick; the next one has arrived by then. In between, the motion is the cubic
-Hermite curve through positions and velocities, so it is C1. If none arrives in time, the motion ramps to rest; when set
-points resume, it joins them smoothly.
+A set point is to be reached at its `due` tick; the next one has arrived by then. In between, the
+motion is the cubic Hermite curve through positions and velocities, so it is C1. If none arrives in
+time, the motion ramps to rest; when set points resume, it joins them smoothly.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from rack.levels.servo import curves
 from rack.levels.servo.curves import Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
 MAX_ACCELERATION = 2.0
-"""Multiple of the acceleration limits that the curve between two set points may need: planned motion, interpolated,
-needs a little more than 1."""
+"""Multiple of the acceleration limits that the curve between two set points may need: planned
+motion, interpolated, needs a little more than 1."""
 JOINING_SPEED_PART = 0.25
 """Part of the velocity limits that joining the set points may add to a motion."""
 ASTRAY_RAD = 0.005
 """Distance from the reference beyond which an arm is led back gradually after missed cycles."""
 MAX_AHEAD_S = 2.0
-"""Time ahead at which a set point may be due: beyond that it is a broken command, not a slow level."""
+"""Time ahead at which a set point may be due: beyond that it is a broken command, not a slow
+level."""
 WRONG = 0
 CUT = 1
 WITHIN = 2
@@ -42,7 +43,8 @@ class SetPoint(NamedTuple):
 
 
 class Reference:
-    """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion wanted at that tick."""
+    """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion
+    wanted at that tick."""
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
         self._limits = limits
@@ -52,16 +54,22 @@ class Reference:
         self._fastest = bounds.velocity
         self._hardest = MAX_ACCELERATION * limits.acceleration
         joints = len(limits.velocity)
-        self._motions = np.zeros((2, 3, joints))  # the one wanted, and its difference from the curve
+        self._motions = np.zeros(
+            (2, 3, joints)
+        )  # the one wanted, and its difference from the curve
         self._wanted = Motion(self._motions[0])
         self._interpolate, self._admit = set_motion.load(), admit.load()
         self._command: Message | None = None  # the newest `JOINT_SET_POINT`
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # the set point to follow after that
-        self.goal: Array | None = None  # (joints,), rad: goal of `to`, until another motion begins; None: none
+        self.goal: Array | None = (
+            None  # (joints,), rad: goal of `to`, until another motion begins; None: none
+        )
         self.holding = True  # no fresh set point
-        self.refused = 0  # set points cut at the bounds, and cycles that saw one that is NaN or too far ahead
+        self.refused = (
+            0  # set points cut at the bounds, and cycles that saw one that is NaN or too far ahead
+        )
         self.start(np.zeros(joints), np.zeros(joints), 0)
 
     def start(self, position: Array, velocity: Array, tick: int) -> None:
@@ -73,7 +81,8 @@ class Reference:
         self.holding = True
 
     def meet(self, position: Array, velocity: Array, tick: int) -> None:
-        """Start from where the arm is after missed cycles, if it has strayed, and lead it back to the set points."""
+        """Start from where the arm is after missed cycles, if it has strayed, and lead it back to
+        the set points."""
         now = self._motion(tick)
         if np.max(np.abs(now.position - position)) < ASTRAY_RAD:
             return
@@ -83,12 +92,14 @@ class Reference:
             self._join(position, velocity, tick)
 
     def take(self, command: Message) -> None:
-        """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is taken."""
+        """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is
+        taken."""
         self._command = command
         self._offered = command.due
 
     def at(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, by the set points taken; its acceleration is mid-cycle."""
+        """Return the motion wanted at `tick`, by the set points taken; its acceleration is
+        mid-cycle."""
         if self._next is not None and (self.holding or tick >= self._due):
             self._advance(self._next, tick)
         offered = self._offered
@@ -109,7 +120,8 @@ class Reference:
         return self._motion(tick)
 
     def to(self, goal: Array, tick: int) -> Motion:
-        """Return the motion wanted at `tick` on the way to `goal` (joints,), rad, ignoring the level above.
+        """Return the motion wanted at `tick` on the way to `goal` (joints,), rad, ignoring the
+        level above.
 
         It ramps to rest, then goes straight, from rest to rest, within the limits of every joint.
         """
@@ -126,7 +138,8 @@ class Reference:
         return self._motion(tick)
 
     def _receive(self, due: int, tick: int) -> None:
-        """Copy the set point offered. It waits until the one before it is due: some protocols deliver early."""
+        """Copy the set point offered. It waits until the one before it is due: some protocols
+        deliver early."""
         command = self._command
         if command is None:
             return
@@ -153,7 +166,10 @@ class Reference:
             self._curve = curve
             self._from = begin
             self._due = due
-            if self._difference is not None and (begin - self._differs_from) * self._tick_s >= self._difference.ends_s:
+            if (
+                self._difference is not None
+                and (begin - self._differs_from) * self._tick_s >= self._difference.ends_s
+            ):
                 self._difference = None
             return
         now = self._motion(tick)
@@ -197,7 +213,10 @@ def admit(position: Array, velocity: Array, low: Array, high: Array, fastest: Ar
     for j in range(len(position)):
         if not (np.isfinite(position[j]) and np.isfinite(velocity[j])):
             return WRONG
-        allowed = min(max(position[j], low[j]), high[j]), min(max(velocity[j], -fastest[j]), fastest[j])
+        allowed = (
+            min(max(position[j], low[j]), high[j]),
+            min(max(velocity[j], -fastest[j]), fastest[j]),
+        )
         if allowed != (position[j], velocity[j]):
             verdict = CUT
         position[j], velocity[j] = allowed

@@ -19,20 +19,24 @@ from rack.levels.servo.control import ArmParams
 Mask = NDArray[np.bool_]
 
 FIT_RAD = 5e-5
-"""Permitted difference between a position and the integrated velocities: 20 times that of faultless runs."""
+"""Permitted difference between a position and the integrated velocities: 20 times that of faultless
+runs."""
 BEYOND_RAD = 0.05
 BEYOND_SPEED = 1.2
 """Distance beyond its range, rad, and multiple of its velocity limit, that no joint can reach."""
 STILL_CYCLES = 10
 """Cycles without any change, while the set point moves, after which a sensor is stuck."""
 STILL_RAD = 5e-5
-"""Least distance that the set point moves in that time: even a slow joint soon runs away with a stuck sensor."""
+"""Least distance that the set point moves in that time: even a slow joint soon runs away with a
+stuck sensor."""
 PLAUSIBLE_RAD = 1e-3
-"""Offset after a fault of a joint's sensor that is accepted at rest: a millimetre at the arm's reach."""
+"""Offset after a fault of a joint's sensor that is accepted at rest: a millimetre at the arm's
+reach."""
 STUCK_RAD = 0.01
 """Distance that a joint may have moved before its stuck sensor is noticed."""
 STUCK_STEPS = 3.0
-"""Motion, in multiples of twice a good sample's largest error, after which an encoder that shows none is stuck."""
+"""Motion, in multiples of twice a good sample's largest error, after which an encoder that shows
+none is stuck."""
 UNSEEN_S = 0.05
 """Time for which a joint may have accelerated while its stuck sensor was not yet noticed."""
 BRAKE_TAIL_S2 = 1e-3
@@ -48,10 +52,11 @@ TAKEN = 2
 
 
 class SensorMonitor:
-    """Checks every sample against the one before: positions must agree with the integrated velocities.
+    """Checks every sample against the one before: positions must agree with the integrated
+    velocities.
 
-    A joint is good again when its samples agree with the estimate, and with each other, for `good_cycles` in a row: an
-    offset greater than `doubt` is never accepted.
+    A joint is good again when its samples agree with the estimate, and with each other, for
+    `good_cycles` in a row: an offset greater than `doubt` is never accepted.
     """
 
     def __init__(self, cell: Cell, params: ArmParams, tick_s: float, every: int) -> None:
@@ -69,22 +74,30 @@ class SensorMonitor:
         joints = len(home)
         self._table = np.zeros((19, joints))  # in the rows of `check`
         self._q, self._qd, *self._raw = self._table[:4]  # the sample, and the one before it
-        # (joints,), rad: as sensed; estimated for joints whose sensor is suspect. (joints,), rad/s, likewise; unknown
-        # ones are estimated as braked. (joints,), rad: largest error of `position`.
+        # (joints,), rad: as sensed; estimated for joints whose sensor is suspect. (joints,), rad/s,
+        # likewise; unknown ones are estimated as braked. (joints,), rad: largest error of
+        # `position`.
         self.position, self.velocity, self.doubt = self.estimate = self._table[4:7]
         self.state = self._table[4:6]  # (2, joints): `position` and `velocity`
         self._room, self._speed_room, self._unshown = self._table[7:10]
         self._still, self._still_way, self._claimed = self._table[10:13]
         self._way, self._allowed, self._braking, self._fastest = self._table[13:17]
         self._fits, self._unchanged = self._table[17:]
-        self._braking[:], self._fastest[:] = cell.limits.acceleration, BEYOND_SPEED * bounds.velocity
+        self._braking[:], self._fastest[:] = (
+            cell.limits.acceleration,
+            BEYOND_SPEED * bounds.velocity,
+        )
         self._room[:], self._speed_room[:] = FIT_RAD + 2.0 * encoders.off, encoders.speed_off
         self._unshown[:] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
         self.position[:] = self._raw[0][:] = home
         self.fresh = True  # there is a sample of this cycle
         self.faulty = False  # a sensor is, or was until fewer than `good_cycles` ago, at fault
         self.drivable = True  # velocities are known, so the arm could still be driven
-        self.blamed = (-1, 0.0, 0.0)  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
+        self.blamed = (
+            -1,
+            0.0,
+            0.0,
+        )  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
         self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
         self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
@@ -96,14 +109,18 @@ class SensorMonitor:
 
     def recall(self, state: Message) -> None:
         """Continue from the estimate in an `ARM_STATE`."""
-        self.position[:], self.velocity[:], self.doubt[:] = state.position, state.velocity, state.doubt
+        self.position[:], self.velocity[:], self.doubt[:] = (
+            state.position,
+            state.velocity,
+            state.doubt,
+        )
         self._tick = state.tick
 
     def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
         """Check a sample at `tick`, and add faults to `findings`, once per episode.
 
-        `wanted` is the motion that the arm was driven to follow, rad, rad/s, ... by row; None: it was not driven.
-        `struck`: something has touched the arm since the last cycle.
+        `wanted` is the motion that the arm was driven to follow, rad, rad/s, ... by row; None: it
+        was not driven. `struck`: something has touched the arm since the last cycle.
         """
         q, qd, _, _, sampled = sensed
         passed = self._every if self._tick is None else tick - self._tick
@@ -145,12 +162,15 @@ class SensorMonitor:
         self._table[4:6] = self._table[2:4] = self._table[:2]
 
     def _claim(self, unchanged: Mask, passed_s: float) -> None:
-        """Integrate the least motion that a joint's sensed velocity implies while its sample does not change."""
+        """Integrate the least motion that a joint's sensed velocity implies while its sample does
+        not change."""
         least = np.maximum(np.abs(self._qd) - self._speed_room, 0.0)
         self._claimed[:] = np.where(unchanged, self._claimed + passed_s * least, 0.0)
 
     def _is_still(self) -> Mask:
-        return np.asarray((self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown))
+        return np.asarray(
+            (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
+        )
 
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
@@ -174,9 +194,15 @@ class SensorMonitor:
         self._unproven |= still
         self._unproven &= unchanged
         if begins:
-            # A sensor that showed no change may have been stuck while its joint crept: it may be off by that distance.
-            np.maximum(self.doubt, np.where(self._unchanged != 0.0, STUCK_RAD, PLAUSIBLE_RAD), out=self.doubt)
-            # One that shows no change now, although its joint was driven, may have been stuck for longer.
+            # A sensor that showed no change may have been stuck while its joint crept: it may be
+            # off by that distance.
+            np.maximum(
+                self.doubt,
+                np.where(self._unchanged != 0.0, STUCK_RAD, PLAUSIBLE_RAD),
+                out=self.doubt,
+            )
+            # One that shows no change now, although its joint was driven, may have been stuck for
+            # longer.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         self._still[still] = 0
@@ -196,7 +222,8 @@ class SensorMonitor:
             self.blamed = joint, float(q[joint]), float(off[joint])
 
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
-        """Estimate suspect joints from their velocity, or as braked where that is unknown; take the others as sensed.
+        """Estimate suspect joints from their velocity, or as braked where that is unknown; take the
+        others as sensed.
 
         A suspect's sample that happens to fit is not used: with noise the estimate would drift.
         """
@@ -270,18 +297,34 @@ def check(
     driven: bool,
     faulty: bool,
 ) -> int:
-    """Check a sample against the estimate, and take it if nothing is in doubt; return the verdict."""
-    q, qd, last_q, last_qd = table[0], table[1], table[2], table[3]  # this sample and the one before it: rad, rad/s
+    """Check a sample against the estimate, and take it if nothing is in doubt; return the
+    verdict."""
+    q, qd, last_q, last_qd = (
+        table[0],
+        table[1],
+        table[2],
+        table[3],
+    )  # this sample and the one before it: rad, rad/s
     position, velocity, doubt = table[4], table[5], table[6]  # the estimate: rad, rad/s, rad
-    room, speed_room, unshown = table[7], table[8], table[9]  # for errors, rad, rad/s; motion that must show, rad
-    # Cycles without a change while the set point moves, and its motion in that time, rad; integrated velocity while the
-    # sample does not change, rad.
+    room, speed_room, unshown = (
+        table[7],
+        table[8],
+        table[9],
+    )  # for errors, rad, rad/s; motion that must show, rad
+    # Cycles without a change while the set point moves, and its motion in that time, rad;
+    # integrated velocity while the sample does not change, rad.
     still = table[10]
     still_way = table[11]
     claimed = table[12]
-    way, allowed = table[13], table[14]  # set: motion since the last sample, and room for its errors, rad
+    way, allowed = (
+        table[13],
+        table[14],
+    )  # set: motion since the last sample, and room for its errors, rad
     braking, fastest = table[15], table[16]  # rad/s2, rad/s
-    fits, unchanged = table[17], table[18]  # set to 0 or 1: agrees with velocities; if taken, is as before
+    fits, unchanged = (
+        table[17],
+        table[18],
+    )  # set to 0 or 1: agrees with velocities; if taken, is as before
     good = not faulty
     in_doubt = False
     at_rest = False
@@ -299,7 +342,9 @@ def check(
         unmoved = at_rest and change == 0.0 and same and wanted[1, j] != 0.0
         still[j] = still[j] + 1.0 if unmoved else 0.0
         still_way[j] = still_way[j] + passed_s * wanted[1, j] if unmoved else 0.0
-        good = good and fitting and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
+        good = (
+            good and fitting and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
+        )
         if coarse:  # an exact sensor that is stuck shows it in the next sample
             least = max(abs(qd[j]) - speed_room[j], 0.0)
             claimed[j] = claimed[j] + passed_s * least if same and qd[j] == last_qd[j] else 0.0
@@ -317,4 +362,6 @@ def check(
 def preload() -> None:
     """Load this module's compiled functions."""
     joints = np.zeros(1)
-    check.load()(np.zeros((19, 1)), False, joints, joints, np.zeros((2, 1)), 0.0, 0.0, 0.0, False, False)
+    check.load()(
+        np.zeros((19, 1)), False, joints, joints, np.zeros((2, 1)), 0.0, 0.0, 0.0, False, False
+    )

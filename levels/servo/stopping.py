@@ -1,4 +1,5 @@
-"""Decides in every cycle whether the arm follows its set points or stops, and for how long; logs its brakes."""
+"""Decides in every cycle whether the arm follows its set points or stops, and for how long; logs
+its brakes."""
 
 from __future__ import annotations
 
@@ -39,14 +40,17 @@ class Cause(NamedTuple):
 
 
 class Stopping:
-    """Weighs the rack's demands, faults of sensors, motors and torques, and blows: the strongest reaction wins.
+    """Weighs the rack's demands, faults of sensors, motors and torques, and blows: the strongest
+    reaction wins.
 
-    A failed motor is retried after a while: the arm holds with it, and follows set points after `good_cycles` without a
-    fault. If it fails while the arm ramps or holds with it, the brakes engage. An arm that was struck, or pressed too
-    hard, stays stopped until nothing has for the same time.
+    A failed motor is retried after a while: the arm holds with it, and follows set points after
+    `good_cycles` without a fault. If it fails while the arm ramps or holds with it, the brakes
+    engage. An arm that was struck, or pressed too hard, stays stopped until nothing has for the
+    same time.
 
-    Faults may keep the arm from its set points for `patience`. That time counts up during faults and down while the arm
-    follows, so recurring faults use it up too. Then the fault is latched: the brakes stay engaged.
+    Faults may keep the arm from its set points for `patience`. That time counts up during faults
+    and down while the arm follows, so recurring faults use it up too. Then the fault is latched:
+    the brakes stay engaged.
     """
 
     def __init__(self, params: ArmParams, joints: Sequence[str], tick_s: float, every: int) -> None:
@@ -66,7 +70,9 @@ class Stopping:
         self._kept = 0  # ticks for which faults have kept the arm from its set points
         self._remembered: tuple[int, Error] | None = None  # in the last state
         self._tick: int | None = None
-        self._retry_at: int | None = None  # tick at which a failed motor is retried; None: none has failed
+        self._retry_at: int | None = (
+            None  # tick at which a failed motor is retried; None: none has failed
+        )
         self._on_failure = self._on_motors  # reaction until then
         self._motor = self._blow = Cause(Error.NONE, "")
         self._struck_until: int | None = None  # tick until which a struck arm stays stopped
@@ -97,7 +103,9 @@ class Stopping:
         self._on_failure = self._on_motors if self._retry_at is None else Reaction.BRAKE
         self._retry_at = tick + self._retry_ticks
         text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
-        self._motor = Cause(Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}")
+        self._motor = Cause(
+            Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}"
+        )
         self._wait_for(self._motor, tick)
         return self._on_failure
 
@@ -112,7 +120,8 @@ class Stopping:
         self._stop_for(blow, Finding(Alarm.COLLISION, *contact), Reaction.BRAKE, tick)
 
     def pressed(self, finding: Finding, text: str, reaction: Reaction, tick: int) -> None:
-        """Register a contact stronger than the arm's limits, with its text and the reaction to it."""
+        """Register a contact stronger than the arm's limits, with its text and the reaction to
+        it."""
         self._stop_for(Cause(Error.FORCE, text, value=finding.value), finding, reaction, tick)
 
     def _stop_for(self, blow: Cause, finding: Finding, reaction: Reaction, tick: int) -> None:
@@ -142,7 +151,10 @@ class Stopping:
             if self._kept >= self._most:
                 return self._latch(cause)
         if demand:
-            self.reason = f"demand '{demand.name.lower()}' on the arm, until boards and emergency stop are in order"
+            self.reason = (
+                f"demand '{demand.name.lower()}' on the arm, until boards and emergency stop are in"
+                " order"
+            )
         elif cause is not None:
             self._wait_for(cause, tick)
         else:
@@ -151,7 +163,8 @@ class Stopping:
         return max(reaction, DEMANDED[demand]) if demand else reaction
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
-        """Set `cause` and `reason`: the fault that must end, and the tick at which it is latched."""
+        """Set `cause` and `reason`: the fault that must end, and the tick at which it is
+        latched."""
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
@@ -176,10 +189,14 @@ class Stopping:
         if joint < 0:
             return Cause(Error.SENSORS, "sensors give no new samples", joint, read)
         text = f"sensor of '{self._joints[joint]}' reads {read:.4g} rad"
-        return Cause(Error.SENSORS, f"{text}, off by {off:.3g}" if off == off else text, joint, read)
+        return Cause(
+            Error.SENSORS, f"{text}, off by {off:.3g}" if off == off else text, joint, read
+        )
 
     def _about_torque(self, refused: Finding) -> Cause:
-        what = "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"
+        what = (
+            "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"
+        )
         text = f"rejected: torque of '{self._joints[refused.subject]}' is {what}"
         return Cause(Error.LIMIT, text, refused.subject, refused.value)
 
@@ -203,10 +220,13 @@ class BrakeLog:
     def __init__(self, arm: Arm, every: int) -> None:
         self._arm = arm
         self._every = every
-        self._engaged: tuple[int, int] | None = None  # why, see `Alarm.BRAKES_CLOSED`, and at which tick
+        self._engaged: tuple[int, int] | None = (
+            None  # why, see `Alarm.BRAKES_CLOSED`, and at which tick
+        )
 
     def start(self, tick: int, why: int) -> None:
-        """Begin at `tick` with brakes engaged: no torque has been given yet, or none since a restart."""
+        """Begin at `tick` with brakes engaged: no torque has been given yet, or none since a
+        restart."""
         self._engaged = why, tick
 
     def after_waiting(self, tick: int, findings: list[Finding]) -> None:

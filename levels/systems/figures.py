@@ -1,4 +1,5 @@
-"""The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only consumes processor time."""
+"""The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only consumes processor
+time."""
 
 from __future__ import annotations
 
@@ -17,7 +18,12 @@ FIGURE_PLAN = MessageType(
     1,
     (
         Field("made_at", "i8", "tick", "release that the plan answers"),
-        Field("cycle", "i8", "tick", "cycle of the executor whose status the plan rests on; -1: none was there"),
+        Field(
+            "cycle",
+            "i8",
+            "tick",
+            "cycle of the executor whose status the plan rests on; -1: none was there",
+        ),
     ),
 )
 FIGURE_STATUS = status(
@@ -32,10 +38,16 @@ Milliseconds = Annotated[float, Parameter(ge=0, le=10_000, allow_inf_nan=False)]
 
 
 class FigureParams(Table):
-    """Processor times of the level's unit functions; R, W, U and C are the bus's, in `[board.<name>.transfer]`."""
+    """Processor times of the level's unit functions; R, W, U and C are the bus's, in
+    `[board.<name>.transfer]`."""
 
-    process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = Parameter(
-        2.0, description="X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"
+    process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = (
+        Parameter(
+            2.0,
+            description=(
+                "X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"
+            ),
+        )
     )
     plan_ms: Milliseconds = Parameter(6.0, description="P: one plan, without its update, ms")
 

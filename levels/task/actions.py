@@ -44,7 +44,8 @@ class Way(NamedTuple):
 
 
 def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehearsal:
-    """Return the whole program as moves, rehearsed. Raises `Refused` with action, place and a possible alternative."""
+    """Return the whole program as moves, rehearsed. Raises `Refused` with action, place and a
+    possible alternative."""
     rehearsal = start
     for k, action in enumerate(program.action):
         if isinstance(action, Transfer):
@@ -79,15 +80,22 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
         tools = [pose(action.position, pointing(action.direction or DOWN, turn)) for turn in turns]
     motion = rehearsal.motion
     rehearsal.situation.lay_out(motion.checker, None)
-    ends = [(tool, q) for tool in tools for q in motion.ik.solutions(tool, rehearsal.q, motion.checker.free)]
+    ends = [
+        (tool, q)
+        for tool in tools
+        for q in motion.ik.solutions(tool, rehearsal.q, motion.checker.free)
+    ]
     if not ends:
         raise _nothing_at(motion, tools, rehearsal.q)
     ends.sort(key=lambda end: motion.ik.time_between(rehearsal.q, end[1]))
-    return _first(ends[:MAX_WAYS], lambda end: rehearsal.then(k, Verb.MOVE, tool=end[0], joints=end[1]))
+    return _first(
+        ends[:MAX_WAYS], lambda end: rehearsal.then(k, Verb.MOVE, tool=end[0], joints=end[1])
+    )
 
 
 def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
-    """Return the rehearsal after a transfer. Raises `Refused` that names the step, pick or place."""
+    """Return the rehearsal after a transfer. Raises `Refused` that names the step, pick or
+    place."""
     handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"action {k}, pick {action.object}"
     place = f"action {k}, place {action.object} at {list(action.to)}"
@@ -95,7 +103,8 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
         situation = rehearsal.situation
         row = handling.row
         standing_goals = [
-            standing(rehearsal.motion.cell, situation, row, goal) for goal in goals(action, situation.object_pose(row))
+            standing(rehearsal.motion.cell, situation, row, goal)
+            for goal in goals(action, situation.object_pose(row))
         ]
     with _naming(pick):
         takes = handling.takes()
@@ -112,14 +121,16 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
 
 
 class Handling(NamedTuple):
-    """A transfer as planning sees it: the tool goes straight down to the object and straight up again."""
+    """A transfer as planning sees it: the tool goes straight down to the object and straight up
+    again."""
 
     start: Rehearsal
     row: int  # of the object
     lift: float  # height of the straight motions, m
 
     def takes(self) -> list[Spot]:
-        """Return the spots to take and hold the object, at the lowest possible height. Raises `Refused`."""
+        """Return the spots to take and hold the object, at the lowest possible height. Raises
+        `Refused`."""
         start = self.start
         refusal: Refused | None = None
         for tools in grasps(start.motion.cell, start.situation, self.row):
@@ -133,7 +144,8 @@ class Handling(NamedTuple):
         raise refusal
 
     def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
-        """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there is none."""
+        """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there
+        is none."""
         situation = self.start.situation
         here = self.start.q
         ways: list[Way] = []
@@ -150,10 +162,13 @@ class Handling(NamedTuple):
         if not ways:
             raise self._nothing_at([tool for tool, _ in puts])
         pace = self.start.motion.ik.time_between
-        return sorted(ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above))
+        return sorted(
+            ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above)
+        )
 
     def moved(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
-        """Return the rehearsal after the four moves of a grasp or a release for action `k`. Raises `Refused`."""
+        """Return the rehearsal after the four moves of a grasp or a release for action `k`. Raises
+        `Refused`."""
         above = spot.tool.raised(self.lift)
         row = self.row
         over = None if verb is Verb.GRASP else row
@@ -172,7 +187,8 @@ class Handling(NamedTuple):
         return [Spot(tool, q) for q, end in ends if end is not None and motion.checker.free(end)]
 
     def _held(self, takes: list[Spot]) -> list[Spot]:
-        """Return the spots where gripper and motors can hold the object. Raises the first `Refused` when none can."""
+        """Return the spots where gripper and motors can hold the object. Raises the first `Refused`
+        when none can."""
         payloads = self.start.motion.payloads
         seen = self.start.situation.object_pose(self.row)
         held: list[Spot] = []
@@ -190,13 +206,15 @@ class Handling(NamedTuple):
         return held
 
     def _nothing_at(self, tools: list[Pose]) -> Refused:
-        """Return the refusal for poses that the arm cannot reach from above, or only in collision."""
+        """Return the refusal for poses that the arm cannot reach from above, or only in
+        collision."""
         places = [place for tool in tools for place in (tool, tool.raised(self.lift))]
         return _nothing_at(self.start.motion, places, self.start.q)
 
 
 def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
-    """Return the first rehearsal that succeeds. Raises the `Refused` of the first option when none does."""
+    """Return the first rehearsal that succeeds. Raises the `Refused` of the first option when none
+    does."""
     refusals: list[Refused] = []
     for option in options:
         try:
@@ -220,7 +238,11 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
     high = 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        reached = bool(motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here))
+        reached = bool(
+            motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here)
+        )
         low, high = (middle, high) if reached else (low, middle)
     in_reach = begin.towards(end, low)
-    return Refused(Error.UNREACHABLE, f"out of reach: {in_metres(end)}; in reach: {in_metres(in_reach)}")
+    return Refused(
+        Error.UNREACHABLE, f"out of reach: {in_metres(end)}; in reach: {in_metres(in_reach)}"
+    )

@@ -7,7 +7,14 @@ from typing import ClassVar
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, LevelContext, Ports, Program, Reading
 from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
-from rack.levels.operator import BELOW_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Goal, Operation, Orders
+from rack.levels.operator import (
+    BELOW_LOST,
+    HELD_FROM_ABOVE,
+    OPERATOR_COMMAND,
+    Goal,
+    Operation,
+    Orders,
+)
 from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
 from rack.levels.task.window import Detour, ShownWindow
@@ -54,7 +61,9 @@ class TaskExecutor(Executor):
         """Read the progress below, and the operator's commands; hand down the next moves."""
         if not self._started:
             self._recall(read, write)
-        self._orders.take(read.operator, lambda command: self._judge(command, read.last_status.value.order))
+        self._orders.take(
+            read.operator, lambda command: self._judge(command, read.last_status.value.order)
+        )
         plan = self._plan_to_follow(read, write, tick)
         below = read.status.value
         if not self._error:
@@ -78,7 +87,8 @@ class TaskExecutor(Executor):
         return plan
 
     def _recall(self, read: Ports, write: Ports) -> None:
-        """Continue from the last command and status in the mailboxes, after a restart of the board."""
+        """Continue from the last command and status in the mailboxes, after a restart of the
+        board."""
         self._started = True
         last = read.last_status.value
         self._done = last.moves_done
@@ -90,7 +100,8 @@ class TaskExecutor(Executor):
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
     def _judge(self, command: Message, answered: int) -> None:
-        """Accept or refuse a goto; one already answered before a restart of this board is not new."""
+        """Accept or refuse a goto; one already answered before a restart of this board is not
+        new."""
         if self._orders.standing is Operation.GOTO:
             self._detour.begin(command, command.id > answered)
 
@@ -122,7 +133,8 @@ class TaskExecutor(Executor):
                 self._reason = reason
 
     def _reason_to_wait(self, below: Reading) -> str:
-        """Return the reason why the level waits, and the condition that ends the wait; empty: it does not."""
+        """Return the reason why the level waits, and the condition that ends the wait; empty: it
+        does not."""
         orders = self._orders
         if orders.standing is Operation.GOTO:
             return self._detour.reason()
@@ -136,7 +148,15 @@ class TaskExecutor(Executor):
     def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
         """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
         below = read.status.value
-        progress = (plan.id, self._done, below.done, below.planned, below.current, below.progress, self._detour.move)
+        progress = (
+            plan.id,
+            self._done,
+            below.done,
+            below.planned,
+            below.current,
+            below.progress,
+            self._detour.move,
+        )
         progress = (*progress, *self._stage())
         operated = below.operated or self._orders.standing is not Operation.NONE
         if operated or progress != self._progress:
@@ -144,7 +164,9 @@ class TaskExecutor(Executor):
             self._moved_at = tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
             self._error = Error.STALLED
-            self._reason = f"nothing has moved for {self._stalled_s:g} s: {waits or _awaited(plan, below)}"
+            self._reason = (
+                f"nothing has moved for {self._stalled_s:g} s: {waits or _awaited(plan, below)}"
+            )
 
     def _stage(self) -> tuple[int, ...]:
         """Return what else counts as progress."""
@@ -153,7 +175,11 @@ class TaskExecutor(Executor):
     def _actions_done(self, plan: Message) -> int:
         if not plan.count:
             return 0
-        return len(self._actions) if self._done == plan.count else int(plan.moves["action"][self._done])
+        return (
+            len(self._actions)
+            if self._done == plan.count
+            else int(plan.moves["action"][self._done])
+        )
 
     def _hand_down(self, plan: Message, command: Message) -> None:
         """Show the program's next moves, or the operator's goto."""
@@ -177,7 +203,9 @@ class TaskExecutor(Executor):
         if waits and status.state == State.EXECUTING:
             status.state = State.HOLDING
         status.error = self._error
-        status.reason = self._reason if self._error else waits if status.state == State.HOLDING else ""
+        status.reason = (
+            self._reason if self._error else waits if status.state == State.HOLDING else ""
+        )
         status.action = self._actions_done(plan)
         status.actions = len(self._actions)
         status.moves_done = self._done
@@ -186,7 +214,8 @@ class TaskExecutor(Executor):
         status.detour = self._detour.move
 
     def _answer(self, below: Message, write: Ports) -> None:
-        """Obey and answer the operator, and pass down the newest command on which this cycle is based."""
+        """Obey and answer the operator, and pass down the newest command on which this cycle is
+        based."""
         orders = self._orders
         write.command.hold = orders.standing is Operation.HOLD or self._detour.holds
         write.command.operator = orders.rests_on(0)
@@ -206,4 +235,8 @@ def _awaited(plan: Message, below: Message) -> str:
     """Return the event for which a task waits while nothing holds it."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"
-    return f"move {below.current} is under way" if below.current else f"no path yet for move {below.done + 1}"
+    return (
+        f"move {below.current} is under way"
+        if below.current
+        else f"no path yet for move {below.done + 1}"
+    )

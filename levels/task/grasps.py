@@ -20,7 +20,8 @@ from rack.levels.task.program import DOWN, Transfer
 QUARTERS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
 HEIGHT_STEP_M = 0.01
-"""Spacing of grasps above the object's origin: a tall object is taken higher, so that the palm stays clear."""
+"""Spacing of grasps above the object's origin: a tall object is taken higher, so that the palm
+stays clear."""
 SET_DOWN_M = 0.0005
 """Gap between an object and its support when the gripper opens."""
 MAX_DISTANCE_M = 10.0
@@ -45,9 +46,14 @@ def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
 
 
 def goals(action: Transfer, at: Pose) -> Iterator[Pose]:
-    """Yield poses in which the object may be put down: upright as it is now, turned about the vertical."""
+    """Yield poses in which the object may be put down: upright as it is now, turned about the
+    vertical."""
     yaw = yaw_of(at.quaternion)
-    turns = [action.yaw - yaw] if action.yaw is not None else [quarter * np.pi / 2.0 for quarter in QUARTERS]
+    turns = (
+        [action.yaw - yaw]
+        if action.yaw is not None
+        else [quarter * np.pi / 2.0 for quarter in QUARTERS]
+    )
     for turn in turns:
         quaternion = np.zeros(4)
         mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
@@ -67,18 +73,27 @@ def standing(cell: Cell, situation: Situation, row: int, goal: Pose) -> Pose:
     if support not in cell.supports:
         supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.supports) or "none"
         place = f"over '{geom_name(model, support)}'" if support >= 0 else "over nothing"
-        raise Refused(Error.UNREACHABLE, f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}")
+        raise Refused(
+            Error.UNREACHABLE,
+            f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}",
+        )
     parts = geoms_of(model, below(model, cell.bodies[[row]]))
-    gap = min(mujoco.mj_geomDistance(model, data, int(part), support, MAX_DISTANCE_M, None) for part in parts)
+    gap = min(
+        mujoco.mj_geomDistance(model, data, int(part), support, MAX_DISTANCE_M, None)
+        for part in parts
+    )
     if abs(gap) > MAX_STANDING_GAP_M:
         side = "above" if gap > 0 else "deep in"
         place = f"{abs(gap) * 1e3:.0f} mm {side} '{geom_name(model, support)}'"
-        raise Refused(Error.UNREACHABLE, f"at z = {z:.3f} '{name}' would be {place}; valid z: {z - gap:.3f}")
+        raise Refused(
+            Error.UNREACHABLE, f"at z = {z:.3f} '{name}' would be {place}; valid z: {z - gap:.3f}"
+        )
     return goal.raised(SET_DOWN_M - gap)
 
 
 def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
-    """Return the first geom below `point` that is neither object `row` nor the arm; -1: there is none."""
+    """Return the first geom below `point` that is neither object `row` nor the arm; -1: there is
+    none."""
     found = np.full(1, -1, dtype=np.int32)
     body = int(cell.bodies[row])
     begin = point.copy()
@@ -106,5 +121,9 @@ def _top(cell: Cell, situation: Situation, row: int) -> float:
     vertical = data.geom_xmat[parts].reshape(-1, 3, 3)[:, 2, :]
     centre = model.geom_aabb[parts, :3]
     half = model.geom_aabb[parts, 3:]
-    heights = data.geom_xpos[parts, 2] + np.sum(vertical * centre, axis=1) + np.sum(np.abs(vertical) * half, axis=1)
+    heights = (
+        data.geom_xpos[parts, 2]
+        + np.sum(vertical * centre, axis=1)
+        + np.sum(np.abs(vertical) * half, axis=1)
+    )
     return float(np.max(heights))

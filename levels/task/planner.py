@@ -1,4 +1,5 @@
-"""The planner of the task level: the whole program as elemental moves, or the reason why it cannot be done."""
+"""The planner of the task level: the whole program as elemental moves, or the reason why it cannot
+be done."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ MAX_REST_M_S = 0.01
 
 
 class TaskPlanner(Planner):
-    """Plans the program once, as soon as the position of the arm is known and the objects are at rest.
+    """Plans the program once, as soon as the position of the arm is known and the objects are at
+    rest.
 
     A program that cannot be done is refused before anything moves, with a possible alternative.
     """
@@ -81,7 +83,8 @@ class TaskPlanner(Planner):
         return bool(np.all(speeds < MAX_REST_M_S))
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Decompose the whole program into `write`, or refuse it; a plan that was lost is published again."""
+        """Decompose the whole program into `write`, or refuse it; a plan that was lost is published
+        again."""
         self._visible_at = tick + self._slice
         if self._plan is not None:
             write.copy_from(self._plan)
@@ -102,7 +105,8 @@ class TaskPlanner(Planner):
         return self.context.within_cycles * self.context.every
 
     def _is_on_its_way(self, read: Ports, tick: int, since: int) -> bool:
-        """Return whether the executor may still report a plan: of this process, or of one before it."""
+        """Return whether the executor may still report a plan: of this process, or of one before
+        it."""
         if self._plan is not None:
             # Once visible, the status acknowledges it a cycle later.
             return tick <= self._visible_at + self.context.every
@@ -117,33 +121,47 @@ class TaskPlanner(Planner):
         start = Rehearsal(self._motion, np.array(read.servo.value.target), situation)
         moves = self._with_times(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
-            raise Refused(Error.LIMIT, f"the program has {len(moves)} elemental moves; at most {MOVES} are valid")
+            raise Refused(
+                Error.LIMIT,
+                f"the program has {len(moves)} elemental moves; at most {MOVES} are valid",
+            )
         self._promise(moves, self._visible_s(tick), write)
         for k, (move, _) in enumerate(moves):
             move.write_to(write.moves[k])
         write.count = len(moves)
 
     def _visible_s(self, tick: int) -> float:
-        """Return when the first moves of a plan begun at `tick` become visible below, s of simulated time here."""
-        # It is ready within its cycles, is read and handed down at once, and is visible below a cycle later.
+        """Return when the first moves of a plan begun at `tick` become visible below, s of
+        simulated time here."""
+        # It is ready within its cycles, is read and handed down at once, and is visible below a
+        # cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
     def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
-        """Set the time by which the last move of each action must be done below, for this level to report in time."""
+        """Set the time by which the last move of each action must be done below, for this level to
+        report in time."""
         timed = list(moves)
         for k, (move, duration_s) in enumerate(moves):
             by_s = self._program.action[move.action].by
-            if by_s is not None and (k + 1 == len(moves) or moves[k + 1].move.action != move.action):
-                timed[k] = Rehearsed(move._replace(by_s=by_s - self._ahead_s - self.context.period_s), duration_s)
+            if by_s is not None and (
+                k + 1 == len(moves) or moves[k + 1].move.action != move.action
+            ):
+                timed[k] = Rehearsed(
+                    move._replace(by_s=by_s - self._ahead_s - self.context.period_s), duration_s
+                )
         return timed
 
     def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
-        """Raise `Refused` with the earliest possible time if an action cannot be done by its time."""
+        """Raise `Refused` with the earliest possible time if an action cannot be done by its
+        time."""
         finish_s = finish_times(moves, visible_s, self._periods, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
             action = self._program.action[move.action]
             earliest_s = finished_s + self._ahead_s
             if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
                 write.earliest = earliest_s
-                text = f"action {move.action}, {action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
+                text = (
+                    f"action {move.action}, {action}, by {action.by:g} s: the earliest is"
+                    f" {earliest_s:.2f} s"
+                )
                 raise Refused(Error.TOO_LATE, text)

@@ -1,4 +1,5 @@
-"""The task in a config: the `[task]` table, a program of actions, and the parameters of the level."""
+"""The task in a config: the `[task]` table, a program of actions, and the parameters of the
+level."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ DOWN = (0.0, 0.0, -1.0)
 class Action(Table):
     """Base of all actions."""
 
-    by: Positive | None = Field(None, description="simulated time by which the action must be done, s")
+    by: Positive | None = Field(
+        None, description="simulated time by which the action must be done, s"
+    )
 
 
 class Transfer(Action):
@@ -28,8 +31,12 @@ class Transfer(Action):
     do: Literal["transfer"] = Field("transfer", description="the kind of action")
     object: str = Field(description="object of the scene")
     to: Vector = Field(description="where the object's origin goes, m")
-    yaw: Finite | None = Field(None, description="turn of the object's x axis there, rad; free when not given")
-    lift: Positive = Field(0.1, description="height of the straight motion above grasp and release, m")
+    yaw: Finite | None = Field(
+        None, description="turn of the object's x axis there, rad; free when not given"
+    )
+    lift: Positive = Field(
+        0.1, description="height of the straight motion above grasp and release, m"
+    )
 
     def __str__(self) -> str:
         return f"transfer {self.object} to {list(self.to)}"
@@ -40,8 +47,12 @@ class Goto(Action):
 
     do: Literal["goto"] = Field("goto", description="the kind of action")
     position: Vector | None = Field(None, description="of the tool, m")
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(None, description="of the tool, as w, x, y, z")
-    direction: Vector | None = Field(None, description="of the tool's z axis, any turn about it; down when not given")
+    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
+        None, description="of the tool, as w, x, y, z"
+    )
+    direction: Vector | None = Field(
+        None, description="of the tool's z axis, any turn about it; down when not given"
+    )
     joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
 
     @model_validator(mode="after")
@@ -58,7 +69,11 @@ class Goto(Action):
         return self
 
     def __str__(self) -> str:
-        return f"goto {list(self.position)}" if self.position is not None else f"goto joints {list(self.joints or ())}"
+        return (
+            f"goto {list(self.position)}"
+            if self.position is not None
+            else f"goto joints {list(self.joints or ())}"
+        )
 
 
 class Home(Action):
@@ -86,7 +101,9 @@ class TaskConfig(Program):
             if isinstance(action, Transfer):
                 yield GoalConfig(object=action.object, position=action.to)
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterator[tuple[str, Any, str]]:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
         for k, action in enumerate(self.action if robot is not None else ()):
             for key, value, why in _misfits(action, cast(RobotConfig, robot), scene):
@@ -94,30 +111,49 @@ class TaskConfig(Program):
 
 
 class TaskParams(Table):
-    """Times that the levels below need at most, for the promise of a time, and how long they may make no progress.
+    """Times that the levels below need at most, for the promise of a time, and how long they may
+    make no progress.
 
     In `[board.<name>.params]`; s of simulated time.
     """
 
-    beginning: Positive = Field(0.1, description="from a segment's arrival in the primitive level to motion, s")
-    settling: Positive = Field(0.2, description="from the end of a motion to the report that it is done, s")
-    gripping: Positive = Field(0.6, description="time that the gripper takes to open or close and to settle, s")
+    beginning: Positive = Field(
+        0.1, description="from a segment's arrival in the primitive level to motion, s"
+    )
+    settling: Positive = Field(
+        0.2, description="from the end of a motion to the report that it is done, s"
+    )
+    gripping: Positive = Field(
+        0.6, description="time that the gripper takes to open or close and to settle, s"
+    )
     stalled_s: Positive = Field(
         90.0,
-        description="time without any progress after which the task ends, unless an operator holds it; longer than "
-        "the patience of the level below, s",
+        description=(
+            "time without any progress after which the task ends, unless an operator holds it;"
+            " longer than the patience of the level below, s"
+        ),
     )
 
 
 read_program = TaskConfig.read
 
 
-def _misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+def _misfits(
+    action: Action, robot: RobotConfig, scene: SceneConfig
+) -> Iterator[tuple[str, Any, str]]:
     if isinstance(action, Transfer):
         if action.object not in scene.objects:
-            yield "object", action.object, f"not in the scene; objects: {', '.join(scene.objects) or 'none'}"
+            yield (
+                "object",
+                action.object,
+                f"not in the scene; objects: {', '.join(scene.objects) or 'none'}",
+            )
         if robot.gripper is None:
             yield "do", action.do, "the robot has no gripper; permitted: goto, home"
-    if isinstance(action, Goto) and action.joints is not None and len(action.joints) != len(robot.joints):
+    if (
+        isinstance(action, Goto)
+        and action.joints is not None
+        and len(action.joints) != len(robot.joints)
+    ):
         why = f"{len(action.joints)} values; permitted: {len(robot.joints)}, one per joint"
         yield "joints", list(action.joints), why

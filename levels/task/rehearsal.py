@@ -1,4 +1,5 @@
-"""Rehearsal of a program before anything moves: every move is planned as the level below will plan it, and timed."""
+"""Rehearsal of a program before anything moves: every move is planned as the level below will plan
+it, and timed."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class Rehearsed(NamedTuple):
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The result of a sequence of moves. Immutable: `then` returns a new one, so alternatives can start from here."""
+    """The result of a sequence of moves. Immutable: `then` returns a new one, so alternatives can
+    start from here."""
 
     motion: MotionPlanner
     q: Array  # configuration at the end, (joints,), rad
@@ -35,11 +37,18 @@ class Rehearsal:
     moves: tuple[Rehearsed, ...] = ()
 
     def then(
-        self, action: int, verb: Verb, *, tool: Pose | None = None, row: int | None = None, joints: Array | None = None
+        self,
+        action: int,
+        verb: Verb,
+        *,
+        tool: Pose | None = None,
+        row: int | None = None,
+        joints: Array | None = None,
     ) -> Rehearsal:
         """Return the rehearsal after one more move; `joints` is its goal, or the posture at `tool`.
 
-        Without `tool` the move ends at `joints`, or where the tool is. Raises `Refused` when the move cannot be done.
+        Without `tool` the move ends at `joints`, or where the tool is. Raises `Refused` when the
+        move cannot be done.
         """
         ends_at = self.q if joints is None else joints
         move = Move(
@@ -53,7 +62,11 @@ class Rehearsal:
             by_s=0.0,
         )
         if not move.is_motion:
-            return replace(self, situation=self.situation.after(move), moves=(*self.moves, Rehearsed(move, 0.0)))
+            return replace(
+                self,
+                situation=self.situation.after(move),
+                moves=(*self.moves, Rehearsed(move, 0.0)),
+            )
         # One search is enough: the level below takes the quickest of several, this one among them.
         path = self.motion.plan(move, self.q, self.situation, searches=1)
         rehearsed = Rehearsed(move, self.motion.paths.duration(path))
@@ -71,7 +84,9 @@ class PipelinePeriods(NamedTuple):
 def pipeline_periods(context: LevelContext) -> PipelinePeriods:
     """Return the periods of a task level. Raises `LevelError` if it has no level below."""
     if not context.below:
-        raise LevelError(f"level '{context.board}' has no level below; it needs one to carry out its moves")
+        raise LevelError(
+            f"level '{context.board}' has no level below; it needs one to carry out its moves"
+        )
     (below,) = context.below.values()
     below_s = below.every * context.tick_s
     return PipelinePeriods(context.period_s, below_s, below_s * below.within_cycles)
@@ -80,11 +95,13 @@ def pipeline_periods(context: LevelContext) -> PipelinePeriods:
 def finish_times(
     moves: Sequence[Rehearsed], visible_s: float, periods: PipelinePeriods, needs: TaskParams
 ) -> list[float]:
-    """Return for every move the latest simulated time, in s, at which the task level reads that it is done.
+    """Return for every move the latest simulated time, in s, at which the task level reads that it
+    is done.
 
-    `visible_s` is when the first window of moves becomes visible below. A move begins when the one before it is done,
-    its path is planned, and the window of segments has room for it; each message waits at most one cycle to be read
-    and one to be seen. The result assumes that nothing is in the way.
+    `visible_s` is when the first window of moves becomes visible below. A move begins when the one
+    before it is done, its path is planned, and the window of segments has room for it; each message
+    waits at most one cycle to be read and one to be seen. The result assumes that nothing is in the
+    way.
     """
     below = periods.below_s
     done: list[float] = []
@@ -94,7 +111,8 @@ def finish_times(
         if k >= WINDOW:
             shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * periods.own_s)
         if move.is_motion:
-            # The planner makes one plan after the other; only a move that it has waited for costs a cycle more.
+            # The planner makes one plan after the other; only a move that it has waited for costs a
+            # cycle more.
             planned = max(planned, shown + below) + periods.planning_s
         at_hand = max(planned, shown) if move.is_motion else shown
         room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0

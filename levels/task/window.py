@@ -1,7 +1,9 @@
-"""The moves that the task level shows to the level below: a window on the plan, or an operator's goto instead.
+"""The moves that the task level shows to the level below: a window on the plan, or an operator's
+goto instead.
 
-A goto interrupts the program during a free motion or right after one; that motion is repeated afterwards, from the
-arm's position at that time. Work on an object is completed first: approach, grasp, depart.
+A goto interrupts the program during a free motion or right after one; that motion is repeated
+afterwards, from the arm's position at that time. Work on an object is completed first: approach,
+grasp, depart.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class ShownWindow:
         return int(below.done) - self.first + 1
 
     def breaking_off(self, plan: Message, done: int, below: Message) -> tuple[int, bool]:
-        """Return the first move that must not begin so that the plan is broken off, and whether the arm may rest now.
+        """Return the first move that must not begin so that the plan is broken off, and whether the
+        arm may rest now.
 
         It may during a free motion and right after one; else the work on an object comes first.
         """
@@ -60,7 +63,8 @@ class ShownWindow:
         return done, True
 
     def show(self, plan: Message, done: int, command: Message, until: int) -> None:
-        """Show the moves from the first one that is not done up to `until`; after the last, the window stays.
+        """Show the moves from the first one that is not done up to `until`; after the last, the
+        window stays.
 
         Moves that were done under other ids are not shown again: the level below would repeat them.
         """
@@ -89,19 +93,23 @@ class ShownWindow:
 
 
 def is_free(plan: Message, k: int) -> bool:
-    """Return whether move `k` of the plan is a free motion; before the first and after the last move, True."""
+    """Return whether move `k` of the plan is a free motion; before the first and after the last
+    move, True."""
     return not 0 <= k < plan.count or int(plan.moves["verb"][k]) in FREE
 
 
 def next_free(plan: Message, done: int) -> int:
-    """Return the first free motion of the plan from move `done` on; without one, the end of the plan."""
+    """Return the first free motion of the plan from move `done` on; without one, the end of the
+    plan."""
     return next(k for k in range(done, plan.count + 1) if is_free(plan, k))
 
 
 class Detour:
     """An operator's goto: one move instead of the program's, then the rest of the program."""
 
-    def __init__(self, robot: RobotConfig, orders: Orders, window: ShownWindow, move: int = 0) -> None:
+    def __init__(
+        self, robot: RobotConfig, orders: Orders, window: ShownWindow, move: int = 0
+    ) -> None:
         self._robot = robot
         self._orders = orders
         self._window = window
@@ -113,7 +121,8 @@ class Detour:
 
     @property
     def is_known(self) -> bool:
-        """False if this board was restarted and a hold came after the goto: the goal is then lost."""
+        """False if this board was restarted and a hold came after the goto: the goal is then
+        lost."""
         return self._goal is not None
 
     def reason(self) -> str:
@@ -123,7 +132,8 @@ class Detour:
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def begin(self, message: Message, is_new: bool) -> None:
-        """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under its id."""
+        """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
+        its id."""
         goal = Message(message.record.dtype)
         goal.copy_from(message)
         try:
@@ -138,7 +148,8 @@ class Detour:
         self._is_new = is_new
 
     def step(self, plan: Message, done: int, below: Message) -> int:
-        """Advance by one cycle; return how many of the plan's moves are done: `done`, or one less."""
+        """Advance by one cycle; return how many of the plan's moves are done: `done`, or one
+        less."""
         self.holds = False
         self.until = None
         standing = self._orders.standing
@@ -155,11 +166,13 @@ class Detour:
         return done
 
     def _leave(self, plan: Message, done: int, below: Message) -> int:
-        """Interrupt the program where possible; until then show only the moves that must be done first."""
+        """Interrupt the program where possible; until then show only the moves that must be done
+        first."""
         self.until, self.holds = self._window.breaking_off(plan, done, below)
         if not self.holds:
             return done
-        # At rest, the program can be interrupted once the level below has received the window without further moves.
+        # At rest, the program can be interrupted once the level below has received the window
+        # without further moves.
         if below.resting and below.operator >= self._orders.basis:
             self.move = self._window.jump()
             self.holds = False
@@ -167,7 +180,8 @@ class Detour:
         return done
 
     def as_move(self, action: int) -> Move:
-        """Return the goto as a move; `action` is the program's next, though the move serves none."""
+        """Return the goto as a move; `action` is the program's next, though the move serves
+        none."""
         goal = self._goal
         assert goal is not None, "there is a move only for a goal"
         joints = np.array(self._robot.home)

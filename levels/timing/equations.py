@@ -1,9 +1,10 @@
 """The paper's timing model, equations 3.1 to 3.10, as plain functions (NISTIR 90-4251, section 3).
 
-All times are in ns. An equation that a level can fail returns both of its sides as a `Relation`; one that defines a
-time returns that time. The paper's symbols: R_i is a level's response time, which is its cycle; R_max the longest cycle
-of all levels; t_exec the executor's processing in a cycle; t_comm its reading and writing, waiting included; t_residual
-the rest of the cycle; t_plan one plan with its update; d the cycles that a plan may take; t_cs one context switch.
+All times are in ns. An equation that a level can fail returns both of its sides as a `Relation`;
+one that defines a time returns that time. The paper's symbols: R_i is a level's response time,
+which is its cycle; R_max the longest cycle of all levels; t_exec the executor's processing in a
+cycle; t_comm its reading and writing, waiting included; t_residual the rest of the cycle; t_plan
+one plan with its update; d the cycles that a plan may take; t_cs one context switch.
 """
 
 from __future__ import annotations
@@ -22,7 +23,11 @@ SMALL_SHARE = 0.1
 
 Sign = Literal["<", "<=", "="]
 
-_HOLDS: dict[str, Callable[[float, float], bool]] = {"<": operator.lt, "<=": operator.le, "=": operator.eq}
+_HOLDS: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    "=": operator.eq,
+}
 
 
 class Relation(NamedTuple):
@@ -48,7 +53,8 @@ class Relation(NamedTuple):
 
 
 def fits_cycle(processing_ns: float, communication_ns: float, cycle_ns: float) -> Relation:
-    """Compare a level's processing and communication with its cycle: t_proc + t_c <= R_i (eq. 3.1)."""
+    """Compare a level's processing and communication with its cycle: t_proc + t_c <= R_i (eq.
+    3.1)."""
     return Relation(processing_ns + communication_ns, "<=", cycle_ns)
 
 
@@ -57,29 +63,37 @@ def system_response_bound_ns(cycles_ns: Sequence[float]) -> float:
     return len(cycles_ns) * max(cycles_ns)
 
 
-def system_response_ns(machine_cycles_ns: Sequence[float], goal_cycles_ns: Sequence[float]) -> float:
+def system_response_ns(
+    machine_cycles_ns: Sequence[float], goal_cycles_ns: Sequence[float]
+) -> float:
     """Return the system's response time: R_s = sum of R_i + sum of R_j (eq. 3.3).
 
-    `machine_cycles_ns` are tied to the update rate of the machine, `goal_cycles_ns` chosen to meet the goal.
+    `machine_cycles_ns` are tied to the update rate of the machine, `goal_cycles_ns` chosen to meet
+    the goal.
     """
     return sum(machine_cycles_ns) + sum(goal_cycles_ns)
 
 
 def grid_wait(written: TickGrid, read: TickGrid) -> int:
-    """Return the longest time, ticks, from a message on the grid of its writer to the next read (eq. 3.7)."""
+    """Return the longest time, ticks, from a message on the grid of its writer to the next read
+    (eq. 3.7)."""
     common = gcd(written.every, read.every)
     return read.every - common + (read.phase - written.phase) % common
 
 
 def response_ticks(cycles: Sequence[int], waits: Sequence[int] | None = None) -> int:
-    """Return the longest time from the first level's release to the end of the last level's cycle that acts on it.
+    """Return the longest time from the first level's release to the end of the last level's cycle
+    that acts on it.
 
-    `cycles` are in ticks, in the order in which the information passes. Each level takes its cycle (eq. 3.3); a message
-    also waits for its next read on the common grid. `waits` are those times (`grid_wait`), by default of levels without
-    phases that read in every cycle: a wait is 0 if the reader's cycle divides the writer's.
+    `cycles` are in ticks, in the order in which the information passes. Each level takes its cycle
+    (eq. 3.3); a message also waits for its next read on the common grid. `waits` are those times
+    (`grid_wait`), by default of levels without phases that read in every cycle: a wait is 0 if the
+    reader's cycle divides the writer's.
     """
     if waits is None:
-        waits = [grid_wait(TickGrid(earlier), TickGrid(later)) for earlier, later in pairwise(cycles)]
+        waits = [
+            grid_wait(TickGrid(earlier), TickGrid(later)) for earlier, later in pairwise(cycles)
+        ]
     return sum(cycles) + sum(waits)
 
 
@@ -89,12 +103,14 @@ def executes_in_time(execution_ns: float, longest_cycle_ns: float) -> Relation:
 
 
 def response_time_ns(execution_ns: float, communication_ns: float, residual_ns: float) -> float:
-    """Return a level's response time from its parts: R_i = t_exec + t_comm + t_residual (eq. 3.5)."""
+    """Return a level's response time from its parts: R_i = t_exec + t_comm + t_residual (eq.
+    3.5)."""
     return execution_ns + communication_ns + residual_ns
 
 
 def residual_ns(cycle_ns: float, execution_ns: float, communication_ns: float) -> float:
-    """Return the rest of a cycle, t_residual = R_i - t_exec - t_comm (eq. 3.5); negative if the cycle is too short."""
+    """Return the rest of a cycle, t_residual = R_i - t_exec - t_comm (eq. 3.5); negative if the
+    cycle is too short."""
     return cycle_ns - execution_ns - communication_ns
 
 
@@ -107,10 +123,14 @@ def parts_make_cycle(execution_ns: float, communication_ns: float, cycle_ns: flo
     return Relation(response_time_ns(execution_ns, communication_ns, left_ns), "=", cycle_ns)
 
 
-def residual_bound_ns(cycle_ns: float, executions_ns: Sequence[float], communications_ns: Sequence[float]) -> float:
-    """Return alpha, the residual guaranteed in the worst cycle (eq. 3.6); negative if there is none.
+def residual_bound_ns(
+    cycle_ns: float, executions_ns: Sequence[float], communications_ns: Sequence[float]
+) -> float:
+    """Return alpha, the residual guaranteed in the worst cycle (eq. 3.6); negative if there is
+    none.
 
-    The longest execution and the longest communication count, even if they fell into different cycles.
+    The longest execution and the longest communication count, even if they fell into different
+    cycles.
     """
     return residual_ns(cycle_ns, max(executions_ns), max(communications_ns))
 
@@ -120,23 +140,31 @@ def residual_is_left(residual_ns: float) -> Relation:
     return Relation(0, "<", residual_ns)
 
 
-def residual_deviation_ns(executions_ns: Sequence[float], communications_ns: Sequence[float]) -> float:
-    """Return the standard deviation of the residual from cycle to cycle: smooth motion needs a small one (eq. 3.6)."""
+def residual_deviation_ns(
+    executions_ns: Sequence[float], communications_ns: Sequence[float]
+) -> float:
+    """Return the standard deviation of the residual from cycle to cycle: smooth motion needs a
+    small one (eq. 3.6)."""
     return pstdev([e + c for e, c in zip(executions_ns, communications_ns, strict=True)])
 
 
 def cycle_start_ns(first_ns: int, period_ns: int, cycle: int) -> int:
-    """Return the start of a cycle on the fixed grid of the system clock: t_(k+1) = t_k + c (eq. 3.7)."""
+    """Return the start of a cycle on the fixed grid of the system clock: t_(k+1) = t_k + c (eq.
+    3.7)."""
     return first_ns + cycle * period_ns
 
 
 def cycle_is_on_grid(cycle_ns: float, clock_ns: int) -> Relation:
-    """Compare a cycle with the nearest whole number of clock periods: R_i = k c (required by eq. 3.7)."""
+    """Compare a cycle with the nearest whole number of clock periods: R_i = k c (required by eq.
+    3.7)."""
     return Relation(cycle_ns, "=", cycle_start_ns(0, clock_ns, max(round(cycle_ns / clock_ns), 1)))
 
 
-def plan_fits_tight(plan_ns: float, cycles: int, residual_ns: float, context_switch_ns: float) -> Relation:
-    """Compare a planner on its executor's processor with the residual: t_plan / d < t_residual - 2 t_cs (eq. 3.8).
+def plan_fits_tight(
+    plan_ns: float, cycles: int, residual_ns: float, context_switch_ns: float
+) -> Relation:
+    """Compare a planner on its executor's processor with the residual: t_plan / d < t_residual - 2
+    t_cs (eq. 3.8).
 
     `plan_ns` includes the update of the plan.
     """
@@ -150,17 +178,22 @@ def plan_cycles_tight(plan_ns: float, residual_ns: float, context_switch_ns: flo
 
 
 def plan_fits_loose(plan_ns: float, cycles: int, cycle_ns: float) -> Relation:
-    """Compare a planner on its own processor with its time slice: t_plan <= d R_i (section 3.4, fig. 4)."""
+    """Compare a planner on its own processor with its time slice: t_plan <= d R_i (section 3.4,
+    fig. 4)."""
     return Relation(plan_ns, "<=", cycles * cycle_ns)
 
 
 def communication_ns(interlevel_ns: float, executor_planner_ns: float) -> float:
-    """Return a level's communication in a cycle: t_comm = t_interlevel + t_executor-planner (eq. 3.9)."""
+    """Return a level's communication in a cycle: t_comm = t_interlevel + t_executor-planner (eq.
+    3.9)."""
     return interlevel_ns + executor_planner_ns
 
 
 def response_time_tight_ns(
-    execution_ns: float, communication_ns: float, plan_and_residual_ns: float, context_switch_ns: float
+    execution_ns: float,
+    communication_ns: float,
+    plan_and_residual_ns: float,
+    context_switch_ns: float,
 ) -> float:
     """Return the response time of a level whose planner shares its executor's processor (eq. 3.9).
 
@@ -172,11 +205,15 @@ def response_time_tight_ns(
 def leaves_time_to_plan(
     execution_ns: float, communication_ns: float, context_switch_ns: float, cycle_ns: float
 ) -> Relation:
-    """Compare a cycle without its planning with the whole: t_exec + t_comm + 2 t_cs < R_i (eq. 3.9).
+    """Compare a cycle without its planning with the whole: t_exec + t_comm + 2 t_cs < R_i (eq.
+    3.9).
 
-    The margin is t_(plan+residual). `communication_ns` is of the worst cycle, in which the plan is updated.
+    The margin is t_(plan+residual). `communication_ns` is of the worst cycle, in which the plan is
+    updated.
     """
-    return Relation(response_time_tight_ns(execution_ns, communication_ns, 0, context_switch_ns), "<", cycle_ns)
+    return Relation(
+        response_time_tight_ns(execution_ns, communication_ns, 0, context_switch_ns), "<", cycle_ns
+    )
 
 
 def plan_update_share(executor_planner_ns: float, cycle_ns: float) -> float:
@@ -184,8 +221,11 @@ def plan_update_share(executor_planner_ns: float, cycle_ns: float) -> float:
     return executor_planner_ns / cycle_ns
 
 
-def coupling_may_be_tight(executor_planner_ns: float, cycle_ns: float, small: float = SMALL_SHARE) -> Relation:
-    """Compare the plan's update with a small share of the cycle: t_executor-planner << R_i (eq. 3.10).
+def coupling_may_be_tight(
+    executor_planner_ns: float, cycle_ns: float, small: float = SMALL_SHARE
+) -> Relation:
+    """Compare the plan's update with a small share of the cycle: t_executor-planner << R_i (eq.
+    3.10).
 
     Both sides are shares of the cycle. If it fails, planner and executor should be split.
     """

@@ -15,10 +15,11 @@ from rack.levels.timing.verdicts import EquationVerdict, verdicts
 
 @dataclass(frozen=True)
 class Forecast:
-    """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the prediction.
+    """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the
+    prediction.
 
-    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it.
-    `schedule` is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
+    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it. `schedule`
+    is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
     """
 
     system: Prediction
@@ -35,7 +36,8 @@ class Forecast:
 
     @classmethod
     def of(cls, rack: RackTiming, has_cores: bool = True) -> Forecast:
-        """Return the forecast of a rack; `has_cores` is false if this machine lacks cores that the config asks for."""
+        """Return the forecast of a rack; `has_cores` is false if this machine lacks cores that the
+        config asks for."""
         return cls(
             system=predict(rack),
             context_switch_ns=rack.context_switch_ns,
@@ -44,7 +46,8 @@ class Forecast:
             responses=task_responses(rack.tasks, rack.context_switch_ns),
             loads=rack.loads,
             inboxes=tuple(
-                inbox.document(rack.slice_ticks(name) * rack.clock_ns) for name, inbox in rack.inboxes.items()
+                inbox.document(rack.slice_ticks(name) * rack.clock_ns)
+                for name, inbox in rack.inboxes.items()
             ),
             tick_ns=rack.tick_ns,
             schedule=rack.schedule,
@@ -76,30 +79,53 @@ class Forecast:
         """Return the static schedule as plain data; None: there is none."""
         if self.schedule is None:
             return None
-        sizes = {f"{name}_ms": ticks * self.tick_ns * 1e-6 for name, ticks in self.schedule._asdict().items()}
+        sizes = {
+            f"{name}_ms": ticks * self.tick_ns * 1e-6
+            for name, ticks in self.schedule._asdict().items()
+        }
         return {**sizes, "cores": [found.document() for found in self.frames]}
 
 
 def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
-    if queues := [queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues]:
+    if queues := [
+        queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
+    ]:
         yield f"the system's response is that of empty queues: {', '.join(queues)}"
     if rack.inboxes:
-        yield f"the system's response leaves out how long messages wait to be served: {', '.join(rack.inboxes)}"
+        yield (
+            "the system's response leaves out how long messages wait to be served:"
+            f" {', '.join(rack.inboxes)}"
+        )
     known = [board for board in rack.boards.values() if board.budget is not None]
     if known and rack.is_lockstep:
-        yield "in lockstep a tick waits for late tasks; this is the timing of the same rack in real time"
+        yield (
+            "in lockstep a tick waits for late tasks; this is the timing of the same rack in real"
+            " time"
+        )
     if known and rack.speed != 1.0:
-        yield f"times are of the wall clock: speed {rack.speed:g} changes the cycles, not the budgets"
+        yield (
+            f"times are of the wall clock: speed {rack.speed:g} changes the cycles, not the budgets"
+        )
     if known and not has_cores:
         yield "cores are those of the config; this machine lacks some of them"
     if without := [name for name, board in rack.boards.items() if board.budget is None]:
         names = ", ".join(without)
-        yield f"no budget, so not judged and not counted (set one in the config, or use --from RUN): {names}"
-    if silent := [board.name for board in known if board.has_planner and not board.is_plan_budgeted]:
+        yield (
+            "no budget, so not judged and not counted (set one in the config, or use --from RUN):"
+            f" {names}"
+        )
+    if silent := [
+        board.name for board in known if board.has_planner and not board.is_plan_budgeted
+    ]:
         yield f"planner not judged, no plan_ms in the budget: {', '.join(silent)}"
     if not rack.clock.cost_ns:
         yield "the clock is not counted on its core: timing.clock_ms is 0"
     sharing = [task for task in rack.tasks if task.cost_ns and not task.priority]
-    crowded = [task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1]
+    crowded = [
+        task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1
+    ]
     if crowded:
-        yield f"ordinary scheduling guarantees nothing; bounds that assume fair turns: {', '.join(crowded)}"
+        yield (
+            "ordinary scheduling guarantees nothing; bounds that assume fair turns:"
+            f" {', '.join(crowded)}"
+        )

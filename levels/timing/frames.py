@@ -1,8 +1,10 @@
-"""Static cyclic schedules: every board has its place in minor frames, which repeat with the major frame.
+"""Static cyclic schedules: every board has its place in minor frames, which repeat with the major
+frame.
 
-The terms are those of T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time Systems 1 (1989). A
-board's cycle is a whole number of minor frames and divides the major one; its phase is its place in them. Boards whose
-places are in one tick follow each other by priority. Planners have no place: they plan in the slack.
+The terms are those of T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time
+Systems 1 (1989). A board's cycle is a whole number of minor frames and divides the major one; its
+phase is its place in them. Boards whose places are in one tick follow each other by priority.
+Planners have no place: they plan in the slack.
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ Work = dict[tuple[str, int], list[Span]]
 
 @dataclass(frozen=True)
 class FramePlace:
-    """A board in a frame, ns from the frame's start: it begins at `offset_ns` and must be done by `limit_ns`.
+    """A board in a frame, ns from the frame's start: it begins at `offset_ns` and must be done by
+    `limit_ns`.
 
-    `job_ns` is its budget with two context switches. `slack_ns` is the time from its end to the limit; negative: so
-    much of its work is left then. `until` is the board that begins at the limit; empty: the frame ends there.
+    `job_ns` is its budget with two context switches. `slack_ns` is the time from its end to the
+    limit; negative: so much of its work is left then. `until` is the board that begins at the
+    limit; empty: the frame ends there.
     """
 
     board: str
@@ -50,7 +54,8 @@ class FramePlace:
 
 @dataclass(frozen=True)
 class CoreFrames:
-    """Frames of one core, by number in the major frame, in which the same boards have the same places."""
+    """Frames of one core, by number in the major frame, in which the same boards have the same
+    places."""
 
     core: int
     frames: tuple[int, ...]
@@ -60,16 +65,22 @@ class CoreFrames:
         """Return it as plain data; times are ms."""
         names = ("offset", "job", "limit", "slack")
         places = [
-            {"board": p.board, "until": p.until, **{f"{n}_ms": getattr(p, f"{n}_ns") * 1e-6 for n in names}}
+            {
+                "board": p.board,
+                "until": p.until,
+                **{f"{n}_ms": getattr(p, f"{n}_ns") * 1e-6 for n in names},
+            }
             for p in self.places
         ]
         return {"core": self.core, "frames": list(self.frames), "places": places}
 
 
 def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
-    """Return the distinct frames of every core, in the order of their first; none without a static schedule.
+    """Return the distinct frames of every core, in the order of their first; none without a static
+    schedule.
 
-    They are those of the second major frame: boards that are late in the first have their effect there.
+    They are those of the second major frame: boards that are late in the first have their effect
+    there.
     """
     if rack.schedule is None:
         return ()
@@ -89,7 +100,9 @@ def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
         for frame in range(major // minor):
             if places := tuple(_places(own, work, major + frame * minor, minor)):
                 found[core, places].append(frame)
-    return tuple(CoreFrames(core, tuple(frames), places) for (core, places), frames in found.items())
+    return tuple(
+        CoreFrames(core, tuple(frames), places) for (core, places), frames in found.items()
+    )
 
 
 def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> Iterator[FramePlace]:
@@ -99,9 +112,14 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
         for task in tasks
         if (task.phase_ns - start) % task.every_ns < minor
     ]
-    groups = [[task for *_, task in group] for _, group in groupby(sorted(released), key=lambda one: one[0])]
+    groups = [
+        [task for *_, task in group]
+        for _, group in groupby(sorted(released), key=lambda one: one[0])
+    ]
     times = [*sorted({release for release, *_ in released}), start + minor]
-    for group, release, following, limit in zip(groups, times, [*groups[1:], []], times[1:], strict=False):
+    for group, release, following, limit in zip(
+        groups, times, [*groups[1:], []], times[1:], strict=False
+    ):
         begins = release
         for task, after in zip(group, [*group[1:], *following[:1], None], strict=False):
             is_last = task is group[-1]

@@ -12,8 +12,9 @@ from rack.backplane.mailbox.inbox import Burst, InterruptSource, burst_of
 class InboxTiming:
     """The inbox of a board, served by its task `task`; `depth` messages may wait.
 
-    `mailboxes` are those whose messages interrupt it, `sources` their periods and services, in the same order; ns of
-    simulated time. A mailbox that is not written in every cycle counts as if it were.
+    `mailboxes` are those whose messages interrupt it, `sources` their periods and services, in the
+    same order; ns of simulated time. A mailbox that is not written in every cycle counts as if it
+    were.
     """
 
     task: str

@@ -28,14 +28,16 @@ class CyclicSchedule(NamedTuple):
 
 @dataclass(frozen=True)
 class BoardTiming:
-    """One board. `every` is its cycle, `phase` its first release, in ticks; cores are those that the config asks for.
+    """One board. `every` is its cycle, `phase` its first release, in ticks; cores are those that
+    the config asks for.
 
-    `above` and `below` name each other: a board is above all that it lists below, and all that list it above.
+    `above` and `below` name each other: a board is above all that it lists below, and all that list
+    it above.
 
-    `is_critical` is true if the plan update is the paper's critical section: it keeps the executor waiting. `budget` is
-    None if unknown. `plan_within_ns` is the time within which the config wants a new plan, wall clock. `queues` are the
-    mailboxes in which messages wait for it. `reads` holds the ticks at which it reads the messages of another board, by
-    that board, if not in every cycle.
+    `is_critical` is true if the plan update is the paper's critical section: it keeps the executor
+    waiting. `budget` is None if unknown. `plan_within_ns` is the time within which the config wants
+    a new plan, wall clock. `queues` are the mailboxes in which messages wait for it. `reads` holds
+    the ticks at which it reads the messages of another board, by that board, if not in every cycle.
     """
 
     name: str
@@ -67,12 +69,14 @@ class BoardTiming:
 
     @property
     def is_plan_budgeted(self) -> bool:
-        """Whether the budget covers its planner: in a measured run the planner may have made no plan."""
+        """Whether the budget covers its planner: in a measured run the planner may have made no
+        plan."""
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
 
 
 def spanned(names: Sequence[str]) -> str:
-    """Return names as text; of three or more that are numbered in order the first and the last, "joint1 ... joint6"."""
+    """Return names as text; of three or more that are numbered in order the first and the last,
+    "joint1 ... joint6"."""
     rows: list[list[str]] = []
     for name in names:
         if rows and name == _following(rows[-1][-1]):
@@ -90,7 +94,8 @@ def _following(name: str) -> str:
 
 @dataclass(frozen=True)
 class ParallelChains:
-    """Chains of boards, highest first, of equal cycles, in ticks: every combination of the boards of each level.
+    """Chains of boards, highest first, of equal cycles, in ticks: every combination of the boards
+    of each level.
 
     A rack with a board for every joint has one chain for each, and one answer for all of them.
     """
@@ -101,7 +106,9 @@ class ParallelChains:
     @property
     def levels(self) -> tuple[str, ...]:
         """The boards of each level, as text."""
-        return tuple(spanned(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True))
+        return tuple(
+            spanned(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True)
+        )
 
     @property
     def text(self) -> str:
@@ -113,9 +120,9 @@ class ParallelChains:
 class LevelTiming:
     """One level in the worst case, ns of the wall clock.
 
-    `cycle_ns` is R_i, `longest_cycle_ns` is R_max (see `RackTiming.longest_cycles`). `exchange_ns` (C) and `update_ns`
-    (U) pass the plan between planner and executor. `within_cycles` is d; it and `plan_ns` (P) are None without a
-    planner, or if the budget does not cover it.
+    `cycle_ns` is R_i, `longest_cycle_ns` is R_max (see `RackTiming.longest_cycles`). `exchange_ns`
+    (C) and `update_ns` (U) pass the plan between planner and executor. `within_cycles` is d; it and
+    `plan_ns` (P) are None without a planner, or if the budget does not cover it.
     """
 
     board: str
@@ -143,12 +150,14 @@ class LevelTiming:
 
     @property
     def executor_planner_ns(self) -> int:
-        """t_executor-planner of eqs 3.9 and 3.10: the plan read and updated, C and U, both in the worst cycle."""
+        """t_executor-planner of eqs 3.9 and 3.10: the plan read and updated, C and U, both in the
+        worst cycle."""
         return self.exchange_ns + self.update_ns
 
     @property
     def residual_ns(self) -> int:
-        """t_residual of eq. 3.5, and alpha of eq. 3.6: the budget's times are the longest of all cycles."""
+        """t_residual of eq. 3.5, and alpha of eq. 3.6: the budget's times are the longest of all
+        cycles."""
         return round(residual_ns(self.cycle_ns, self.execution_ns, self.communication_ns))
 
     @property
@@ -163,7 +172,13 @@ class LevelTiming:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        derived = ("communication_ns", "executor_planner_ns", "residual_ns", "planning_ns", "slice_ns")
+        derived = (
+            "communication_ns",
+            "executor_planner_ns",
+            "residual_ns",
+            "planning_ns",
+            "slice_ns",
+        )
         return asdict(self) | {name: getattr(self, name) for name in derived}
 
 
@@ -171,11 +186,12 @@ class LevelTiming:
 class RackTiming:
     """The data of a rack for the timing model.
 
-    `clock_ns` is one tick of simulated time. `clock` is the task of the system clock, released every tick of the wall
-    clock; its cost is 0 if unknown. `context_switch_ns` is t_cs, `small_share` the limit of eq. 3.10.
-    `response_goal_ns` is the goal for the system's response, simulated time. Budgets are processor times: a `speed`
-    factor shortens the cycles, not the budgets. `inboxes`, by task, are those of boards that messages interrupt;
-    budgets do not include what that costs.
+    `clock_ns` is one tick of simulated time. `clock` is the task of the system clock, released
+    every tick of the wall clock; its cost is 0 if unknown. `context_switch_ns` is t_cs,
+    `small_share` the limit of eq. 3.10. `response_goal_ns` is the goal for the system's response,
+    simulated time. Budgets are processor times: a `speed` factor shortens the cycles, not the
+    budgets. `inboxes`, by task, are those of boards that messages interrupt; budgets do not include
+    what that costs.
     """
 
     is_lockstep: bool
@@ -200,7 +216,8 @@ class RackTiming:
 
     @cached_property
     def chains(self) -> tuple[tuple[str, ...], ...]:
-        """Every chain of boards from a highest to a lowest; a rack with a board per joint has one for every joint."""
+        """Every chain of boards from a highest to a lowest; a rack with a board per joint has one
+        for every joint."""
         lowest = [board.name for board in self.boards.values() if board.above and not board.below]
         return tuple(chain for name in lowest for chain in self._chains((name,)))
 
@@ -214,7 +231,8 @@ class RackTiming:
 
     @cached_property
     def parallel(self) -> tuple[ParallelChains, ...]:
-        """All chains: those of equal cycles together where they are every combination of their boards."""
+        """All chains: those of equal cycles together where they are every combination of their
+        boards."""
         by_cycles: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
         for chain in self.chains:
             by_cycles.setdefault(tuple(self.boards[name].every for name in chain), []).append(chain)
@@ -239,9 +257,12 @@ class RackTiming:
         return max((self.response_ticks(chain[::-1]) for chain in chains.chains), default=0)
 
     def response_ticks(self, boards: Sequence[str]) -> int:
-        """Return the longest response along boards, in the order in which the information passes, ticks."""
+        """Return the longest response along boards, in the order in which the information passes,
+        ticks."""
         passed = [self.boards[name] for name in boards]
-        waits = [grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)]
+        waits = [
+            grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)
+        ]
         return response_ticks([board.every for board in passed], waits)
 
     @cached_property
@@ -250,29 +271,37 @@ class RackTiming:
         found: list[frozenset[str]] = []
         for chain in self.chains:
             joined = [boards for boards in found if not boards.isdisjoint(chain)]
-            found = [boards for boards in found if boards.isdisjoint(chain)] + [frozenset(chain).union(*joined)]
+            found = [boards for boards in found if boards.isdisjoint(chain)] + [
+                frozenset(chain).union(*joined)
+            ]
         return tuple(found)
 
     @cached_property
     def ranks(self) -> tuple[tuple[str, ...], ...]:
-        """The boards of all chains by level, the highest first: each as far down as its longest chain from above."""
+        """The boards of all chains by level, the highest first: each as far down as its longest
+        chain from above."""
         depth: dict[str, int] = {}
         for chain in self.chains:
             for at, name in enumerate(chain):
                 depth[name] = max(at, depth.get(name, 0))
-        return tuple(tuple(name for name in depth if depth[name] == at) for at in sorted(set(depth.values())))
+        return tuple(
+            tuple(name for name in depth if depth[name] == at) for at in sorted(set(depth.values()))
+        )
 
     @cached_property
     def longest_cycles(self) -> dict[str, float]:
         """R_max by board, in ticks: the longest cycle that a level may have.
 
-        With a goal for the response it is R_s / n (eq. 3.2), n being the levels of the longest chain through the board;
-        otherwise the longest cycle in its hierarchy. A board outside of all hierarchies has its own cycle.
+        With a goal for the response it is R_s / n (eq. 3.2), n being the levels of the longest
+        chain through the board; otherwise the longest cycle in its hierarchy. A board outside of
+        all hierarchies has its own cycle.
         """
         found = {name: float(board.every) for name, board in self.boards.items()}
         if self.response_goal_ns is None:
             for boards in self.connected:
-                found |= dict.fromkeys(boards, float(max(self.boards[name].every for name in boards)))
+                found |= dict.fromkeys(
+                    boards, float(max(self.boards[name].every for name in boards))
+                )
         else:
             for chain in sorted(self.chains, key=len):
                 found |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
@@ -301,7 +330,8 @@ class RackTiming:
         )
 
     def interrupted_ns(self, task: str) -> int:
-        """Return the processor time that interrupts take from a task in a cycle, or in a plan; 0 if it serves none."""
+        """Return the processor time that interrupts take from a task in a cycle, or in a plan; 0 if
+        it serves none."""
         inbox = self.inboxes.get(task)
         return 0 if inbox is None else inbox.cost_ns(self.slice_ticks(task) * self.clock_ns)
 
@@ -313,7 +343,11 @@ class RackTiming:
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
         """The timing of every level that has a budget, by board."""
-        return {name: self.level(name) for name, board in self.boards.items() if board.budget is not None}
+        return {
+            name: self.level(name)
+            for name, board in self.boards.items()
+            if board.budget is not None
+        }
 
     @cached_property
     def tasks(self) -> tuple[TimedTask, ...]:
@@ -357,7 +391,8 @@ class RackTiming:
 
     @cached_property
     def cores(self) -> dict[str, int]:
-        """The cores that the config asks for, by task, the clock's first; this machine may lack some."""
+        """The cores that the config asks for, by task, the clock's first; this machine may lack
+        some."""
         found = {self.clock.name: self.clock.core}
         for board in self.boards.values():
             found[board.name] = board.core

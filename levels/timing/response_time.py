@@ -1,14 +1,17 @@
-"""Worst-case response times of tasks that share a core under fixed priorities: exact analysis, beyond the paper.
+"""Worst-case response times of tasks that share a core under fixed priorities: exact analysis,
+beyond the paper.
 
-The recurrence is M. Joseph and P. Pandya's, *Finding Response Times in a Real-Time System*, The Computer Journal 29
-(1986); with blocking and release jitter it is N. Audsley et al.'s, *Applying New Scheduling Theory to Static Priority
-Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
+The recurrence is M. Joseph and P. Pandya's, *Finding Response Times in a Real-Time System*, The
+Computer Journal 29 (1986); with blocking and release jitter it is N. Audsley et al.'s, *Applying
+New Scheduling Theory to Static Priority Pre-emptive Scheduling*, Software Engineering Journal 8
+(1993):
 
     R = w + J,  w = B + C + sum over all tasks above of ceil((w + J_j) / T_j) C_j.
 
-This is the response of a job released together with all tasks above it. A rack without phases releases all tasks
-together at tick 0, so the bound is attained. Phases may keep tasks apart for ever, as in a static cyclic schedule: then
-response times are those of the schedule itself, which repeats. Times are integers in one unit; a rack uses ns.
+This is the response of a job released together with all tasks above it. A rack without phases
+releases all tasks together at tick 0, so the bound is attained. Phases may keep tasks apart for
+ever, as in a static cyclic schedule: then response times are those of the schedule itself, which
+repeats. Times are integers in one unit; a rack uses ns.
 """
 
 from __future__ import annotations
@@ -29,13 +32,17 @@ Load = tuple[int, int, int]
 """Demand of a task on its core: cost C of a job, period T, release jitter J."""
 
 TURN_NS = 4_000_000
-"""Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own slice is 3 ms)."""
+"""Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own
+slice is 3 ms)."""
 HORIZON_DEADLINES = 10
-"""The search for a response time ends after this many deadlines: near full load it converges too slowly."""
+"""The search for a response time ends after this many deadlines: near full load it converges too
+slowly."""
 MAX_JOBS = 20_000
-"""Limit on the jobs of a schedule that is computed for its response times; beyond it the bound must do."""
+"""Limit on the jobs of a schedule that is computed for its response times; beyond it the bound must
+do."""
 MAX_STEPS = 10_000
-"""Limit on the steps of one search: a 10 us tick against a plan of hours takes too many before any deadline."""
+"""Limit on the steps of one search: a 10 us tick against a plan of hours takes too many before any
+deadline."""
 
 
 def response_time(
@@ -49,25 +56,36 @@ def response_time(
     turn: int = TURN_NS,
     horizon: int | None = None,
 ) -> int | None:
-    """Return the longest time from a job's release to its end; None: no bound, or none within the `horizon`.
+    """Return the longest time from a job's release to its end; None: no bound, or none within the
+    `horizon`.
 
-    `above` are the tasks of higher or equal priority on the core: each delays the job by whole jobs of its own.
-    `blocking` is the longest part of a lower task that cannot be preempted.
+    `above` are the tasks of higher or equal priority on the core: each delays the job by whole jobs
+    of its own. `blocking` is the longest part of a lower task that cannot be preempted.
 
-    Without a `period`, releases do not queue, as in a rack: a late task takes up the newest release and skips the
-    others, so the job finds its task free, and a response longer than the period is a miss. With a `period`, releases
-    queue, and the result is the longest of all jobs in the busy time (Lehoczky 1990), for any deadline.
+    Without a `period`, releases do not queue, as in a rack: a late task takes up the newest release
+    and skips the others, so the job finds its task free, and a response longer than the period is a
+    miss. With a `period`, releases queue, and the result is the longest of all jobs in the busy
+    time (Lehoczky 1990), for any deadline.
 
-    `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits, none of them computes
-    more than it does, plus one `turn`. That bound assumes fair turns, which Linux does not guarantee. The default
-    `horizon` is 100 times the longest time given.
+    `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits,
+    none of them computes more than it does, plus one `turn`. That bound assumes fair turns, which
+    Linux does not guarantee. The default `horizon` is 100 times the longest time given.
     """
     # Below full load a bound exists; near full load the search for it may take too long.
     own = Fraction(cost, period) if period else Fraction(0)
     demand = sum((Fraction(c, t) for c, t, _ in above), own)
     if cost and (demand > 1 or (demand == 1 and not period)):
         return None
-    longest = max([cost, period or 0, blocking, jitter, *(t for _, t, _ in above), *(t for _, t, _ in sharing)])
+    longest = max(
+        [
+            cost,
+            period or 0,
+            blocking,
+            jitter,
+            *(t for _, t, _ in above),
+            *(t for _, t, _ in sharing),
+        ]
+    )
     horizon = 100 * longest if horizon is None else horizon
 
     def work(until: int, jobs: int) -> int:
@@ -93,7 +111,8 @@ def response_time(
 
 
 def _fixed_point(work: Callable[[int], int], guess: int, horizon: int) -> int | None:
-    """Return the smallest w >= `guess` at which all work released before w is done; None if there is none."""
+    """Return the smallest w >= `guess` at which all work released before w is done; None if there
+    is none."""
     for _ in range(MAX_STEPS):
         if guess > horizon:
             break
@@ -111,18 +130,20 @@ def _released(until: int, load: Load) -> int:
 def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[str, int | None]:
     """Return the worst-case response time of every task with a cost, ns, by name.
 
-    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both. None: no bound, or
-    none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each other by whole jobs; tasks under
-    ordinary scheduling (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
-    it does not credit a job for its own parts that cannot be preempted. On a core with phases the schedule itself is
-    exact, if it repeats.
+    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both.
+    None: no bound, or none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each
+    other by whole jobs; tasks under ordinary scheduling (priority 0) take turns. The bound is exact
+    for tasks of different priorities without blocking; it does not credit a job for its own parts
+    that cannot be preempted. On a core with phases the schedule itself is exact, if it repeats.
     """
     busy = [task for task in tasks if task.cost_ns]
     found = {}
     for task in busy:
         others = [other for other in busy if other.core == task.core and other is not task]
         shares = [other for other in others if not task.priority and not other.priority]
-        above = [other for other in others if other.priority >= task.priority and other not in shares]
+        above = [
+            other for other in others if other.priority >= task.priority and other not in shares
+        ]
         found[task.name] = response_time(
             job_ns(task, context_switch_ns),
             [_load(other, context_switch_ns) for other in above],
@@ -137,11 +158,12 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
 
 
 def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, int]:
-    """Return the response times of the tasks of one core, from their schedule; empty where it decides nothing.
+    """Return the response times of the tasks of one core, from their schedule; empty where it
+    decides nothing.
 
-    In the worst case every job takes its whole budget: under fixed priorities shorter jobs delay no other. A planner
-    may plan at any release, so its jobs have no fixed place. Tasks of equal priority must never wait at the same time,
-    since their order is not fixed either.
+    In the worst case every job takes its whole budget: under fixed priorities shorter jobs delay no
+    other. A planner may plan at any release, so its jobs have no fixed place. Tasks of equal
+    priority must never wait at the same time, since their order is not fixed either.
     """
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
@@ -149,7 +171,10 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     is_open = any(task.role == "planner" or task.jitter_ns for task in tasks)
     if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
         return {}
-    whole = [replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),)) for task in tasks]
+    whole = [
+        replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
+        for task in tasks
+    ]
     chart = simulate(whole, until + max(task.period_ns for task in tasks))
     priorities = {task.name: task.priority for task in tasks}
     spent = defaultdict[int, list[tuple[int, int]]](list)
@@ -161,7 +186,11 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
             return {}
         found[job.task] = max(found[job.task], job.end_ns - job.release_ns)
         spent[priorities[job.task]].append((job.release_ns, job.end_ns))
-    shared = any(later[0] < earlier[1] for jobs in spent.values() for earlier, later in pairwise(sorted(jobs)))
+    shared = any(
+        later[0] < earlier[1]
+        for jobs in spent.values()
+        for earlier, later in pairwise(sorted(jobs))
+    )
     return {} if shared else found
 
 
@@ -169,8 +198,9 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
 class TaskResponse:
     """One task in the worst case, ns.
 
-    `job_ns` is its own processor time with two context switches, `blocking_ns` the longest wait for a task of lower
-    priority, `response_ns` the time from its release to its end, None without a bound.
+    `job_ns` is its own processor time with two context switches, `blocking_ns` the longest wait for
+    a task of lower priority, `response_ns` the time from its release to its end, None without a
+    bound.
     """
 
     task: str
@@ -215,20 +245,25 @@ def job_ns(task: TimedTask, context_switch_ns: int) -> int:
 
 
 def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return the longest wait for a task of lower priority on the core, ns: one part that cannot be preempted.
+    """Return the longest wait for a task of lower priority on the core, ns: one part that cannot be
+    preempted.
 
-    That is a plan update that began before the release and whose ceiling is at least this task's priority (eq. 3.10).
+    That is a plan update that began before the release and whose ceiling is at least this task's
+    priority (eq. 3.10).
     """
     below = (t for t in tasks if t.core == task.core and t.priority < task.priority <= t.ceiling)
     return max((other.locked_ns for other in below), default=0)
 
 
 def load_of(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[int, float]:
-    """Return the load of each core, by core, context switches included; above 1 it is overloaded."""
+    """Return the load of each core, by core, context switches included; above 1 it is
+    overloaded."""
     loads: dict[int, float] = {}
     for task in tasks:
         if task.cost_ns:
-            loads[task.core] = loads.get(task.core, 0.0) + job_ns(task, context_switch_ns) / task.period_ns
+            loads[task.core] = (
+                loads.get(task.core, 0.0) + job_ns(task, context_switch_ns) / task.period_ns
+            )
     return dict(sorted(loads.items()))
 
 

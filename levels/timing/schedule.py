@@ -1,8 +1,8 @@
 """Gantt charts as data, and the schedule of tasks under fixed priorities, computed instead of run.
 
-The schedule follows the rack's own rules (backplane/clock/wake.py, boards/run/control_loop.py): a late task takes up
-the newest release and skips the others; a planner's release lasts as long as the time slice of its plan, and the next
-release comes after that slice.
+The schedule follows the rack's own rules (backplane/clock/wake.py, boards/run/control_loop.py): a
+late task takes up the newest release and skips the others; a planner's release lasts as long as the
+time slice of its plan, and the next release comes after that slice.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ Variants = Mapping[str, Sequence[Sequence[Part]]]
 
 @dataclass(frozen=True)
 class Span:
-    """An uninterrupted stretch in which a task computed one unit function, ns; `release_ns` is its job's."""
+    """An uninterrupted stretch in which a task computed one unit function, ns; `release_ns` is its
+    job's."""
 
     task: str
     core: int
@@ -56,35 +57,53 @@ class Chart:
         return [job for job in self.jobs if job.task == task and self._is_late(job)]
 
     def _is_late(self, job: Job) -> bool:
-        return job.deadline_ns <= self.end_ns if job.end_ns is None else job.deadline_ns < job.end_ns
+        return (
+            job.deadline_ns <= self.end_ns if job.end_ns is None else job.deadline_ns < job.end_ns
+        )
 
     def window(self, start_ns: int, end_ns: int) -> Chart:
         """Return the chart from `start_ns` to `end_ns`: spans are cut there, jobs kept whole.
 
-        A job is in the window if it was released in it, or was unfinished or not yet due at its start.
+        A job is in the window if it was released in it, or was unfinished or not yet due at its
+        start.
         """
         spans = tuple(
             replace(span, start_ns=max(span.start_ns, start_ns), end_ns=min(span.end_ns, end_ns))
             for span in self.spans
             if span.start_ns < end_ns and span.end_ns > start_ns
         )
-        jobs = tuple(j for j in self.jobs if j.release_ns < end_ns and max(j.deadline_ns, j.end_ns or 0) > start_ns)
+        jobs = tuple(
+            j
+            for j in self.jobs
+            if j.release_ns < end_ns and max(j.deadline_ns, j.end_ns or 0) > start_ns
+        )
         return Chart(start_ns, end_ns, spans, jobs)
 
 
 def simulate(
-    tasks: Sequence[TimedTask], until_ns: int, context_switch_ns: int = 0, variants: Variants | None = None
+    tasks: Sequence[TimedTask],
+    until_ns: int,
+    context_switch_ns: int = 0,
+    variants: Variants | None = None,
 ) -> Chart:
-    """Return the exact schedule of `tasks` from 0 until `until_ns`; each is first released at its phase.
+    """Return the exact schedule of `tasks` from 0 until `until_ns`; each is first released at its
+    phase.
 
-    A job takes two context switches, one before its parts and one after; they show as idle time. Ordinary scheduling,
-    priority 0, is simulated as first come, first served.
+    A job takes two context switches, one before its parts and one after; they show as idle time.
+    Ordinary scheduling, priority 0, is simulated as first come, first served.
     """
-    runners = [_Runner(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,))) for task in tasks]
+    runners = [
+        _Runner(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
+        for task in tasks
+    ]
     for core in {task.core for task in tasks}:
         _run([runner for runner in runners if runner.task.core == core], until_ns)
-    spans = sorted((s for r in runners for s in r.spans), key=lambda span: (span.start_ns, span.core))
-    jobs = sorted((j for r in runners for j in r.jobs(until_ns)), key=lambda job: (job.release_ns, job.task))
+    spans = sorted(
+        (s for r in runners for s in r.spans), key=lambda span: (span.start_ns, span.core)
+    )
+    jobs = sorted(
+        (j for r in runners for j in r.jobs(until_ns)), key=lambda job: (job.release_ns, job.task)
+    )
     return Chart(0, until_ns, tuple(spans), tuple(jobs))
 
 
@@ -110,9 +129,12 @@ class _Step(NamedTuple):
 
 
 class _Runner:
-    """One task, job by job. `ready_at` is the time at which its job, or the next one, can begin, ns."""
+    """One task, job by job. `ready_at` is the time at which its job, or the next one, can begin,
+    ns."""
 
-    def __init__(self, task: TimedTask, context_switch_ns: int, variants: Sequence[Sequence[Part]]) -> None:
+    def __init__(
+        self, task: TimedTask, context_switch_ns: int, variants: Sequence[Sequence[Part]]
+    ) -> None:
         self.task = task
         self.spans: list[Span] = []
         self.ready_at = task.phase_ns + task.jitter_ns
@@ -173,10 +195,16 @@ class _Runner:
 
     def _draw(self, unit: Unit, start_ns: int, end_ns: int) -> None:
         last = self.spans[-1] if self.spans else None
-        if last is not None and (last.unit, last.end_ns, last.release_ns) == (unit, start_ns, self._release):
+        if last is not None and (last.unit, last.end_ns, last.release_ns) == (
+            unit,
+            start_ns,
+            self._release,
+        ):
             self.spans[-1] = replace(last, end_ns=end_ns)
         else:
-            self.spans.append(Span(self.task.name, self.task.core, unit, start_ns, end_ns, self._release))
+            self.spans.append(
+                Span(self.task.name, self.task.core, unit, start_ns, end_ns, self._release)
+            )
 
     def jobs(self, until_ns: int) -> Iterator[Job]:
         """Yield the jobs released before `until_ns`; call it once the schedule is complete."""

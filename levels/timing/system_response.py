@@ -1,4 +1,5 @@
-"""The response of the whole system, predicted: its bounds (eqs 3.2, 3.3), and the path of an operator's command."""
+"""The response of the whole system, predicted: its bounds (eqs 3.2, 3.3), and the path of an
+operator's command."""
 
 from __future__ import annotations
 
@@ -7,16 +8,22 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, MailboxSpec, TickGrid
 from rack.backplane.mailbox.queue import is_position
-from rack.levels.timing.equations import grid_wait, response_ticks, system_response_bound_ns, system_response_ns
+from rack.levels.timing.equations import (
+    grid_wait,
+    response_ticks,
+    system_response_bound_ns,
+    system_response_ns,
+)
 from rack.levels.timing.rack import RackTiming
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Response of the hierarchy, in ms of simulated time; all 0 without one. `levels` are its boards by level, as text.
+    """Response of the hierarchy, in ms of simulated time; all 0 without one. `levels` are its
+    boards by level, as text.
 
-    `command_ms` and `status_ms` are the bounds down and up, with the waits for the grid. `plan_ms` is, by level, the
-    time from a planner's release until its plan can be used.
+    `command_ms` and `status_ms` are the bounds down and up, with the waits for the grid. `plan_ms`
+    is, by level, the time from a planner's release until its plan can be used.
     """
 
     levels: tuple[str, ...]
@@ -47,10 +54,10 @@ def predict(rack: RackTiming) -> Prediction:
 class CommandPath:
     """The levels that an operator's command passes, from the commanded one to the lowest.
 
-    `releases` are the ticks at which each level begins its cycles, `reads` those at which it reads the command of the
-    one above it, the first the operator's. `delay` is the ticks until a given command can be read. `is_exact` is true
-    if every message on the path is of protocol time-slice: with all deadlines met, the releases below are then exact,
-    otherwise bounds.
+    `releases` are the ticks at which each level begins its cycles, `reads` those at which it reads
+    the command of the one above it, the first the operator's. `delay` is the ticks until a given
+    command can be read. `is_exact` is true if every message on the path is of protocol time-slice:
+    with all deadlines met, the releases below are then exact, otherwise bounds.
     """
 
     levels: tuple[str, ...]
@@ -72,7 +79,8 @@ class CommandPath:
         """Return the release of the lowest level's cycle that rests on the command."""
         release = self.samples_at(visible_at)
         for cycle, read in zip(self.cycles, self.reads[1:], strict=False):
-            # Output is visible at the end of its cycle; the next level reads it at its next release (eq. 3.7).
+            # Output is visible at the end of its cycle; the next level reads it at its next release
+            # (eq. 3.7).
             release = read.since(release + cycle)
         return release
 
@@ -82,26 +90,33 @@ class CommandPath:
 
     @property
     def bound_eq_3_2(self) -> int:
-        """Number of levels times the longest cycle (eq. 3.2), from the release that reads the command."""
+        """Number of levels times the longest cycle (eq. 3.2), from the release that reads the
+        command."""
         return len(self.cycles) * max(self.cycles)
 
     @property
     def sum_eq_3_3(self) -> int:
-        """The sum of the cycles (eq. 3.3), from the release that reads the command, if each divides the one above."""
+        """The sum of the cycles (eq. 3.3), from the release that reads the command, if each divides
+        the one above."""
         return sum(self.cycles)
 
     @property
     def longest(self) -> int:
-        """The longest response on the grid: given just too late for a release, waiting for every level's next one."""
-        waits = [grid_wait(written, read) for written, read in zip(self.releases, self.reads[1:], strict=False)]
+        """The longest response on the grid: given just too late for a release, waiting for every
+        level's next one."""
+        waits = [
+            grid_wait(written, read)
+            for written, read in zip(self.releases, self.reads[1:], strict=False)
+        ]
         return self.delay + self.reads[0].every - 1 + response_ticks(self.cycles, waits)
 
 
 def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes that take information from board to board, each resting on the one before.
+    """Return the mailboxes that take information from board to board, each resting on the one
+    before.
 
-    Where the way is broken, they are those of its end: of the longest part that arrives at the last board. A queue
-    breaks it: how long its messages wait there is for their writer to decide.
+    Where the way is broken, they are those of its end: of the longest part that arrives at the last
+    board. A queue breaks it: how long its messages wait there is for their writer to decide.
     """
     if len(boards) < 2:
         return ()
@@ -109,16 +124,21 @@ def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec,
     return _along(layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers})
 
 
-def _along(layout: Layout, boards: Sequence[str], taken: Collection[str]) -> tuple[MailboxSpec, ...]:
+def _along(
+    layout: Layout, boards: Sequence[str], taken: Collection[str]
+) -> tuple[MailboxSpec, ...]:
     """Return the longest row of mailboxes, one a board, that ends with one of those `taken`."""
     if not boards:
         return ()
     last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]
-    return max(((*_along(layout, boards[:-1], box.rests_on), box) for box in last), key=len, default=())
+    return max(
+        ((*_along(layout, boards[:-1], box.rests_on), box) for box in last), key=len, default=()
+    )
 
 
 def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
-    """Return the longest path from every level that an operator can command to the lowest, by level."""
+    """Return the longest path from every level that an operator can command to the lowest, by
+    level."""
     boxes = {box.name: box for box in layout.mailboxes}
     found: dict[str, CommandPath] = {}
     for chain in rack.chains:
@@ -130,7 +150,9 @@ def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
                 continue
             taken = (operator, *passed[len(passed) - len(rest) + 1 :])
             releases = tuple(rack.boards[name].releases for name in rest)
-            reads = tuple(layout.read_grid(box, name) for box, name in zip(taken, rest, strict=True))
+            reads = tuple(
+                layout.read_grid(box, name) for box, name in zip(taken, rest, strict=True)
+            )
             is_exact = all(box.protocol == "time-slice" and box.is_repeatable for box in taken)
             path = CommandPath(rest, releases, reads, operator.delay, is_exact)
             if level not in found or path.longest > found[level].longest:

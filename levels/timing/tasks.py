@@ -1,4 +1,5 @@
-"""Budgets of levels, and tasks of the timing model: unit functions of known length, released on a grid."""
+"""Budgets of levels, and tasks of the timing model: unit functions of known length, released on a
+grid."""
 
 from __future__ import annotations
 
@@ -11,8 +12,9 @@ from typing import Literal
 class Budget:
     """Worst-case processor times of one level, ns; 0 if a level has no such part.
 
-    `read_ns` (R), `process_ns` (X, t_exec), `write_ns` (W) and `exchange_ns` (C, reading the plan) are of one cycle of
-    the executor. `plan_ns` (P) and `update_ns` (U) are of one plan; the paper's t_plan is their sum.
+    `read_ns` (R), `process_ns` (X, t_exec), `write_ns` (W) and `exchange_ns` (C, reading the plan)
+    are of one cycle of the executor. `plan_ns` (P) and `update_ns` (U) are of one plan; the paper's
+    t_plan is their sum.
     """
 
     read_ns: int = 0
@@ -26,7 +28,9 @@ class Budget:
 class Unit(StrEnum):
     """The unit functions of the paper's Gantt charts (section 3.4)."""
 
-    EXCHANGE = "C"  # communication with the planner's processor: a loosely coupled executor reads its plan
+    EXCHANGE = (
+        "C"  # communication with the planner's processor: a loosely coupled executor reads its plan
+    )
     READ = "R"  # command and status
     PROCESS = "X"  # the executor
     WRITE = "W"  # command and status
@@ -36,7 +40,8 @@ class Unit(StrEnum):
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of one unit function. A part that is not preemptible runs at its task's `ceiling`."""
+    """A stretch of one unit function. A part that is not preemptible runs at its task's
+    `ceiling`."""
 
     unit: Unit
     time_ns: int
@@ -47,11 +52,12 @@ class Part:
 class TimedTask:
     """One task; all times in ns. A job is the work of one release, or of one plan.
 
-    The task is released every `every_ns`, first at `phase_ns`. A job may take `within_cycles` cycles; the next
-    job is released after those. `parts` are computed in order. `priority` is SCHED_FIFO's: a higher one preempts; tasks
-    of equal priority run in the order of their releases, then of `name`. Ordinary scheduling is 0, below all. `ceiling`
-    is the priority of parts that are not preemptible: a plan update blocks its own executor and every task that is not
-    above the executor (eq. 3.10). `jitter_ns` bounds the delay from a release until the task is ready.
+    The task is released every `every_ns`, first at `phase_ns`. A job may take `within_cycles`
+    cycles; the next job is released after those. `parts` are computed in order. `priority` is
+    SCHED_FIFO's: a higher one preempts; tasks of equal priority run in the order of their releases,
+    then of `name`. Ordinary scheduling is 0, below all. `ceiling` is the priority of parts that are
+    not preemptible: a plan update blocks its own executor and every task that is not above the
+    executor (eq. 3.10). `jitter_ns` bounds the delay from a release until the task is ready.
     """
 
     name: str

@@ -1,11 +1,12 @@
 """Times from a trace: the measured side of the timing model.
 
-Report, analysis, charts, viewer, snapshots and benchmarks all derive their times here. `rows` are trace records of one
-task, oldest first, shape (n,), of dtype `rack.backplane.trace.RECORD`. Times are ns of the wall clock, shape (n,),
-unless a function says otherwise.
+Report, analysis, charts, viewer, snapshots and benchmarks all derive their times here. `rows` are
+trace records of one task, oldest first, shape (n,), of dtype `rack.backplane.trace.RECORD`. Times
+are ns of the wall clock, shape (n,), unless a function says otherwise.
 
-A trace measures a unit function in two ways. Its borders are stamped by the wall clock; processor time is counted for
-the cycle as a whole. Where a cycle was preempted the two differ, and `unit_times` reconciles them.
+A trace measures a unit function in two ways. Its borders are stamped by the wall clock; processor
+time is counted for the cycle as a whole. Where a cycle was preempted the two differ, and
+`unit_times` reconciles them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ UNITS = {
     ),
     "planner": ((Unit.PLAN, "start_ns", "process_ns"), (Unit.UPDATE, "process_ns", "end_ns")),
 }
-"""The unit functions of a record, by role, with their first and last time stamp. A planner's reading is part of P."""
+"""The unit functions of a record, by role, with their first and last time stamp. A planner's
+reading is part of P."""
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9}
 Distribution = dict[str, float]
 
@@ -59,7 +61,8 @@ def communication_ns(rows: np.ndarray) -> np.ndarray:
 
 
 def residual_ns(rows: np.ndarray, slice_ns: int) -> np.ndarray:
-    """Return t_residual: the part of a time slice left when the cycle ended; negative after a miss."""
+    """Return t_residual: the part of a time slice left when the cycle ended; negative after a
+    miss."""
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
@@ -84,7 +87,8 @@ def counts(rows: np.ndarray) -> tuple[int, int]:
 
 
 def plans(rows: np.ndarray) -> np.ndarray:
-    """Return the records of a planner that made a plan: a release that passed without one may leave a record too."""
+    """Return the records of a planner that made a plan: a release that passed without one may leave
+    a record too."""
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
 
@@ -98,7 +102,8 @@ def newest_visible(ticks: np.ndarray, visible_at: np.ndarray) -> np.ndarray:
 
 
 def plan_ages(executor: np.ndarray, made: np.ndarray, visible_at: np.ndarray) -> np.ndarray:
-    """Return the age in ticks of the plan that each cycle of an executor could read, without cycles before the first.
+    """Return the age in ticks of the plan that each cycle of an executor could read, without cycles
+    before the first.
 
     `executor` holds the ticks of its cycles, `made` and `visible_at` those of the plans, in order.
     """
@@ -108,7 +113,8 @@ def plan_ages(executor: np.ndarray, made: np.ndarray, visible_at: np.ndarray) ->
 
 
 def distribution(values: np.ndarray) -> Distribution | None:
-    """Return min, p50, p99, p99.9 and max of values of any unit, shape (n,); None when there are none."""
+    """Return min, p50, p99, p99.9 and max of values of any unit, shape (n,); None when there are
+    none."""
     if not len(values):
         return None
     found = {"min": float(values.min())}
@@ -117,7 +123,8 @@ def distribution(values: np.ndarray) -> Distribution | None:
 
 
 class Occupation:
-    """When a core was occupied: a union of intervals. `starts` and `ends` are those of the union, ns, shape (n,)."""
+    """When a core was occupied: a union of intervals. `starts` and `ends` are those of the union,
+    ns, shape (n,)."""
 
     def __init__(self, starts: np.ndarray, ends: np.ndarray) -> None:
         """Take intervals from `starts` to `ends`, each of shape (n,), in any order."""
@@ -165,22 +172,26 @@ def waking_ns(rows: np.ndarray) -> np.ndarray:
 
 
 def overhead_ns(rows: np.ndarray) -> int:
-    """Return the median processor time of waking up for a cycle and closing it; 0 where every cycle was disturbed."""
+    """Return the median processor time of waking up for a cycle and closing it; 0 where every cycle
+    was disturbed."""
     beyond = _beyond_stamps(rows)
     return int(np.median(beyond[beyond >= 0])) if (beyond >= 0).any() else 0
 
 
 def _beyond_stamps(rows: np.ndarray) -> np.ndarray:
-    """Return processor time less the time from start to end: negative where others had the core meanwhile."""
+    """Return processor time less the time from start to end: negative where others had the core
+    meanwhile."""
     return np.asarray(rows["processor_ns"] - lasted_ns(rows))
 
 
 def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
-    """Return the processor time of each part of a cycle, shape (n, 4): C, R, X, W; of a planner 0, reading, P, U.
+    """Return the processor time of each part of a cycle, shape (n, 4): C, R, X, W; of a planner 0,
+    reading, P, U.
 
-    `above` is when tasks of higher priority had the core: that is taken off the part in which they ran. Where the sum
-    still exceeds the processor time, because ordinary scheduling or the machine interfered, the rest is taken off the
-    parts that are longer than usual, then off all in proportion.
+    `above` is when tasks of higher priority had the core: that is taken off the part in which they
+    ran. Where the sum still exceeds the processor time, because ordinary scheduling or the machine
+    interfered, the rest is taken off the parts that are longer than usual, then off all in
+    proportion.
     """
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
     starts = stamps[:, :-1]
@@ -195,7 +206,8 @@ def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
 
 
 def _shared_out(total: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return `total`, shape (n,), distributed by `weights`, shape (n, 4), none more than its weight."""
+    """Return `total`, shape (n,), distributed by `weights`, shape (n, 4), none more than its
+    weight."""
     sums = weights.sum(axis=1)
     factor = np.divide(np.minimum(total, sums), sums, out=np.zeros(len(sums)), where=sums > 0)
     return np.asarray(weights * factor[:, None])

@@ -1,7 +1,7 @@
 """Verdicts: every equation of the timing model applied to every level, core and task of a rack.
 
-Equations 3.1 to 3.10 are judged as in the paper, each level as if it had its own processor. Response times and core
-loads account for levels that share a core.
+Equations 3.1 to 3.10 are judged as in the paper, each level as if it had its own processor.
+Response times and core loads account for levels that share a core.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from rack.levels.timing.response_time import response_times
 SYSTEM = "system"
 """The subject of the system's response."""
 LOOSE_PLAN = "fig. 4"
-"""A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation number."""
+"""A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation
+number."""
 PLAN_WITHIN = "plan within"
 RESPONSE_TIME = "response time"
 LOAD = "load"
@@ -38,9 +39,9 @@ ORDER = (*EQUATIONS, *BEYOND)
 class EquationVerdict:
     """Both sides of one equation for one subject, and whether it holds; predicted or measured.
 
-    `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task, a core or
-    "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both sides in the paper's terms,
-    as in "t_plan / d < t_residual - 2 t_cs".
+    `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task,
+    a core or "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both
+    sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs".
     """
 
     equation: str
@@ -53,7 +54,9 @@ class EquationVerdict:
     unit: str = "ns"
 
     @classmethod
-    def of(cls, equation: str, subject: str, relation: Relation, meaning: str, unit: str = "ns") -> EquationVerdict:
+    def of(
+        cls, equation: str, subject: str, relation: Relation, meaning: str, unit: str = "ns"
+    ) -> EquationVerdict:
         """Return the verdict on a relation."""
         return cls(equation, subject, *relation, relation.holds, meaning, unit)
 
@@ -70,7 +73,9 @@ class EquationVerdict:
     def document(self) -> dict[str, Any]:
         """Return everything as plain data; an infinite side is None."""
         sides = {"left": self.left, "right": self.right, "margin": self.margin}
-        return asdict(self) | {name: side if isfinite(side) else None for name, side in sides.items()}
+        return asdict(self) | {
+            name: side if isfinite(side) else None for name, side in sides.items()
+        }
 
 
 def verdicts(rack: RackTiming) -> list[EquationVerdict]:
@@ -91,23 +96,29 @@ def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVer
 
 
 def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on every cycle in them."""
+    """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on
+    every cycle in them."""
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
     for found in rack.parallel:
         yield from _of_chains(rack, found, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
-            relation = Relation(cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns))
+            relation = Relation(
+                cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns)
+            )
             yield EquationVerdict.of("3.1", name, relation, "R_i <= R_max = R_s / n")
 
 
 def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
-    """Return the subject of the system's response along these chains; where there are others, it names them."""
+    """Return the subject of the system's response along these chains; where there are others, it
+    names them."""
     return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
 
 
-def _of_chains(rack: RackTiming, chains: ParallelChains, goal_ns: float | None) -> Iterator[EquationVerdict]:
+def _of_chains(
+    rack: RackTiming, chains: ParallelChains, goal_ns: float | None
+) -> Iterator[EquationVerdict]:
     subject = response_subject(rack, chains)
     cycles_ns = [cycle * rack.tick_ns for cycle in chains.cycles]
     bound = goal_ns
@@ -116,10 +127,17 @@ def _of_chains(rack: RackTiming, chains: ParallelChains, goal_ns: float | None) 
         bound = equations.system_response_bound_ns(cycles_ns)
         limit = "n R_max"
     total = equations.system_response_ns((), cycles_ns)
-    yield EquationVerdict.of("3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}")
-    for way, ticks in (("command", rack.command_ticks(chains)), ("status", rack.status_ticks(chains))):
+    yield EquationVerdict.of(
+        "3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}"
+    )
+    for way, ticks in (
+        ("command", rack.command_ticks(chains)),
+        ("status", rack.status_ticks(chains)),
+    ):
         relation = Relation(ticks * rack.tick_ns, "<=", bound)
-        yield EquationVerdict.of("3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}")
+        yield EquationVerdict.of(
+            "3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}"
+        )
 
 
 def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
@@ -129,7 +147,10 @@ def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     relations = {
         "3.1": (equations.fits_cycle(executes, communicates, cycle), "t_proc + t_c <= R_i"),
         "3.4": (equations.executes_in_time(executes, level.longest_cycle_ns), "t_exec < R_max"),
-        "3.5": (equations.parts_make_cycle(executes, communicates, cycle), "t_exec + t_comm + t_residual = R_i"),
+        "3.5": (
+            equations.parts_make_cycle(executes, communicates, cycle),
+            "t_exec + t_comm + t_residual = R_i",
+        ),
         "3.6": (equations.residual_is_left(level.residual_ns), "0 < t_residual <= alpha"),
         "3.7": (equations.cycle_is_on_grid(cycle, tick_ns), "R_i = k c, k whole"),
     }
@@ -149,11 +170,15 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
         fits = equations.plan_fits_loose(level.planning_ns, level.within_cycles, cycle)
         yield EquationVerdict.of(LOOSE_PLAN, board, fits, "t_plan <= d R_i")
         return
-    fits = equations.plan_fits_tight(level.planning_ns, level.within_cycles, level.residual_ns, switch_ns)
+    fits = equations.plan_fits_tight(
+        level.planning_ns, level.within_cycles, level.residual_ns, switch_ns
+    )
     yield EquationVerdict.of("3.8", board, fits, "t_plan / d < t_residual - 2 t_cs")
     communicates = equations.communication_ns(level.interlevel_ns, level.executor_planner_ns)
     leaves = equations.leaves_time_to_plan(level.execution_ns, communicates, switch_ns, cycle)
-    yield EquationVerdict.of("3.9", board, leaves, "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)")
+    yield EquationVerdict.of(
+        "3.9", board, leaves, "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
+    )
     share = equations.coupling_may_be_tight(level.executor_planner_ns, cycle, small)
     yield EquationVerdict.of("3.10", board, share, "t_executor-planner / R_i, small", "1")
 
@@ -168,11 +193,14 @@ def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
 def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     for core, load in rack.loads.items():
         relation = Relation(load, "<=", 1.0)
-        yield EquationVerdict.of(LOAD, f"core {core}", relation, "share of its time that its tasks compute", "1")
+        yield EquationVerdict.of(
+            LOAD, f"core {core}", relation, "share of its time that its tasks compute", "1"
+        )
 
 
 def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the places of a static schedule: one for all frames in which a place is the same."""
+    """Yield the verdicts on the places of a static schedule: one for all frames in which a place is
+    the same."""
     for alike in core_frames(rack):
         for place in alike.places:
             relation = Relation(place.end_ns, "<=", place.limit_ns)

@@ -13,7 +13,8 @@ from rack.boards.config.layout import field_specs
 
 CLOCK_NS = 2_500_000
 SERVICE_NS, SPARE_NS = 60_000, 1_000_000
-"""Under protocol interrupt: service of a message, and the time from sending it to the tick that shows it."""
+"""Under protocol interrupt: service of a message, and the time from sending it to the tick that
+shows it."""
 NAME = "writer.point"
 SIZES = {"row": 24}
 POINT = MessageType(
@@ -36,7 +37,8 @@ def mailbox(
     writer: str = "writer",
     capacity: int = 0,
 ) -> MailboxSpec:
-    """Return the spec of a mailbox of points; under protocol interrupt they are sent early enough for `delay`."""
+    """Return the spec of a mailbox of points; under protocol interrupt they are sent early enough
+    for `delay`."""
     interrupt = InterruptSpec(delay * CLOCK_NS - SPARE_NS, SERVICE_NS, 16, delay, delay, slots=(3,))
     return MailboxSpec(
         name=name,
@@ -55,8 +57,11 @@ def mailbox(
     )
 
 
-def queue(capacity: int, rates: tuple[int, int] = (1, 1), slots: int = 64) -> tuple[MailboxSpec, MailboxSpec]:
-    """Return the specs of a queue of points and of its reader's position; `rates` are both tasks' periods."""
+def queue(
+    capacity: int, rates: tuple[int, int] = (1, 1), slots: int = 64
+) -> tuple[MailboxSpec, MailboxSpec]:
+    """Return the specs of a queue of points and of its reader's position; `rates` are both tasks'
+    periods."""
     written, read = rates
     box = mailbox("queue", every=written, delay=written, depth=slots, capacity=capacity)
     position = MailboxSpec(
@@ -88,9 +93,13 @@ def task(
     return TaskSpec(name, name, role, slot, 0, 0, every, within_cycles, depth, wake)
 
 
-def layout(rack: str, mailboxes: Iterable[MailboxSpec] = (), tasks: Iterable[TaskSpec] = ()) -> Layout:
+def layout(
+    rack: str, mailboxes: Iterable[MailboxSpec] = (), tasks: Iterable[TaskSpec] = ()
+) -> Layout:
     """Return a layout; without `tasks`, those of a writer and a reader."""
-    return Layout(rack, CLOCK_NS, tuple(tasks) or (task("writer"), task("reader", slot=3)), tuple(mailboxes))
+    return Layout(
+        rack, CLOCK_NS, tuple(tasks) or (task("writer"), task("reader", slot=3)), tuple(mailboxes)
+    )
 
 
 def message_address(segment: Segment, serial: int, name: str = NAME) -> int:

@@ -29,7 +29,9 @@ PLANNER = TaskSpec("writer.planner", "writer", "planner", 2, 0, 0, 8, 4, 64)
 
 @pytest.fixture
 def full() -> Layout:
-    boxes = [mailbox(name=f"writer.{n}", depth=depth) for n, depth in (("a", 4), ("b", 64), ("c", 8))]
+    boxes = [
+        mailbox(name=f"writer.{n}", depth=depth) for n, depth in (("a", 4), ("b", 64), ("c", 8))
+    ]
     boxes += [mailbox(name="reader.operator", writer="clock")]
     return layout("full", boxes, [task("writer"), PLANNER, task("reader", slot=3)])
 
@@ -39,7 +41,9 @@ def test_windows_follow_each_other_on_pages(full: Layout) -> None:
     assert [window.board for window in places.windows] == ["clock", "writer", "reader"]
     assert places.windows[0].address == HEAD_SIZE
     assert all(window.address % PAGE == window.size % PAGE == 0 for window in places.windows)
-    assert all(first.address + first.size == second.address for first, second in pairwise(places.windows))
+    assert all(
+        first.address + first.size == second.address for first, second in pairwise(places.windows)
+    )
     assert places.size == places.windows[-1].address + places.windows[-1].size
 
 
@@ -58,7 +62,9 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
 def test_a_boards_mailboxes_lie_in_its_window(full: Layout) -> None:
     places = AddressMap(full)
     window = next(window for window in places.windows if window.board == "writer")
-    boxes = [places.mailboxes[mailbox.name] for mailbox in full.mailboxes if mailbox.writer == "writer"]
+    boxes = [
+        places.mailboxes[mailbox.name] for mailbox in full.mailboxes if mailbox.writer == "writer"
+    ]
     for address in (*boxes, places.blocks["writer"], places.blocks["writer.planner"]):
         assert window.address <= address < window.address + window.size
 
@@ -79,7 +85,8 @@ def test_shared_words_fit_their_places() -> None:
 
 
 @pytest.mark.parametrize(
-    ("span_ticks", "every", "slots"), [(0, 1, 4), (1, 1, 4), (2, 1, 8), (800, 1, 1024), (800, 8, 128)]
+    ("span_ticks", "every", "slots"),
+    [(0, 1, 4), (1, 1, 4), (2, 1, 8), (800, 1, 1024), (800, 8, 128)],
 )
 def test_depth_keeps_the_span_in_a_power_of_two(span_ticks: int, every: int, slots: int) -> None:
     assert depth_for(span_ticks, every) == slots

@@ -15,7 +15,15 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
 
 WHOLE = Injection(
-    kind=3, task=1, mailbox=0, tick=40, ticks=8, phase=250, seed=77, when=(0, 1, 2), parameters=(0.5, -1.0, 3.25)
+    kind=3,
+    task=1,
+    mailbox=0,
+    tick=40,
+    ticks=8,
+    phase=250,
+    seed=77,
+    when=(0, 1, 2),
+    parameters=(0.5, -1.0, 3.25),
 )
 
 
@@ -23,9 +31,21 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     entry = FaultTable(segment).add(WHOLE)
     read = FaultTable(segment).entries[entry.index]
-    words = (Entry.KIND, Entry.TASK, Entry.MAILBOX, Entry.FROM, Entry.TICKS, Entry.PHASE, Entry.SEED)
+    words = (
+        Entry.KIND,
+        Entry.TASK,
+        Entry.MAILBOX,
+        Entry.FROM,
+        Entry.TICKS,
+        Entry.PHASE,
+        Entry.SEED,
+    )
     assert [read[word] for word in words] == [3, 1, 0, 40, 8, 250, 77]
-    assert [read[word] for word in (Entry.WHEN_BOX, Entry.WHEN_FIELD, Entry.WHEN_VALUE)] == [0, 1, 2]
+    assert [read[word] for word in (Entry.WHEN_BOX, Entry.WHEN_FIELD, Entry.WHEN_VALUE)] == [
+        0,
+        1,
+        2,
+    ]
     assert read.parameters[:3].tolist() == [0.5, -1.0, 3.25]
     assert (read.stage, read[Entry.UNTIL], read[Entry.STRUCK_TICK]) == (Stage.WAITING, NEVER, -1)
     assert segment.words[System.INJECTED] == 1
@@ -37,12 +57,17 @@ def test_a_task_finds_its_own_active_faults(make_bus: MakeBus) -> None:
     assert table.active("reader") == []
     for entry in entries[1:]:
         entry.words[Entry.STAGE] = Stage.ACTIVE
-    found = {name: [entry.index for entry in table.active(name)] for name in ("writer", "reader", "clock")}
+    found = {
+        name: [entry.index for entry in table.active(name)]
+        for name in ("writer", "reader", "clock")
+    }
     assert found == {"writer": [], "reader": [1, 2], "clock": [3]}
     assert [entry.index for entry in table.staged((Stage.WAITING,))] == [0]
 
 
-def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(make_bus: MakeBus) -> None:
+def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(
+    make_bus: MakeBus,
+) -> None:
     entry, before = FaultTable(make_bus()).add(Injection(0, 0)), monotonic_ns()
     entry.acted(9, shows=False)
     first = entry[Entry.STRUCK_NS]

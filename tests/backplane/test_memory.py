@@ -18,7 +18,8 @@ PAGES = 4096
 FEW = 64
 """Pages of a process's own bookkeeping: its stack, its allocator, the interpreter's code."""
 LARGE = 40 << 20
-"""Above the largest bound, 32 MiB, to which the C library raises its own thresholds for mappings."""
+"""Above the largest bound, 32 MiB, to which the C library raises its own thresholds for
+mappings."""
 
 
 def faults(work: Callable[[], object]) -> int:
@@ -76,7 +77,8 @@ def test_the_whole_segment_is_mapped_once_touched(make_bus: MakeBus) -> None:
 def test_memory_given_back_stays_with_the_process() -> None:
     def board() -> bool:
         touch_memory()
-        # The C library maps a piece of this size by itself, and gives it back at once, unless it is kept from that.
+        # The C library maps a piece of this size by itself, and gives it back at once, unless it is
+        # kept from that.
         use(bytearray(LARGE))
         return faults(lambda: [use(bytearray(LARGE)) for _ in range(10)]) < FEW
 

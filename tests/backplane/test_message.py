@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 
 from rack.backplane.errors import MailboxError
-from rack.backplane.message import REASON_BYTES, Field, Message, MessageType, State, command, fill_counts, status
+from rack.backplane.message import (
+    REASON_BYTES,
+    Field,
+    Message,
+    MessageType,
+    State,
+    command,
+    fill_counts,
+    status,
+)
 
-POSE = MessageType("pose", 1, (Field("position", "f8", "m", "", (3,)), Field("valid", "u1", "1", "")))
+POSE = MessageType(
+    "pose", 1, (Field("position", "f8", "m", "", (3,)), Field("valid", "u1", "1", ""))
+)
 TRACK = MessageType(
     "track",
     2,
@@ -35,7 +46,9 @@ def test_symbolic_sizes_are_filled_in() -> None:
 
 
 def test_an_unknown_size_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(MailboxError, match=r"'track' field 'poses': size 'poses' is unknown; known sizes: joints"):
+    with pytest.raises(
+        MailboxError, match=r"'track' field 'poses': size 'poses' is unknown; known sizes: joints"
+    ):
         TRACK.dtype({"joints": 6})
 
 
@@ -131,7 +144,11 @@ def test_commands_begin_with_their_serial_and_statuses_with_the_answer() -> None
 
 
 def test_counts_stay_at_the_greatest_number_of_their_fields() -> None:
-    fields = (Field("few", "u2", "1", ""), Field("many", "u4", "1", ""), Field("tick", "i8", "tick", ""))
+    fields = (
+        Field("few", "u2", "1", ""),
+        Field("many", "u4", "1", ""),
+        Field("tick", "i8", "tick", ""),
+    )
     message = Message(MessageType("counts", 1, (*fields, Field("age_s", "f8", "s", ""))).dtype({}))
     fill_counts(message.record, (1 << 70, 1 << 32, 1 << 63, 1e30))
     assert message.record.tolist() == ((1 << 16) - 1, (1 << 32) - 1, (1 << 63) - 1, 1e30)

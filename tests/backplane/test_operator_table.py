@@ -1,4 +1,5 @@
-"""The operator table: requests are filled whole, wait in order, may be withdrawn, and make room once issued."""
+"""The operator table: requests are filled whole, wait in order, may be withdrawn, and make room
+once issued."""
 
 from __future__ import annotations
 
@@ -10,7 +11,13 @@ import pytest
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.errors import OperatorTableError
-from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    OperatorTable,
+    Request,
+    RequestEntry,
+    RequestStage,
+    RequestWord,
+)
 from rack.backplane.segment import Segment
 from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
@@ -36,7 +43,11 @@ def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
     read = OperatorTable(segment).entries[entry.index]
     assert bytes(read.message[: len(message)]) == message
     assert [read[word] for word in (RequestWord.MAILBOX, RequestWord.TICK)] == [0, 40]
-    assert (read.stage, read[RequestWord.SERIAL], read[RequestWord.GIVEN_TICK]) == (RequestStage.WAITING, 0, -1)
+    assert (read.stage, read[RequestWord.SERIAL], read[RequestWord.GIVEN_TICK]) == (
+        RequestStage.WAITING,
+        0,
+        -1,
+    )
 
 
 def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None:
@@ -62,7 +73,9 @@ def test_a_request_that_was_given_stays_given(segment: Segment) -> None:
     assert entry.stage == RequestStage.GIVEN
 
 
-def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(segment: Segment) -> None:
+def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(
+    segment: Segment,
+) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))
     ticket = entry[RequestWord.TICKET]

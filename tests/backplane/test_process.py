@@ -69,7 +69,9 @@ def test_a_core_that_the_machine_lacks_is_an_error() -> None:
 
 
 @pytest.mark.slow
-def test_cores_are_kept_awake_by_a_request_that_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_are_kept_awake_by_a_request_that_is_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     device = tmp_path / "cpu_dma_latency"
     device.touch()
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
@@ -81,10 +83,16 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(tmp_path: Path, monkeypa
     assert descriptors() == before
 
 
-def test_cores_sleep_as_usual_where_the_request_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_sleep_as_usual_where_the_request_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
     reason = ""
     with cores_kept_awake() as refusal:
         reason = refusal
-    assert reason == f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or directory"
+    assert (
+        reason
+        == f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or"
+        " directory"
+    )
     assert not (tmp_path / "missing").exists()

@@ -60,14 +60,18 @@ def test_attached_memory_is_the_same_memory(make_bus: MakeBus) -> None:
 
 def test_tasks_begin_without_a_release_and_boards_hold_sysfail(make_bus: MakeBus) -> None:
     segment = make_bus()
-    assert [segment.block(t)[w] for t in ("writer", "reader") for w in (Block.RELEASED, Block.DONE)] == [-1] * 4
+    assert [
+        segment.block(t)[w] for t in ("writer", "reader") for w in (Block.RELEASED, Block.DONE)
+    ] == [-1] * 4
     assert [segment.words[System.SYSFAIL + slot] for slot in (1, 2, 3, 4)] == [0, 1, 1, 0]
 
 
 def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus) -> None:
     first = make_bus()
     first.words[System.TICK] = 5
-    assert f"rack '{first.rack}' already has a segment" in refusal(lambda: Segment.create(first.layout, ""))
+    assert f"rack '{first.rack}' already has a segment" in refusal(
+        lambda: Segment.create(first.layout, "")
+    )
     assert Segment.attach(first.rack).words[System.TICK] == 5
 
 
@@ -170,7 +174,9 @@ def test_a_lack_of_shared_memory_is_reported_at_creation(rack_name: str) -> None
 def test_a_limit_on_file_size_is_reported_at_creation(rack_name: str) -> None:
     def create() -> bool:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-        return "File too large" in refusal(lambda: Segment.create(layout(rack_name, [mailbox()]), ""))
+        return "File too large" in refusal(
+            lambda: Segment.create(layout(rack_name, [mailbox()]), "")
+        )
 
     assert exit_status(fork(create)) == 0
     assert rack_name not in racks()

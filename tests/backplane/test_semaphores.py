@@ -21,12 +21,15 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork, forked, wait_until
 
 FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
-"""From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the wall clock."""
+"""From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the
+wall clock."""
 
 
 @pytest.fixture
 def bus(make_bus: MakeBus) -> Segment:
-    return make_bus(mailbox("lock"), mailbox(name="writer.other"), task("writer"), task("writer.planner"))
+    return make_bus(
+        mailbox("lock"), mailbox(name="writer.other"), task("writer"), task("writer.planner")
+    )
 
 
 def named(rack: str) -> int:
@@ -34,7 +37,12 @@ def named(rack: str) -> int:
 
 
 def test_there_are_two_a_task_and_one_a_locked_mailbox(bus: Segment) -> None:
-    assert len(semaphores.names(bus.layout)) == len(set(semaphores.names(bus.layout))) == named(bus.rack) == 5
+    assert (
+        len(semaphores.names(bus.layout))
+        == len(set(semaphores.names(bus.layout)))
+        == named(bus.rack)
+        == 5
+    )
 
 
 def test_locks_begin_free_and_wake_ups_unsent(bus: Segment) -> None:
@@ -80,7 +88,9 @@ def test_removing_names_twice_is_no_error(bus: Segment) -> None:
 def test_another_users_semaphore_of_that_name_is_named_and_left_alone(bus: Segment) -> None:
     def create() -> None:
         os.setuid(65_533)
-        with pytest.raises(SegmentError, match=rf"semaphore /dev/shm/sem.*{bus.rack}.*belongs to another user"):
+        with pytest.raises(
+            SegmentError, match=rf"semaphore /dev/shm/sem.*{bus.rack}.*belongs to another user"
+        ):
             semaphores.create(bus.layout)
         semaphores.unlink_all(bus.rack)
 
@@ -112,7 +122,8 @@ def wait_for_tasks(segment: Segment) -> None:
 
 
 def futex_call(pid: int) -> int:
-    """Return the operation of the futex call in which a process waits, from /proc; 0: it is in none."""
+    """Return the operation of the futex call in which a process waits, from /proc; 0: it is in
+    none."""
     call = Path(f"/proc/{pid}/syscall").read_text().split()
     operation = int(call[2], 16) if len(call) > 2 else 0
     return operation if operation & ~FUTEX_CLOCK_REALTIME == FUTEX_WAIT_BITSET else 0
@@ -120,7 +131,9 @@ def futex_call(pid: int) -> int:
 
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("wait", [wait_for_release, wait_for_lock, wait_for_tasks])
-def test_no_step_of_the_wall_clock_moves_the_bound_of_a_wait(bus: Segment, wait: Callable[[Segment], None]) -> None:
+def test_no_step_of_the_wall_clock_moves_the_bound_of_a_wait(
+    bus: Segment, wait: Callable[[Segment], None]
+) -> None:
     # A test cannot set the machine's clock. The kernel shows by which clock a process waits.
     seen = [0]
     with forked(lambda: wait(bus)) as pid:

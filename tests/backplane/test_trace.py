@@ -20,7 +20,9 @@ def test_records_are_read_as_they_were_written(make_bus: MakeBus) -> None:
     trace(writer, range(1, 6))
     rows, lost = ring.drain()
     assert lost == 0
-    assert [row.tolist() for row in rows] == [tuple(100 * t + at for at in range(len(FIELDS))) for t in range(1, 6)]
+    assert [row.tolist() for row in rows] == [
+        tuple(100 * t + at for at in range(len(FIELDS))) for t in range(1, 6)
+    ]
 
 
 def test_a_trace_without_a_reader_continues_and_lost_records_are_counted(make_bus: MakeBus) -> None:
@@ -44,5 +46,7 @@ def test_tasks_have_rings_of_their_own(make_bus: MakeBus) -> None:
     segment = make_bus(task("writer"), task("reader", slot=3))
     trace(TraceWriter(segment, "writer"), range(2))
     trace(TraceWriter(segment, "reader"), range(5, 6))
-    rings = [trace_ring(segment, name).drain().rows["tick"].tolist() for name in ("writer", "reader")]
+    rings = [
+        trace_ring(segment, name).drain().rows["tick"].tolist() for name in ("writer", "reader")
+    ]
     assert rings == [[0, 100], [500]]

@@ -1,4 +1,5 @@
-"""Racks with the arm on a board of its own, under boards that servo its joints and a level that swings them."""
+"""Racks with the arm on a board of its own, under boards that servo its joints and a level that
+swings them."""
 
 from __future__ import annotations
 

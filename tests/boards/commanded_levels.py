@@ -1,4 +1,5 @@
-"""Two levels without an arm that take operator commands; their output depends on a command's tick."""
+"""Two levels without an arm that take operator commands; their output depends on a command's
+tick."""
 
 from __future__ import annotations
 
@@ -16,7 +17,10 @@ COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that w
 class Upper(Executor):
     """Passes an operator's hold down; refuses to go home."""
 
-    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "status": Input(COUNTED, "below.status")}
+    inputs = {
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "status": Input(COUNTED, "below.status"),
+    }
     outputs = {"command": STEP, "status": COUNTED}
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.HOME,)}
 
@@ -43,7 +47,10 @@ class Upper(Executor):
 class Lower(Executor):
     """Counts, unless it is held from above or here; by two at a time while it is set to `twice`."""
 
-    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "command": Input(STEP, "above.command")}
+    inputs = {
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(STEP, "above.command"),
+    }
     outputs = {"status": COUNTED}
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.MODIFY: (Goal.ON, Goal.OFF)}
     step = 1

@@ -8,7 +8,12 @@ from rack.backplane.message import Field, State, status
 from rack.levels.faults import CommandStep, MotorStep, SensorStep, TendonStep
 from rack.levels.level import Executor, LevelContext, Ports
 
-PLACE = status("place", 1, Field("position", "f8", "rad", "where it is"), Field("mode", "i2", "1", "how it moves"))
+PLACE = status(
+    "place",
+    1,
+    Field("position", "f8", "rad", "where it is"),
+    Field("mode", "i2", "1", "how it moves"),
+)
 
 
 class Driven(Executor):
@@ -34,11 +39,17 @@ class Follower(Watch):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Follow the wave, wait for it, or give up."""
         super().process(read, write, tick)
-        self._since = (self._since or tick) if read.status.is_there and read.status.is_lost else None
+        self._since = (
+            (self._since or tick) if read.status.is_there and read.status.is_lost else None
+        )
         if self._since is not None and tick - self._since > self._patience:
             self._latched = f"nothing heard of the wave for {tick - self._since} ticks"
         waits = f"waiting for the wave; latched at tick {(self._since or 0) + self._patience}"
         write.status.reason = self._latched or (waits if self._since is not None else "")
         write.status.state = (
-            State.ERROR if self._latched else State.HOLDING if self._since is not None else State.EXECUTING
+            State.ERROR
+            if self._latched
+            else State.HOLDING
+            if self._since is not None
+            else State.EXECUTING
         )

@@ -25,7 +25,9 @@ TARGETS = {"overrun": "wave", "planner-slow": "wave.planner", "clock": "clock", 
 """A task to strike, by kind or by the kind's `where`; for all others it is the wave."""
 
 
-def rack(config: MakeConfig, *faults: Mapping[str, Any], settings: tuple[str, ...] = ()) -> RackConfig:
+def rack(
+    config: MakeConfig, *faults: Mapping[str, Any], settings: tuple[str, ...] = ()
+) -> RackConfig:
     """Return the rack in real time with these faults in its config."""
     tables = ", ".join(inline(fault) for fault in faults)
     return config("clock.mode=realtime", f"fault=[{tables}]", *settings, text=DRIVEN)

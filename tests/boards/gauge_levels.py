@@ -42,7 +42,9 @@ KINDS.add(
         where="writer",
         means="every n-th message is lost",
         step=LoseEvery,
-        parameters=(Parameter("n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=draw.whole(2, 4)),),
+        parameters=(
+            Parameter("n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=draw.whole(2, 4)),
+        ),
         detected_as=(Alarm.GAP,),
         bound=writes(1) + DELIVERY,
         lasts=draw.messages(8, 12),
@@ -53,7 +55,11 @@ KINDS.add(
 class Gauge(Executor):
     """Opens its valve at a tick."""
 
-    outputs = {"status": status("gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0"))}
+    outputs = {
+        "status": status(
+            "gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0")
+        )
+    }
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report the valve's state."""

@@ -31,7 +31,12 @@ NUMBER = command(
     Field("value", "f8", "1", "a number"),
     Field("colour", "u1", Colour, "its colour"),
 )
-SUM = status("sum", 1, Field("sum", "f8", "1", "of all numbers read"), Field("last", "u4", "1", "newest id read"))
+SUM = status(
+    "sum",
+    1,
+    Field("sum", "f8", "1", "of all numbers read"),
+    Field("last", "u4", "1", "newest id read"),
+)
 
 
 class Adder(Executor):
@@ -115,7 +120,8 @@ class Escaping(Host):
 
 
 class Printing(Host):
-    """Prints without end, `length` bytes a line; the first that prints `once` prints them without a newline, once."""
+    """Prints without end, `length` bytes a line; the first that prints `once` prints them without a
+    newline, once."""
 
     def run(self, bus: Bus) -> None:
         """Print."""

@@ -10,7 +10,9 @@ BOARDS = 5
 HEARD = status(
     "heard",
     1,
-    Field("cycle", "i8", "tick", "cycle that each board below reports; -1: none came yet", (BOARDS,)),
+    Field(
+        "cycle", "i8", "tick", "cycle that each board below reports; -1: none came yet", (BOARDS,)
+    ),
     Field("lost", "u1", "1", "1: the writer counts as lost", (BOARDS,)),
 )
 ORDER = MessageType("order", 1, (Field("number", "u4", "1", "number of the order"),))

@@ -1,4 +1,5 @@
-"""A level above boards that servo joints: it moves every joint smoothly to and fro. And an arm whose board stalls."""
+"""A level above boards that servo joints: it moves every joint smoothly to and fro. And an arm
+whose board stalls."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ LASTS_S = 0.4
 
 
 class Swing(Executor):
-    """Moves all joints away from home and back by minimum-jerk motions; waits while a board below is stopped."""
+    """Moves all joints away from home and back by minimum-jerk motions; waits while a board below
+    is stopped."""
 
     inputs = {"statuses": Input(JOINT_STATUS, "below.status", many=True)}
     outputs = {"command": JOINT_REFERENCE, "status": PRIMITIVE_STATUS}

@@ -1,4 +1,5 @@
-"""A user's program that runs a rack: `python launcher.py CONFIG [--fork] [KEY=VALUE]...`; prints once launched."""
+"""A user's program that runs a rack: `python launcher.py CONFIG [--fork] [KEY=VALUE]...`; prints
+once launched."""
 
 from __future__ import annotations
 

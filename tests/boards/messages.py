@@ -18,16 +18,22 @@ WHAT = ("serial", "tick", "visible_at", "basis", "chain")
 
 @dataclass(frozen=True)
 class Written:
-    """The messages of a run by mailbox, and its cycles by task; complete if the run is shorter than the rings."""
+    """The messages of a run by mailbox, and its cycles by task; complete if the run is shorter than
+    the rings."""
 
     messages: dict[str, np.ndarray]
     cycles: dict[str, np.ndarray]
 
     @classmethod
     def on(cls, segment: Segment) -> Written:
-        """Read everything from a segment, once the cycles that were under way at the end of the run have ended."""
+        """Read everything from a segment, once the cycles that were under way at the end of the run
+        have ended."""
         blocks = [segment.block(task.name) for task in segment.layout.tasks]
-        wait_until(lambda: all(b[Block.DONE] >= b[Block.RELEASED] or not is_alive(b[Block.PID]) for b in blocks))
+        wait_until(
+            lambda: all(
+                b[Block.DONE] >= b[Block.RELEASED] or not is_alive(b[Block.PID]) for b in blocks
+            )
+        )
         messages, cycles = {}, {}
         for mailbox in segment.layout.mailboxes:
             messages[mailbox.name], lost = MailboxRing(segment, mailbox.name).drain()
@@ -38,7 +44,8 @@ class Written:
         return cls(messages, cycles)
 
     def first_miss(self, otherwise: int) -> int:
-        """Return the first tick at which a task missed or skipped a release; `otherwise` when none did."""
+        """Return the first tick at which a task missed or skipped a release; `otherwise` when none
+        did."""
         found = [otherwise]
         for rows in self.cycles.values():
             late = np.flatnonzero(rows["flags"] & (Flag.MISSED | Flag.SKIPPED))

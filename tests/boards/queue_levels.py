@@ -1,4 +1,5 @@
-"""Levels for tests of queues: one numbers its requests, the other checks that it gets each once and in order."""
+"""Levels for tests of queues: one numbers its requests, the other checks that it gets each once and
+in order."""
 
 from __future__ import annotations
 
@@ -9,7 +10,12 @@ from rack.backplane.message import Field, Message, command, status
 from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Ports, Reading
 
 REQUEST = command("request", 1, Field("made_at", "i8", "tick", "release of the cycle that sent it"))
-SENT = status("sent", 1, Field("sent", "i8", "1", "requests sent"), Field("refused", "i8", "1", "refused: queue full"))
+SENT = status(
+    "sent",
+    1,
+    Field("sent", "i8", "1", "requests sent"),
+    Field("refused", "i8", "1", "refused: queue full"),
+)
 TAKEN = status(
     "taken",
     1,
@@ -21,7 +27,8 @@ TAKEN = status(
 
 
 def request_id(context: LevelContext, tick: int, number: int) -> int:
-    """Return the id of the n-th request of a cycle: it does not depend on what the level remembers."""
+    """Return the id of the n-th request of a cycle: it does not depend on what the level
+    remembers."""
     return 1 + tick // context.every * int(context.params["burst"]) + number
 
 

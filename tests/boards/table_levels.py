@@ -5,10 +5,17 @@ from __future__ import annotations
 from rack.backplane.message import Field, status
 from rack.levels.level import Input, Ports
 from rack.levels.operator import OPERATOR_COMMAND
-from rack.levels.systems.state_table.level import STATUS_HEAD, WORD_COMMAND, StateTableExecutor, vocabulary
+from rack.levels.systems.state_table.level import (
+    STATUS_HEAD,
+    WORD_COMMAND,
+    StateTableExecutor,
+    vocabulary,
+)
 from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 
-COUNTER_STATUS = status("counter_status", 1, *STATUS_HEAD, Field("count", "i8", "1", "where the counter is"))
+COUNTER_STATUS = status(
+    "counter_status", 1, *STATUS_HEAD, Field("count", "i8", "1", "where the counter is")
+)
 
 
 class Counter(StateTableExecutor):

@@ -1,4 +1,5 @@
-"""A rack of one level with state tables, for tests: up and down, or up alone, and a table with a hole."""
+"""A rack of one level with state tables, for tests: up and down, or up alone, and a table with a
+hole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The arm as a board of its own, in a rack of processes: refused where joints lack a board, repeatable, and safe."""
+"""The arm as a board of its own, in a rack of processes: refused where joints lack a board,
+repeatable, and safe."""
 
 from __future__ import annotations
 
@@ -63,7 +64,9 @@ def test_joints_without_one_board_are_refused_in_one_line(config: MakeConfig, ca
 
 
 @pytest.mark.slow
-def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats(config: MakeConfig) -> None:
+def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats(
+    config: MakeConfig,
+) -> None:
     killed = FaultConfig(kind="kill", board="servo_j3", tick=KILLED_AT)
     given = config(text=arm_rack(APART)).model_copy(update={"fault": (killed,)})
     digests = []
@@ -71,7 +74,11 @@ def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats
         with Rack(given) as rack:
             digests.append(rack.run(0.9).digest)
             braked = [event.tick for event in rack.events if event.code == "brakes_closed"]
-            released = [event.tick for event in rack.events if event.code == "brakes_opened" and event.tick > KILLED_AT]
+            released = [
+                event.tick
+                for event in rack.events
+                if event.code == "brakes_opened" and event.tick > KILLED_AT
+            ]
             rejoined = [event.tick for event in rack.events if event.code == "rejoined"]
             arm = open_observer(rack.segment, "arm.status").peek().value
     assert digests[0] == digests[1]

@@ -1,4 +1,5 @@
-"""Brakes in a run: each time is counted with its reason; a run that they held without a cause in sight has failed."""
+"""Brakes in a run: each time is counted with its reason; a run that they held without a cause in
+sight has failed."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ RELEASED = "rack.levels.systems.joint_boards:ArmExecutor"
 def stalling(**params: int) -> str:
     """Return a rack of 1 kHz whose arm's board stalls, as TOML."""
     given = ", ".join(f"{key} = {value}" for key, value in params.items())
-    return arm_rack(TOGETHER).replace(f'"{RELEASED}"', f'"joint_levels:StallingArm"\nparams = {{ {given} }}')
+    return arm_rack(TOGETHER).replace(
+        f'"{RELEASED}"', f'"joint_levels:StallingArm"\nparams = {{ {given} }}'
+    )
 
 
 def change(tick: int, code: str, why: str, value: int = 0) -> Event:
@@ -39,8 +42,15 @@ def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end()
         change(150, "brakes_closed", NO_TORQUE, 4),
     ]
     found = brakings(events, 200, 2.0)
-    assert found == (Braking(NO_TORQUE, 47, 6.0), Braking("sensors", 80, 20.0), Braking(NO_TORQUE, 150, 100.0))
-    told = "brakes engaged 3 times, 126 ms in all, longest 100 ms at tick 150: no torque (2), sensors (1)"
+    assert found == (
+        Braking(NO_TORQUE, 47, 6.0),
+        Braking("sensors", 80, 20.0),
+        Braking(NO_TORQUE, 150, 100.0),
+    )
+    told = (
+        "brakes engaged 3 times, 126 ms in all, longest 100 ms at tick 150: no torque (2),"
+        " sensors (1)"
+    )
     assert braked_text(found) == told
 
 
@@ -54,7 +64,8 @@ def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
     assert (outcome.faults, outcome.worked) == ((), True)
     assert [braking.why for braking in outcome.brakings] == [NO_TORQUE] * count
     for number, braking in enumerate(outcome.brakings, 1):
-        # The last torque was given in the last cycle before the stall, and the motors kept it for 5 cycles.
+        # The last torque was given in the last cycle before the stall, and the motors kept it for 5
+        # cycles.
         assert braking.since == 400 * number - stall - 1 + 5
         # The boards above must see that the arm was braked before it is released.
         assert stall - 4 < braking.lasted_ms < stall - 4 + 6
@@ -83,7 +94,9 @@ def test_a_run_held_by_brakes_has_failed_and_says_so(config: MakeConfig) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sight", ["a fault", "an emergency stop"])
-def test_a_run_held_by_brakes_with_a_cause_in_sight_has_not_failed(config: MakeConfig, sight: str) -> None:
+def test_a_run_held_by_brakes_with_a_cause_in_sight_has_not_failed(
+    config: MakeConfig, sight: str
+) -> None:
     killed = FaultConfig(kind="kill", board="swing", tick=101)
     faulty = config(text=stalling(stall=400, period=600)).model_copy(update={"fault": (killed,)})
     given = faulty if sight == "a fault" else config(text=arm_rack(TOGETHER))
@@ -112,14 +125,18 @@ def test_brakes_that_were_never_released_have_held_the_run(config: MakeConfig) -
 
 
 @pytest.mark.slow
-def test_a_level_that_holds_to_the_end_for_more_than_5_s_has_held_the_run(config: MakeConfig) -> None:
+def test_a_level_that_holds_to_the_end_for_more_than_5_s_has_held_the_run(
+    config: MakeConfig,
+) -> None:
     waiting = arm_rack(TOGETHER).replace("joint_levels:Swing", "joint_levels:Waiting")
     outcomes = []
     for seconds in (4.9, 5.1):
         with Rack(config(text=waiting)) as rack:
             outcomes.append(rack.run(seconds))
     assert [outcome.worked for outcome in outcomes] == [True, False]
-    assert outcomes[1].faults == (f"level 'swing' held for 5100 ms {HELD[5:]}: it does not feel like it",)
+    assert outcomes[1].faults == (
+        f"level 'swing' held for 5100 ms {HELD[5:]}: it does not feel like it",
+    )
 
 
 @pytest.mark.slow

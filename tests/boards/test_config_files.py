@@ -52,7 +52,9 @@ def test_other_racks_in_the_folder_of_a_bundled_one_have_names_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert {"cell", "cell/puma", "cell/k1607"} <= set(names())
-    assert not {"cell/arm", "brown/kill-each-board", "robots/puma560"} & set(names()), "these are no racks"
+    assert not {"cell/arm", "brown/kill-each-board", "robots/puma560"} & set(names()), (
+        "these are no racks"
+    )
     assert load("cell/puma").name == "cell-puma"
     (tmp_path / "cell").mkdir()
     (tmp_path / "cell" / "puma").write_text('name = "mine"\nextends = ["cell/puma"]\n')
@@ -63,7 +65,9 @@ def test_other_racks_in_the_folder_of_a_bundled_one_have_names_too(
 def test_an_unknown_name_lists_the_known_names() -> None:
     with pytest.raises(ConfigError) as error:
         load("nasrm")
-    assert lines(error) == [f'config = "nasrm": no such file; by name: {", ".join(names())}; or a path']
+    assert lines(error) == [
+        f'config = "nasrm": no such file; by name: {", ".join(names())}; or a path'
+    ]
 
 
 def test_text_that_is_not_toml_is_reported_with_its_line(write: Write) -> None:
@@ -72,9 +76,15 @@ def test_text_that_is_not_toml_is_reported_with_its_line(write: Write) -> None:
 
 
 def test_a_file_overrides_what_it_extends_key_by_key(small: Path, write: Write) -> None:
-    path = write("mine.toml", 'name = "mine"\nextends = ["small.toml"]\n[board.upper]\nrate_hz = 100\n')
+    path = write(
+        "mine.toml", 'name = "mine"\nextends = ["small.toml"]\n[board.upper]\nrate_hz = 100\n'
+    )
     config = load(path)
-    assert (config.name, config.board["upper"].rate_hz, config.board["upper"].slot) == ("mine", 100, 2)
+    assert (config.name, config.board["upper"].rate_hz, config.board["upper"].slot) == (
+        "mine",
+        100,
+        2,
+    )
 
 
 def test_bases_are_merged_in_order(small: Path, write: Write) -> None:
@@ -95,7 +105,11 @@ def test_an_arm_is_replaced_as_a_whole(write: Write) -> None:
 
 
 def test_an_arm_without_a_model_of_its_own_is_merged_as_every_table_is(write: Write) -> None:
-    config = load(write("mine.toml", 'extends = ["nasrem"]\n[robot]\nsubsteps = 8\n[scene]\nclearance = 0.03\n'))
+    config = load(
+        write(
+            "mine.toml", 'extends = ["nasrem"]\n[robot]\nsubsteps = 8\n[scene]\nclearance = 0.03\n'
+        )
+    )
     whole = load("nasrem")
     assert config.robot == whole.robot.model_copy(update={"substeps": 8})
     assert config.scene == whole.scene.model_copy(update={"clearance": 0.03})
@@ -105,7 +119,9 @@ def test_an_incomplete_arm_is_reported_to_inherit_nothing(write: Write) -> None:
     model = write("arm.xml", "<mujoco/>")
     with pytest.raises(ConfigError) as error:
         load(write("mine.toml", f'extends = ["nasrem"]\n[robot]\nmodel = "{model.name}"\n'))
-    alone = "a [robot] with its own model is a different arm and inherits nothing from extended files"
+    alone = (
+        "a [robot] with its own model is a different arm and inherits nothing from extended files"
+    )
     assert f"robot.jerk: missing; jerk limits of planned motion, rad/s3; {alone}" in lines(error)
 
 
@@ -120,7 +136,9 @@ DEEP = {
 
 @pytest.mark.parametrize("text", DEEP.values(), ids=DEEP)
 def test_endless_nesting_is_refused_in_one_line(write: Write, text: str) -> None:
-    with pytest.raises(ConfigError, match=r"^deep\.toml.*: nested too deeply; permitted: 32 levels$") as error:
+    with pytest.raises(
+        ConfigError, match=r"^deep\.toml.*: nested too deeply; permitted: 32 levels$"
+    ) as error:
         load(write("deep.toml", f'extends = ["fig2"]\n{text}\n'))
     assert len(lines(error)) == 1
     assert len(lines(error)[0]) < 200
@@ -147,7 +165,9 @@ def test_values_that_no_config_has_are_refused_in_files_and_settings(
 def test_an_endless_chain_of_files_is_refused(write: Write) -> None:
     for at in range(1200):
         write(f"chain{at}.toml", f'extends = ["chain{at + 1}.toml"]\n')
-    with pytest.raises(ConfigError, match=r"chain32.toml: extends: chain of extends too long; permitted: 32 files$"):
+    with pytest.raises(
+        ConfigError, match=r"chain32.toml: extends: chain of extends too long; permitted: 32 files$"
+    ):
         load(write("chain1200.toml", "").with_name("chain0.toml"))
 
 
@@ -162,15 +182,23 @@ def test_a_file_that_many_extend_is_read_once(small: Path, write: Write) -> None
 
 
 def test_a_file_too_large_to_be_a_config_is_not_read(write: Write) -> None:
-    with pytest.raises(ConfigError, match=r"large.toml: too large, 1000002 bytes; permitted: 1000000$"):
+    with pytest.raises(
+        ConfigError, match=r"large.toml: too large, 1000002 bytes; permitted: 1000000$"
+    ):
         load(write("large.toml", "#" * 1_000_002))
 
 
-@pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a" * 5000, "a/" * 3000, "x" * 300 + ".toml", "a\0b.toml"])
-def test_an_impossible_file_name_is_reported_as_missing(small: Path, write: Write, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["~nosuchuser/x.toml", "a" * 5000, "a/" * 3000, "x" * 300 + ".toml", "a\0b.toml"]
+)
+def test_an_impossible_file_name_is_reported_as_missing(
+    small: Path, write: Write, name: str
+) -> None:
     with pytest.raises(ConfigError, match=r"^config = .*: no such file; by name: ") as error:
         load(name)
-    assert len(lines(error)[0]) - len(", ".join(names())) < 160, "it is cut, apart from the names of racks"
+    assert len(lines(error)[0]) - len(", ".join(names())) < 160, (
+        "it is cut, apart from the names of racks"
+    )
     with pytest.raises(ConfigError, match=r"^--faults = .*: no such file"):
         load(small, faults=name)
     if "\0" not in name:
@@ -195,15 +223,26 @@ def test_every_missing_base_is_reported(write: Write) -> None:
     [
         ("clock.mode=realtime", lambda c: c.clock.mode == "realtime"),
         ("board.upper.every = 4", None),
-        ('protocol.mailbox."lower.status"=lock', lambda c: c.protocol.mailbox == {"lower.status": "lock"}),
-        (" protocol . mailbox . 'lower.status' = lock", lambda c: c.protocol.mailbox == {"lower.status": "lock"}),
+        (
+            'protocol.mailbox."lower.status"=lock',
+            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
+        ),
+        (
+            " protocol . mailbox . 'lower.status' = lock",
+            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
+        ),
         ('task."a = b"=1', lambda c: c.task == {"a = b": 1}),
         ("seed=7", lambda c: c.seed == 7),
-        ('protocol.mailbox={"lower.status" = "lock"}', lambda c: c.protocol.mailbox == {"lower.status": "lock"}),
+        (
+            'protocol.mailbox={"lower.status" = "lock"}',
+            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
+        ),
         ("board.lower.params.gains=[1, 2]", lambda c: c.board["lower"].params == {"gains": [1, 2]}),
     ],
 )
-def test_overrides_set_single_values(small: Path, setting: str, found: Callable[..., bool] | None) -> None:
+def test_overrides_set_single_values(
+    small: Path, setting: str, found: Callable[..., bool] | None
+) -> None:
     if found is not None:
         assert found(load(small, [setting]))
         return
@@ -251,5 +290,7 @@ def test_every_export_exists_once() -> None:
     exported = rack.boards.config.__all__
     assert len(exported) == len(set(exported))
     assert all(hasattr(rack.boards.config, name) for name in exported)
-    with pytest.raises(AttributeError, match=r"module 'rack\.boards\.config' has no attribute 'nothing'"):
+    with pytest.raises(
+        AttributeError, match=r"module 'rack\.boards\.config' has no attribute 'nothing'"
+    ):
         rack.boards.config.nothing  # noqa: B018

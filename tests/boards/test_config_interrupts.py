@@ -1,4 +1,5 @@
-"""Protocol interrupt in a config: when messages are sent, what they cost, and which mailboxes may have it."""
+"""Protocol interrupt in a config: when messages are sent, what they cost, and which mailboxes may
+have it."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def mistake(text: str, *settings: str) -> str:
 
 
 def sent(box: MailboxSpec) -> tuple[int, int, int]:
-    """Return when a message is sent, ns, before which tick it must be there, and when it can first be seen."""
+    """Return when a message is sent, ns, before which tick it must be there, and when it can first
+    be seen."""
     assert box.interrupt is not None
     return box.interrupt.sent_ns, box.interrupt.due, box.delay
 
@@ -53,7 +55,10 @@ def test_a_message_is_sent_after_the_budget_of_its_cycle(small: Path) -> None:
 
 def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path) -> None:
     layout = layout_of(small, "protocol.interrupt={ fixed_us = 10, word_us = 2.5, depth = 3 }")
-    command, plan = layout.mailbox("upper.command").interrupt, layout.mailbox("lower.plan").interrupt
+    command, plan = (
+        layout.mailbox("upper.command").interrupt,
+        layout.mailbox("lower.plan").interrupt,
+    )
     assert command is not None
     assert plan is not None
     assert command.service_ns == 10_000 + 2_500 * (layout.mailbox("upper.command").size // 4)
@@ -84,13 +89,25 @@ def test_the_protocol_passes_where_determinism_is_demanded(small: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "why"),
     [
-        ("protocol.interrupt.fixed_us=-1", "protocol.interrupt.fixed_us = -1: should be greater than or equal to 0"),
-        ("protocol.interrupt.word_us=inf", "protocol.interrupt.word_us = inf: should be a finite number"),
-        ("protocol.interrupt.depth=0", "protocol.interrupt.depth = 0: should be greater than or equal to 1"),
+        (
+            "protocol.interrupt.fixed_us=-1",
+            "protocol.interrupt.fixed_us = -1: should be greater than or equal to 0",
+        ),
+        (
+            "protocol.interrupt.word_us=inf",
+            "protocol.interrupt.word_us = inf: should be a finite number",
+        ),
+        (
+            "protocol.interrupt.depth=0",
+            "protocol.interrupt.depth = 0: should be greater than or equal to 1",
+        ),
         ("protocol.interrupt.slots=3", "protocol.interrupt.slots = 3: unknown key"),
         (
             "board.hub.exchange.status.asynchronous=true",
-            "the messages of 'figure0.status' interrupt the board as they come already; permitted: false",
+            (
+                "the messages of 'figure0.status' interrupt the board as they come already;"
+                " permitted: false"
+            ),
         ),
     ],
 )
@@ -106,14 +123,23 @@ def test_a_queue_and_mailboxes_beyond_the_boards_are_refused() -> None:
     )
     for mailbox in ("program.numbers", "bridge.sum"):
         found = mistake(HOSTED, f"protocol.mailbox={{ '{mailbox}' = 'interrupt' }}")
-        assert found.startswith(f'protocol.mailbox.{mailbox} = "interrupt": it is on the host side, where nothing is')
+        assert found.startswith(
+            f'protocol.mailbox.{mailbox} = "interrupt": it is on the host side, where nothing is'
+        )
     network = rack_text("here", "tcp/127.0.0.1:7001", (), "there")
     found = mistake(network, "protocol.mailbox={ 'lan.other' = 'interrupt' }")
-    assert "the network adapter writes it as messages come in; permitted: time-slice, double-buffer" in found
+    assert (
+        "the network adapter writes it as messages come in; permitted: time-slice, double-buffer"
+        in found
+    )
 
 
 def test_the_network_adapter_reads_without_interrupts() -> None:
-    layout = wire(validated(override(parse(rack_text("here", "tcp/127.0.0.1:7001", (), "there")), [INTERRUPT])))
+    layout = wire(
+        validated(
+            override(parse(rack_text("here", "tcp/127.0.0.1:7001", (), "there")), [INTERRUPT])
+        )
+    )
     pulse = layout.mailbox("pulse.status")
     assert pulse.interrupt is not None
     assert pulse.interrupt.slots == ()
@@ -143,4 +169,6 @@ def test_interrupts_are_part_of_reading_and_of_a_plan(small: Path) -> None:
 def test_an_inbox_that_a_burst_overflows_fails(depth: int, holds: bool) -> None:
     config = loads(RACK.replace('"interrupt"', f'"interrupt"\nprotocol.interrupt.depth = {depth}'))
     found = [v for v in verdicts(rack_timing(config, wire(config))) if v.equation == INBOX]
-    assert [(v.subject, v.left, v.right, v.holds) for v in found] == [("hub", BOARDS - 1, depth, holds)]
+    assert [(v.subject, v.left, v.right, v.holds) for v in found] == [
+        ("hub", BOARDS - 1, depth, holds)
+    ]

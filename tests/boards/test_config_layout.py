@@ -61,14 +61,19 @@ def test_a_tight_planner_shares_its_executors_board(small: Path) -> None:
 
 
 def test_a_loose_planner_has_a_board_of_its_own(small: Path) -> None:
-    settings = ["board.lower.coupling=loose", "board.lower.planner_slot=9", "board.lower.planner_priority=20"]
+    settings = [
+        "board.lower.coupling=loose",
+        "board.lower.planner_slot=9",
+        "board.lower.planner_priority=20",
+    ]
     planner = wire(load(small, settings)).task("lower.planner")
     assert (planner.slot, planner.priority) == (9, 20)
 
 
 def test_a_port_can_be_wired_to_another_mailbox(small: Path) -> None:
     tasks = {
-        task.task: task for task in resolve(load(small, ["board.lower.reads={ command = 'upper.command' }"])).tasks
+        task.task: task
+        for task in resolve(load(small, ["board.lower.reads={ command = 'upper.command' }"])).tasks
     }
     assert tasks["lower"].inputs == {"command": "upper.command", "plan": "lower.plan"}
 
@@ -81,29 +86,48 @@ def test_field_specs_describe_the_exact_bytes_of_a_message(kind) -> None:
     for name in dtype.names:
         assert described.fields[name][1] == dtype.fields[name][1]
         assert described[name].shape == dtype[name].shape
-    assert described["moves"].base.fields["position"][1] == dtype["moves"].base.fields["position"][1]
+    assert (
+        described["moves"].base.fields["position"][1] == dtype["moves"].base.fields["position"][1]
+    )
 
 
-def test_missing_cores_are_replaced_and_reported(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_cores_are_replaced_and_reported(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
     assert [obtained_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
-    assert shared_out(load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])) == [
-        "core 5 is not available (available: 2, 3): core 3 runs upper"
-    ]
+    assert shared_out(
+        load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])
+    ) == ["core 5 is not available (available: 2, 3): core 3 runs upper"]
 
 
 def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
-    upper, lower, _ = (task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks)
-    assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == ("lower", 1, 4, 2_500_000, 5)
+    upper, lower, _ = (
+        task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks
+    )
+    assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == (
+        "lower",
+        1,
+        4,
+        2_500_000,
+        5,
+    )
     assert (lower.above, lower.below) == ({"upper": Pace(8, 1)}, {})
     assert upper.below == {"lower": Pace(1, 4)}
     assert lower.params == {"gain": 2}
 
 
-def test_a_launch_resolves_and_checks_everything_once(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_launch_resolves_and_checks_everything_once(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     checked = []
-    monkeypatch.setattr(resolved, "broken_rules", lambda *of: checked.append(of) or broken_rules(*of))
-    settings = ["fault=[{ kind = 'self-test', board = 'upper' }]", "board.lower.transfer.read_ms=0.5"]
+    monkeypatch.setattr(
+        resolved, "broken_rules", lambda *of: checked.append(of) or broken_rules(*of)
+    )
+    settings = [
+        "fault=[{ kind = 'self-test', board = 'upper' }]",
+        "board.lower.transfer.read_ms=0.5",
+    ]
     found = resolve(load(small, settings))
     assert len(checked) == 1
     assert [(task.task, task.fails_self_test, task.guards_clock) for task in found.tasks] == [
@@ -136,9 +160,16 @@ def test_a_board_may_wait_otherwise_than_the_rack_and_a_planner_does_not_poll(sm
     }
 
 
-def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_gives_it_away(small: Path) -> None:
+def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_gives_it_away(
+    small: Path,
+) -> None:
     def core(mode: str, *settings: str) -> int:
-        return resolve(load(small, [f"clock.mode={mode}", "clock.core=0", *settings])).clock(None).core
+        return (
+            resolve(load(small, [f"clock.mode={mode}", "clock.core=0", *settings])).clock(None).core
+        )
 
-    assert (core("realtime", "board.lower.core=1"), core("lockstep", "board.lower.core=1")) == (0, 1)
+    assert (core("realtime", "board.lower.core=1"), core("lockstep", "board.lower.core=1")) == (
+        0,
+        1,
+    )
     assert core("lockstep", "board.upper.core=0", *POLLING) == 0

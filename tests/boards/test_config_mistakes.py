@@ -1,4 +1,5 @@
-"""Mistakes of a config: all of them at once, each with its place, its value and what is permitted."""
+"""Mistakes of a config: all of them at once, each with its place, its value and what is
+permitted."""
 
 from __future__ import annotations
 
@@ -21,32 +22,71 @@ def mistakes(name: str | Path, *settings: str) -> list[Mistake]:
 
 
 MISTAKES = {
-    "unknown key": ("clock.periodms=1", "clock.periodms = 1: unknown key; did you mean 'period_ms'?"),
-    "out of range": ("board.upper.slot=22", "board.upper.slot = 22: should be less than or equal to 21; slot in"),
+    "unknown key": (
+        "clock.periodms=1",
+        "clock.periodms = 1: unknown key; did you mean 'period_ms'?",
+    ),
+    "out of range": (
+        "board.upper.slot=22",
+        "board.upper.slot = 22: should be less than or equal to 21; slot in",
+    ),
     "slot of the clock": ("board.upper.slot=1", "slot 1 is the clock's"),
     "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: already taken by board.upper.slot"),
     "name": ("name='../x'", 'name = "../x": '),
     "choice": ("clock.mode=fast", "'realtime' or 'lockstep'"),
     "not finite": ("clock.speed=inf", "clock.speed = inf: should be a finite number"),
-    "period": ("clock.period_ms=2.4999995", "clock.period_ms = 2.4999995: not a whole number of ns"),
+    "period": (
+        "clock.period_ms=2.4999995",
+        "clock.period_ms = 2.4999995: not a whole number of ns",
+    ),
     "rate": (
         "board.upper.rate_hz=60",
-        "60 Hz does not divide the 400 Hz clock; nearest: 57.14 Hz (every 7 ticks), 66.67 Hz (every 6 ticks)",
+        (
+            "60 Hz does not divide the 400 Hz clock; nearest: 57.14 Hz (every 7 ticks), 66.67 Hz"
+            " (every 6 ticks)"
+        ),
     ),
     "rate above the clock": ("board.upper.rate_hz=1000", "nearest: 400 Hz (every 1 tick)"),
     "speed in lockstep": ("clock.speed=2", "clock.speed = 2.0: lockstep runs as fast as it can"),
-    "neighbour": ("board.lower.above=uper", 'board.lower.above = "uper": no other board has this name; boards: upper'),
+    "neighbour": (
+        "board.lower.above=uper",
+        'board.lower.above = "uper": no other board has this name; boards: upper',
+    ),
     "circle below": (
         "board.lower.below=upper",
-        'board.lower.below = "upper": the levels form a circle, upper -> lower -> upper; the lowest level has no below',
+        (
+            'board.lower.below = "upper": the levels form a circle, upper -> lower -> upper; the'
+            " lowest level has no below"
+        ),
     ),
-    "circle above": ("board.upper.above=lower", "a circle, upper -> lower -> upper; the highest level has no above"),
-    "truth for a number": ("clock.period_ms=true", "clock.period_ms = true: should be a valid number; tick period, ms"),
-    "text for a number": ("board.upper.core='1'", 'board.upper.core = "1": should be a valid integer'),
-    "number for a truth": ("board.upper.ends_run=1", "board.upper.ends_run = 1: should be a valid boolean"),
-    "very short tick": ("clock.period_ms=1e-6", "should be greater than or equal to 0.01; tick period, ms"),
-    "very fast": ("clock.speed=1e300", "clock.speed = 1e+300: should be less than or equal to 1000; simulated time"),
-    "very slow": ("clock.speed=1e-300", "clock.speed = 1e-300: should be greater than or equal to 0.001"),
+    "circle above": (
+        "board.upper.above=lower",
+        "a circle, upper -> lower -> upper; the highest level has no above",
+    ),
+    "truth for a number": (
+        "clock.period_ms=true",
+        "clock.period_ms = true: should be a valid number; tick period, ms",
+    ),
+    "text for a number": (
+        "board.upper.core='1'",
+        'board.upper.core = "1": should be a valid integer',
+    ),
+    "number for a truth": (
+        "board.upper.ends_run=1",
+        "board.upper.ends_run = 1: should be a valid boolean",
+    ),
+    "very short tick": (
+        "clock.period_ms=1e-6",
+        "should be greater than or equal to 0.01; tick period, ms",
+    ),
+    "very fast": (
+        "clock.speed=1e300",
+        "clock.speed = 1e+300: should be less than or equal to 1000; simulated time",
+    ),
+    "very slow": (
+        "clock.speed=1e-300",
+        "clock.speed = 1e-300: should be greater than or equal to 0.001",
+    ),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
         "clock.speed = 500.0: a tick would take 0.005 ms of real time; permitted: 0.01 ms or more",
@@ -55,59 +95,104 @@ MISTAKES = {
         "board.lower={ rate_hz = 1e-5 }",
         "a cycle would take 40000000 ticks; permitted: up to 1000000",
     ),
-    "rate near zero": ("board.lower={ rate_hz = 5e-324 }", "board.lower.rate_hz = 5e-324: should be greater than or"),
-    "phase": ("board.upper.phase=8", "board.upper.phase = 8: must be less than the board's period; permitted: 0 to 7"),
-    "phase below zero": ("board.upper.phase=-1", "board.upper.phase = -1: should be greater than or equal to 0; first"),
+    "rate near zero": (
+        "board.lower={ rate_hz = 5e-324 }",
+        "board.lower.rate_hz = 5e-324: should be greater than or",
+    ),
+    "phase": (
+        "board.upper.phase=8",
+        "board.upper.phase = 8: must be less than the board's period; permitted: 0 to 7",
+    ),
+    "phase below zero": (
+        "board.upper.phase=-1",
+        "board.upper.phase = -1: should be greater than or equal to 0; first",
+    ),
     "port of no executor": (
         "board.upper.exchange={ command = { every = 2 } }",
         "board.upper.exchange.command: no such port of the executor; ports: status",
     ),
-    "exchange never": ("board.upper.exchange={ status = { every = 0 } }", "exchange.status.every = 0: should be gr"),
+    "exchange never": (
+        "board.upper.exchange={ status = { every = 0 } }",
+        "exchange.status.every = 0: should be gr",
+    ),
     "exchange in no cycle": (
         "board.upper.exchange={ status = { every = 3, phase = 3 } }",
         "board.upper.exchange.status.phase = 3: must be less than every; permitted: 0 to 2 cycles",
     ),
     "rarely and at once": (
         "board.upper.exchange={ status = { every = 2, asynchronous = true } }",
-        "board.upper.exchange.status.every = 2: an asynchronous port is read in every cycle; permitted: 1",
+        (
+            "board.upper.exchange.status.every = 2: an asynchronous port is read in every cycle;"
+            " permitted: 1"
+        ),
     ),
     "own neighbour": ("board.lower.above=lower", "no other board has this name"),
     "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose" with a planner'),
     "no planner": ("board.upper.coupling=tight", 'permitted: "none" without a planner'),
-    "loose": ("board.lower.coupling=loose", "board.lower.planner_slot: missing; a loosely coupled planner has"),
+    "loose": (
+        "board.lower.coupling=loose",
+        "board.lower.planner_slot: missing; a loosely coupled planner has",
+    ),
     "planner slot": ("board.lower.planner_slot=9", 'only for a planner with coupling = "loose"'),
     "priorities": ("board.lower.planner_priority=5", "must be below the executor's priority, 0"),
     "polling": (
         "board.upper.wake=poll",
         "needs a core of its own, but shares core 0 with: clock, lower, lower.planner",
     ),
-    "two ends": ("board.lower.ends_run=true", "only one board can end the run; 'upper' already does"),
+    "two ends": (
+        "board.lower.ends_run=true",
+        "only one board can end the run; 'upper' already does",
+    ),
     "board name": (
         "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
         "invalid name for a board",
     ),
     "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
-    "moving what is not there": ("scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]", "no such obstacle"),
+    "moving what is not there": (
+        "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]",
+        "no such obstacle",
+    ),
     "pushing what is not there": (
         "scene.push=[{ body = 'bar', at = 1, seconds = 1, force = [0, 0, 1] }]",
         "no such object",
     ),
-    "no module": ("board.upper.executor='no_levels:Upper'", "cannot import 'no_levels': ModuleNotFoundError"),
-    "no method": ("board.upper.executor='two_levels:Unfinished'", "class 'Unfinished' lacks the method 'process'"),
+    "no module": (
+        "board.upper.executor='no_levels:Upper'",
+        "cannot import 'no_levels': ModuleNotFoundError",
+    ),
+    "no method": (
+        "board.upper.executor='two_levels:Unfinished'",
+        "class 'Unfinished' lacks the method 'process'",
+    ),
     "no class": (
         "board.upper.executor='two_levels:Uper'",
         "has no class 'Uper'; it has: Lower, PlanWriter, Programmed, Unfinished, Upper",
     ),
-    "no executor": ("board.upper.executor='two_levels:LowerPlanner'", "has no Executor named 'LowerPlanner'"),
-    "nobody writes": ("board.upper.reads={ status = 'lower.state' }", "no task writes it; mailboxes: upper.command"),
+    "no executor": (
+        "board.upper.executor='two_levels:LowerPlanner'",
+        "has no Executor named 'LowerPlanner'",
+    ),
+    "nobody writes": (
+        "board.upper.reads={ status = 'lower.state' }",
+        "no task writes it; mailboxes: upper.command",
+    ),
     "type": (
         "board.upper.reads={ status = 'upper.command' }",
         "carries count_command 1; the port needs count_status 1",
     ),
-    "no port": ("board.upper.reads={ state = 'lower.status' }", "the executor has no such port; ports: status"),
+    "no port": (
+        "board.upper.reads={ state = 'lower.status' }",
+        "the executor has no such port; ports: status",
+    ),
     "two writers": ("board.lower.executor='two_levels:PlanWriter'", "mailbox lower.plan"),
-    "protocol": ("protocol.mailbox={ 'lower.state' = 'lock' }", "protocol.mailbox.lower.state: no such mailbox"),
-    "size": ("board.lower.planner='two_levels:SizedPlanner'", "carries count_plan 1; the port needs small_plan 1"),
+    "protocol": (
+        "protocol.mailbox={ 'lower.state' = 'lock' }",
+        "protocol.mailbox.lower.state: no such mailbox",
+    ),
+    "size": (
+        "board.lower.planner='two_levels:SizedPlanner'",
+        "carries count_plan 1; the port needs small_plan 1",
+    ),
 }
 
 
@@ -138,7 +223,9 @@ def test_all_mistakes_are_reported_at_once_wherever_they_are(small: Path) -> Non
     }
 
 
-def test_mistakes_of_tables_model_scene_faults_and_commands_are_reported_together(write: Write) -> None:
+def test_mistakes_of_tables_model_scene_faults_and_commands_are_reported_together(
+    write: Write,
+) -> None:
     text = """
 extends = ["nasrem"]
 [clock]
@@ -166,7 +253,8 @@ what = "hold"
 home = true
 """
     found = {mistake.place: mistake.why for mistake in mistakes(write("mine.toml", text))}
-    # No further mistakes of tables that are broken: the world board, the first fault, the first command.
+    # No further mistakes of tables that are broken: the world board, the first fault, the first
+    # command.
     assert set(found) == {
         "clock.wake",
         "robot.joints",
@@ -182,8 +270,12 @@ home = true
         "command[0].what",
         "command[1].home",
     }
-    assert found["robot.joints"].startswith("no joint 'j9' in the model; it has: j1, j2, j3, j4, j5, j6")
-    assert found["scene.supports"].startswith("no geom 'shelf' in the model; it has: pedestal, floor, table")
+    assert found["robot.joints"].startswith(
+        "no joint 'j9' in the model; it has: j1, j2, j3, j4, j5, j6"
+    )
+    assert found["scene.supports"].startswith(
+        "no geom 'shelf' in the model; it has: pedestal, floor, table"
+    )
 
 
 def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_reported() -> None:
@@ -198,19 +290,29 @@ def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_report
 
 def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
     with pytest.raises(ConfigError) as error:
-        load(write("odd.toml", f'extends = ["fig2"]\n"two\\nlines\\u001b[31m" = 1\n"{"k" * 5000}" = 1\n'))
+        load(
+            write(
+                "odd.toml",
+                f'extends = ["fig2"]\n"two\\nlines\\u001b[31m" = 1\n"{"k" * 5000}" = 1\n',
+            )
+        )
     lines = str(error.value).splitlines()
     assert len(lines) == 2
     assert all(line.isprintable() and len(line) < 500 for line in lines)
 
 
 def test_a_segment_too_large_for_any_machine_is_refused(small: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^mailbox upper.command: \d+ messages are kept .*; permitted: 1073741824; "):
+    with pytest.raises(
+        ConfigError,
+        match=r"^mailbox upper.command: \d+ messages are kept .*; permitted: 1073741824; ",
+    ):
         resolve(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
 def test_a_broken_board_causes_no_mistakes_in_its_neighbours(small: Path) -> None:
-    assert [mistake.place for mistake in mistakes(small, "board.lower.slot=99")] == ["board.lower.slot"]
+    assert [mistake.place for mistake in mistakes(small, "board.lower.slot=99")] == [
+        "board.lower.slot"
+    ]
 
 
 def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
@@ -220,7 +322,8 @@ def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "place"), [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")]
+    ("setting", "place"),
+    [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")],
 )
 def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place: str) -> None:
     (mistake,) = mistakes("nasrem", f"robot.sensors.{setting}")
@@ -246,7 +349,9 @@ STRICT = {
 
 
 @pytest.mark.parametrize(("setting", "place"), STRICT.values(), ids=STRICT)
-def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(small: Path, setting: str, place: str) -> None:
+def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(
+    small: Path, setting: str, place: str
+) -> None:
     assert resolve(load(small, [setting]))
     (mistake,) = mistakes(small, setting, "protocol.strict=true")
     why = "makes a run depend on timing, refused by protocol.strict = true; permitted: "
@@ -255,13 +360,41 @@ def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(small: 
 
 PARAMS = {
     "unknown": ("fig2", "level.params.proces_ms=1", "= 1: unknown key; did you mean 'process_ms'?"),
-    "of nothing known": ("nasrem", "world.params.x=1", "= 1: unknown key; known: moved, turned, slow, resting"),
-    "text": ("fig2", "level.params.process_ms=lock", '= "lock": should be a valid number; X: the executor in a cycle'),
-    "truth": ("nasrem", "servo.params.bandwidth=true", "= true: should be a valid number; natural frequency"),
-    "range": ("nasrem", "primitive.params.braking=4", "= 4: should be less than or equal to 3; multiple of"),
-    "choice": ("nasrem", "servo.params.on_sensor_fault=stay", "= \"stay\": should be 'hold', 'stop' or 'brake'"),
-    "of the planner alone": ("nasrem", "task.params.settling=-1", "= -1: should be greater than 0; from the end"),
-    "both": ("nasrem", "elemental_move.params.patience=nan", "= nan: should be a finite number; time that a move"),
+    "of nothing known": (
+        "nasrem",
+        "world.params.x=1",
+        "= 1: unknown key; known: moved, turned, slow, resting",
+    ),
+    "text": (
+        "fig2",
+        "level.params.process_ms=lock",
+        '= "lock": should be a valid number; X: the executor in a cycle',
+    ),
+    "truth": (
+        "nasrem",
+        "servo.params.bandwidth=true",
+        "= true: should be a valid number; natural frequency",
+    ),
+    "range": (
+        "nasrem",
+        "primitive.params.braking=4",
+        "= 4: should be less than or equal to 3; multiple of",
+    ),
+    "choice": (
+        "nasrem",
+        "servo.params.on_sensor_fault=stay",
+        "= \"stay\": should be 'hold', 'stop' or 'brake'",
+    ),
+    "of the planner alone": (
+        "nasrem",
+        "task.params.settling=-1",
+        "= -1: should be greater than 0; from the end",
+    ),
+    "both": (
+        "nasrem",
+        "elemental_move.params.patience=nan",
+        "= nan: should be a finite number; time that a move",
+    ),
 }
 
 
@@ -272,7 +405,9 @@ def test_a_parameter_that_no_level_has_is_a_mistake(rack: str, setting: str, exp
 
 
 def test_every_mistake_of_parameters_is_reported() -> None:
-    found = mistakes("nasrem", "board.servo.params={ bandwidth = -1, damping = 9 }", "board.world.params.slow=0")
+    found = mistakes(
+        "nasrem", "board.servo.params={ bandwidth = -1, damping = 9 }", "board.world.params.slow=0"
+    )
     assert [mistake.place for mistake in found] == [
         "board.servo.params.bandwidth",
         "board.servo.params.damping",
@@ -295,7 +430,9 @@ def test_a_users_own_level_declares_its_program(small: Path) -> None:
         "task.counts = 3: unknown key",
     ]
     found = mistakes(small, OWN_PROGRAM, "task.count=[1, -2]")
-    assert [str(mistake) for mistake in found] == ["task.count[1] = -2: nothing to count; objects: none"]
+    assert [str(mistake) for mistake in found] == [
+        "task.count[1] = -2: nothing to count; objects: none"
+    ]
 
 
 @pytest.mark.slow

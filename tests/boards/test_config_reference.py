@@ -22,7 +22,17 @@ DIMENSIONLESS = {
     "for",  # s, or text with its unit
 }
 WHOLE = (
-    *("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit", "posture", "points"),
+    *(
+        "reads",
+        "planner_reads",
+        "mailbox",
+        "depth",
+        "tables",
+        "arms",
+        "permit",
+        "posture",
+        "points",
+    ),
     *("wrench", "guard", "speed"),
 )
 """Keys whose tables hold names of the user's own."""
@@ -50,11 +60,14 @@ def used(tables: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, str]]:
 
 
 def general(place: str, known: Iterable[str]) -> str:
-    """Return the place of a table as the reference has it, with "<name>" for a name of the user's own."""
+    """Return the place of a table as the reference has it, with "<name>" for a name of the user's
+    own."""
 
     def fits(pattern: str) -> bool:
         parts, own = pattern.split("."), place.split(".")
-        return len(parts) == len(own) and all(part in (name, "<name>") for part, name in zip(parts, own, strict=True))
+        return len(parts) == len(own) and all(
+            part in (name, "<name>") for part, name in zip(parts, own, strict=True)
+        )
 
     return next(filter(fits, known), place)
 
@@ -64,7 +77,9 @@ def general(place: str, known: Iterable[str]) -> str:
 def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
     known = reference(name)
     tables = read(name)
-    assert {(at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})} == set()
+    assert {
+        (at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})
+    } == set()
 
 
 def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:

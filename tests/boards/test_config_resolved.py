@@ -18,7 +18,9 @@ REFUSED = "SCHED_FIFO refused, ordinary scheduling for wave"
 @pytest.fixture
 def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
     """A rack of which one board wants a real-time priority, and its memory."""
-    plan = resolve(config("clock.mode=realtime", "clock.on_no_realtime=refuse", "board.wave.priority=50"))
+    plan = resolve(
+        config("clock.mode=realtime", "clock.on_no_realtime=refuse", "board.wave.priority=50")
+    )
     segment = Segment.create(plan.layout, "")
     yield plan, segment
     unlink(segment.rack)
@@ -44,8 +46,15 @@ def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     plan = resolve(config("supervision.lockstep_restart_s=0.25"))
     clock = plan.clock(0.5)
     # A tick of 2.5 ms.
-    assert resolve(config("clock.mode=realtime", "clock.speed=2")).clock(None).period_ns == 1_250_000
-    assert (clock.period_ns, clock.stop_tick, clock.restart_ticks, clock.linger) == (2_500_000, 200, 100, 200)
+    assert (
+        resolve(config("clock.mode=realtime", "clock.speed=2")).clock(None).period_ns == 1_250_000
+    )
+    assert (clock.period_ns, clock.stop_tick, clock.restart_ticks, clock.linger) == (
+        2_500_000,
+        200,
+        100,
+        200,
+    )
     assert (clock.lockstep, clock.keeps_awake, clock.ends_run) == (True, False, "watch.status")
     assert set(clock.on_loss) == {"wave", "watch"}
     assert all(isinstance(demand, Demand) for demand in clock.on_loss.values())
@@ -53,7 +62,9 @@ def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     assert plan.clock(1e-9).stop_tick == 1
 
 
-def test_a_launch_says_whether_idle_cores_are_held_awake(memory: tuple[Resolved, Segment], config: MakeConfig) -> None:
+def test_a_launch_says_whether_idle_cores_are_held_awake(
+    memory: tuple[Resolved, Segment], config: MakeConfig
+) -> None:
     plan, segment = memory
     assert not [note for note in plan.notes(segment) if "idle_cores" in note]
     awake = resolve(config("clock.mode=realtime", "clock.idle_cores=awake"))

@@ -1,4 +1,5 @@
-"""`[schedule]`: frames off the clock's grid and cycles that do not fit are refused, with the nearest that do."""
+"""`[schedule]`: frames off the clock's grid and cycles that do not fit are refused, with the
+nearest that do."""
 
 from __future__ import annotations
 
@@ -15,12 +16,18 @@ REFUSED = {
         "schedule.minor_ms=4.5",
         "schedule.minor_ms = 4.5: not a whole number of ticks of 1 ms; nearest: 4 or 5 ms",
     ),
-    "short": ("schedule.minor_ms=0.1", "schedule.minor_ms = 0.1: not a whole number of ticks of 1 ms; nearest: 1 ms"),
+    "short": (
+        "schedule.minor_ms=0.1",
+        "schedule.minor_ms = 0.1: not a whole number of ticks of 1 ms; nearest: 1 ms",
+    ),
     "major": (
         "schedule.major_ms=10",
         "schedule.major_ms = 10.0: not a multiple of minor_ms, 4 ms; nearest: 8 or 12 ms",
     ),
-    "long": ("schedule.major_ms=40000", "schedule.major_ms = 40000.0: 40000 ticks; permitted: up to 10000, 10000 ms"),
+    "long": (
+        "schedule.major_ms=40000",
+        "schedule.major_ms = 40000.0: 40000 ticks; permitted: up to 10000, 10000 ms",
+    ),
     "no multiple": (
         "board.odd.every=6",
         f"board.odd.every = 6: a cycle of 6 ms {FIT} 8 ms; nearest: 4 ms, every 4 or 8 ms, every 8",
@@ -41,7 +48,11 @@ def test_a_schedule_that_does_not_divide_is_one_mistake(setting: str, line: str)
 
 def test_a_rate_is_refused_with_the_nearest_rates() -> None:
     config = load(
-        "nasrem", ["schedule={ minor_ms = 2.5, major_ms = 1000 }", "board.primitive.rate_hz=57.142857142857146"]
+        "nasrem",
+        [
+            "schedule={ minor_ms = 2.5, major_ms = 1000 }",
+            "board.primitive.rate_hz=57.142857142857146",
+        ],
     )
     (found,) = schedule(Wiring(config))
     assert found.place == "board.primitive.rate_hz"

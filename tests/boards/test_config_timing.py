@@ -15,17 +15,23 @@ from tests.boards.run.test_exchange import NOTES, SPARSE
 from tests.boards.run.test_exchange import TEXT as EXCHANGE
 from tests.boards.test_queues import QUEUES
 
-MEASURED = Budget(read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11)
+MEASURED = Budget(
+    read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11
+)
 WITHIN = "board.lower.budget={ process_ms = 1.5, plan_ms = 3, plan_within_ms = 20 }"
 
 
 def test_budgets_are_whole_nanoseconds_by_board(small: Path) -> None:
-    config = load(small, ["board.lower.budget={ read_ms = 0.1, process_ms = 1.25, update_ms = 0.000001 }"])
+    config = load(
+        small, ["board.lower.budget={ read_ms = 0.1, process_ms = 1.25, update_ms = 0.000001 }"]
+    )
     assert budgets(config) == {"lower": Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)}
 
 
 def test_plan_within_ms_is_not_part_of_the_budget(small: Path) -> None:
-    assert budgets(load(small, [WITHIN])) == {"lower": Budget(process_ns=1_500_000, plan_ns=3_000_000)}
+    assert budgets(load(small, [WITHIN])) == {
+        "lower": Budget(process_ns=1_500_000, plan_ns=3_000_000)
+    }
 
 
 def test_budgets_survive_being_put_into_a_config(small: Path) -> None:
@@ -42,14 +48,24 @@ def test_budgets_survive_being_put_into_a_config(small: Path) -> None:
 @pytest.mark.parametrize("table", ["budget", "transfer"])
 @pytest.mark.parametrize("key", ["exchange_ms", "update_ms"])
 def test_planner_times_without_a_planner_are_a_mistake(small: Path, table: str, key: str) -> None:
-    with pytest.raises(ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"):
+    with pytest.raises(
+        ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"
+    ):
         wire(load(small, [f"board.upper.{table}.{key}=1.5"]))
     assert wire(load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"]))
 
 
 def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:
-    settings = ["core=7", "coupling=loose", "planner_slot=9", "planner_core=11", "budget.process_ms=1"]
-    config = load(small, [*(f"board.lower.{setting}" for setting in settings), "board.lower.budget.plan_ms=2"])
+    settings = [
+        "core=7",
+        "coupling=loose",
+        "planner_slot=9",
+        "planner_core=11",
+        "budget.process_ms=1",
+    ]
+    config = load(
+        small, [*(f"board.lower.{setting}" for setting in settings), "board.lower.budget.plan_ms=2"]
+    )
     tasks = {task.name: task for task in rack_timing(config, wire(config)).tasks}
     assert {name: task.core for name, task in tasks.items()} == {"lower": 7, "lower.planner": 11}
     assert tasks["lower.planner"].parts == (Part(Unit.PLAN, 2_000_000),)
@@ -57,7 +73,8 @@ def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:
 
 
 def test_each_board_has_the_grids_of_its_own_reads_by_writer() -> None:
-    # Another board reads the same mailbox in fewer cycles, and this one another mailbox in every cycle.
+    # Another board reads the same mailbox in fewer cycles, and this one another mailbox in every
+    # cycle.
     other = f"""{EXCHANGE}
 [board.slow]
 slot = 4
@@ -80,5 +97,7 @@ def test_only_the_reader_of_a_queue_waits_for_it() -> None:
     queues = {name: board.queues for name, board in rack_timing(config, layout).boards.items()}
     boxes = [box for box in layout.mailboxes if box.capacity]
     assert boxes
-    assert queues == {name: tuple(box.name for box in boxes if name in box.readers) for name in queues}
+    assert queues == {
+        name: tuple(box.name for box in boxes if name in box.readers) for name in queues
+    }
     assert {queue for found in queues.values() for queue in found} == {box.name for box in boxes}

@@ -1,4 +1,5 @@
-"""Every kind of fault, for however long, ends: all goes on within the kind's bound, or what failed is latched."""
+"""Every kind of fault, for however long, ends: all goes on within the kind's bound, or what failed
+is latched."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ OTHERS = [kind for kind in KINDS if kind.where != "arm"]
 
 
 def cases(realtime: bool) -> list[Any]:
-    """Return every kind that needs real time, or that does not, with every length that it can have."""
+    """Return every kind that needs real time, or that does not, with every length that it can
+    have."""
     return [
         pytest.param(kind, length, id=f"{kind.name}, {name}")
         for kind in OTHERS
@@ -51,7 +53,11 @@ def rack_with(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> Rack:
     settings = ["clock.mode=realtime"] if kind.realtime else []
     found = config(*settings, *([LOCKED] if kind.where == "lock" else []), text=FOLLOWED)
     tick = {} if kind.where == "start" else {"tick": FIRST}
-    return Rack(found.model_copy(update={"fault": (FaultConfig(kind=kind.name, board=board, **tick, **length),)}))
+    return Rack(
+        found.model_copy(
+            update={"fault": (FaultConfig(kind=kind.name, board=board, **tick, **length),)}
+        )
+    )
 
 
 @pytest.mark.parametrize(("kind", "length"), cases(realtime=False))
@@ -64,7 +70,9 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
         (entry,) = FaultTable(rack.segment).staged((Stage.ACTIVE, Stage.OVER))
         board = layout.tasks[entry[Entry.TASK]].name if entry[Entry.TASK] >= 0 else CLOCK
         rows = trace_ring(rack.segment, "watch").drain().rows
-    bound = kind.bound_ticks(injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None)
+    bound = kind.bound_ticks(
+        injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None
+    )
     found = min((event.tick for event in rack.events if event.code in kind.codes), default=None)
     if found is None:
         # One cycle may be too short to tell anything, or to hit a message.
@@ -89,13 +97,17 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
 
 
 @pytest.mark.parametrize(("kind", "length"), cases(realtime=True))
-def test_a_fault_in_real_time_finally_ends_or_latches(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> None:
+def test_a_fault_in_real_time_finally_ends_or_latches(
+    config: MakeConfig, kind: Kind, length: dict[str, Any]
+) -> None:
     with rack_with(config, kind, length) as rack:
         rack.start()
         entry, watch = FaultTable(rack.segment).entries[0], rack.segment.block("watch")
         tasks = [rack.segment.block(task.name) for task in rack.segment.layout.tasks]
         deadline = time.monotonic() + BOUND_S
-        while (entry.stage != Stage.OVER or any(task[Block.LOST] for task in tasks)) and rack.watch(0.02):
+        while (entry.stage != Stage.OVER or any(task[Block.LOST] for task in tasks)) and rack.watch(
+            0.02
+        ):
             assert time.monotonic() < deadline
         before = [task[Block.CYCLES] for task in tasks]
         while (
@@ -112,7 +124,9 @@ def test_a_fault_in_real_time_finally_ends_or_latches(config: MakeConfig, kind: 
 
 def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> None:
     fault = FaultConfig(kind="lock-held", board="watch", tick=FIRST + 1)
-    found = config("clock.mode=realtime", LOCKED, text=FOLLOWED).model_copy(update={"fault": (fault,)})
+    found = config("clock.mode=realtime", LOCKED, text=FOLLOWED).model_copy(
+        update={"fault": (fault,)}
+    )
     with Rack(found) as rack:
         rack.start()
         entry, deadline = FaultTable(rack.segment).entries[0], time.monotonic() + BOUND_S
@@ -125,7 +139,9 @@ def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> 
 def test_a_run_ends_when_the_level_that_ends_it_falls_silent(config: MakeConfig) -> None:
     slow = FOLLOWED.replace("rate_hz = 400", "rate_hz = 40").replace("rate_hz = 50", "rate_hz = 5")
     fault = FaultConfig(kind="mute", board="watch", tick=FIRST)
-    with Rack(config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})) as rack:
+    with Rack(
+        config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})
+    ) as rack:
         outcome = rack.run()
     assert (outcome.cause, outcome.worked) == ("task failed", False)
     assert outcome.reason.startswith("'watch.status' has not been written for 30.")

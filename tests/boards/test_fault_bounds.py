@@ -24,7 +24,11 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
     "planner": ({"kind": "hang", "board": "wave.planner"}, None, 5 * 4),
     "core taken": ({"kind": "hog", "board": "watch"}, None, 5 * 8),
     "overrun": ({"kind": "overrun", "board": "watch"}, None, 8),
-    "slow planner, d cycles and one": ({"kind": "planner-slow", "board": "wave.planner"}, None, 4 + 1),
+    "slow planner, d cycles and one": (
+        {"kind": "planner-slow", "board": "wave.planner"},
+        None,
+        4 + 1,
+    ),
     "mute, first reader": ({"kind": "mute", "board": "wave"}, None, 2 + 4),
     "mute, one reader": ({"kind": "mute", "board": "wave"}, "watch", 2 + 8),
     "mute, nobody reads": ({"kind": "mute", "board": "driven"}, None, None),
@@ -34,7 +38,11 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
     "reorder": ({"kind": "reorder", "board": "wave"}, "watch", 1 + 1 + 8),
     "delay": ({"kind": "delay", "board": "wave", "by": 3}, "watch", 3 + 1 + 8),
     "corrupt": ({"kind": "corrupt", "board": "wave"}, "watch", 1 + 8),
-    "corrupt plan, visible after its slice": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
+    "corrupt plan, visible after its slice": (
+        {"kind": "corrupt", "board": "wave.planner"},
+        "wave",
+        4 + 1,
+    ),
     "babble": ({"kind": "babble", "board": "wave"}, None, 1 + 4),
     "masquerade": ({"kind": "masquerade", "board": "wave"}, None, 1 + 4),
     "clock stops": ({"kind": "clock-stop", "board": "clock"}, None, 3),
@@ -53,7 +61,9 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
 }
 
 
-def bound(config: MakeConfig, fault: dict[str, Any], reader: str | None, *settings: str) -> int | None:
+def bound(
+    config: MakeConfig, fault: dict[str, Any], reader: str | None, *settings: str
+) -> int | None:
     found = rack(config, fault, settings=settings)
     layout: Layout = wire(found)
     return KINDS[fault["kind"]].bound_ticks(injections(found, layout)[0], layout, reader)
@@ -73,20 +83,33 @@ def test_a_slow_planner_is_detected_after_its_slice_and_one_release(config: Make
 
 
 @pytest.mark.parametrize(("kind", "ticks"), [("actuator-off", 13), ("actuator-saturated", 30)])
-def test_a_motor_of_a_fast_board_is_detected_within_a_time(config: MakeConfig, kind: str, ticks: int) -> None:
+def test_a_motor_of_a_fast_board_is_detected_within_a_time(
+    config: MakeConfig, kind: str, ticks: int
+) -> None:
     rates = [f"board.{name}.rate_hz=1000" for name in ("wave", "watch", "driven")]
-    assert bound(config, {"kind": kind, "board": "driven"}, None, "clock.period_ms=1.0", *rates) == ticks
+    assert (
+        bound(config, {"kind": kind, "board": "driven"}, None, "clock.period_ms=1.0", *rates)
+        == ticks
+    )
 
 
 @pytest.mark.parametrize(("ticks", "within"), [(1, 3), (3, 3), (4, 4)])
-def test_a_skip_is_found_in_the_next_cycle_of_the_fastest_boards(config: MakeConfig, ticks: int, within: int) -> None:
+def test_a_skip_is_found_in_the_next_cycle_of_the_fastest_boards(
+    config: MakeConfig, ticks: int, within: int
+) -> None:
     rates = [f"board.{name}.rate_hz=100" for name in ("wave", "watch", "driven")]
-    assert bound(config, {"kind": "clock-skip", "board": "clock", "ticks": ticks}, None, *rates) == within
+    assert (
+        bound(config, {"kind": "clock-skip", "board": "clock", "ticks": ticks}, None, *rates)
+        == within
+    )
 
 
 def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) -> None:
     # 2 ms of 2.5 ms ticks, and the cycle of the first reader.
-    assert bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock") == 1 + 4
+    assert (
+        bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock")
+        == 1 + 4
+    )
 
 
 def test_every_kind_has_a_bound_or_says_why_not() -> None:
@@ -95,7 +118,10 @@ def test_every_kind_has_a_bound_or_says_why_not() -> None:
 
 
 def test_the_text_of_a_bound_matches_its_computation() -> None:
-    words = {name: str(KINDS[name].bound) for name in ("hang", "mute", "planner-slow", "clock-stop", "command-nan")}
+    words = {
+        name: str(KINDS[name].bound)
+        for name in ("hang", "mute", "planner-slow", "clock-stop", "command-nan")
+    }
     assert words == {
         "hang": "5 cycles",
         "mute": "2 writes + 1 read",
@@ -107,4 +133,9 @@ def test_the_text_of_a_bound_matches_its_computation() -> None:
 
 def test_the_clocks_cycle_is_a_tick_and_a_planners_is_its_slice(config: MakeConfig) -> None:
     layout = wire(rack(config))
-    assert [cycle_ticks(layout, name) for name in ("clock", "wave", "wave.planner", "watch")] == [1, 1, 4, 8]
+    assert [cycle_ticks(layout, name) for name in ("clock", "wave", "wave.planner", "watch")] == [
+        1,
+        1,
+        4,
+        8,
+    ]

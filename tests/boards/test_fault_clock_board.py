@@ -1,4 +1,5 @@
-"""The course of faults in lockstep: it depends on ticks alone, however long a cycle takes that is under way."""
+"""The course of faults in lockstep: it depends on ticks alone, however long a cycle takes that is
+under way."""
 
 from __future__ import annotations
 
@@ -51,5 +52,9 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # n
     driver.controller = Controller()
     driver.run()
     thread.join(BOUND_S)
-    assert seen == [(tick, at) for tick, at in ((0, Stage.WAITING), (8, Stage.ACTIVE), (16, Stage.OVER)) for _ in "ab"]
+    assert seen == [
+        (tick, at)
+        for tick, at in ((0, Stage.WAITING), (8, Stage.ACTIVE), (16, Stage.OVER))
+        for _ in "ab"
+    ]
     assert (entry[Entry.FROM], entry[Entry.UNTIL]) == (3, 9)

@@ -23,16 +23,36 @@ def test_no_parameter_has_the_name_of_a_common_fault_key() -> None:
     assert not [(kind.name, p.name) for kind in KINDS for p in kind.parameters if p.name in keys]
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("0.5s", 0.5), ("20ms", 0.02), (" 1.5 s ", 1.5), (2, 2.0), (0.25, 0.25)])
-def test_a_duration_is_a_text_with_its_unit_or_a_number_of_seconds(text: object, seconds: float) -> None:
-    assert FaultConfig.model_validate({"kind": "mute", "board": "wave", "for": text}).lasts == pytest.approx(seconds)
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("0.5s", 0.5), ("20ms", 0.02), (" 1.5 s ", 1.5), (2, 2.0), (0.25, 0.25)]
+)
+def test_a_duration_is_a_text_with_its_unit_or_a_number_of_seconds(
+    text: object, seconds: float
+) -> None:
+    assert FaultConfig.model_validate(
+        {"kind": "mute", "board": "wave", "for": text}
+    ).lasts == pytest.approx(seconds)
 
 
 def test_the_resolved_text_of_a_config_with_faults_loads_again(config: MakeConfig) -> None:
     found = rack(
         config,
-        {"kind": "mute", "board": "wave", "for": "20ms", "when": "wave.status.state == executing", "seed": 3},
-        {"kind": "sensor-bias", "board": "driven", "tick": 40, "cycles": 5, "phase": 0.25, "size": 0.1, "joint": -1},
+        {
+            "kind": "mute",
+            "board": "wave",
+            "for": "20ms",
+            "when": "wave.status.state == executing",
+            "seed": 3,
+        },
+        {
+            "kind": "sensor-bias",
+            "board": "driven",
+            "tick": 40,
+            "cycles": 5,
+            "phase": 0.25,
+            "size": 0.1,
+            "joint": -1,
+        },
     )
     again = loads(found.text())
     assert again == found
@@ -59,18 +79,27 @@ def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
 def test_an_unknown_script_lists_the_known_scripts(small: Path) -> None:
     with pytest.raises(ConfigError) as error:
         load(small, faults="noisy")
-    assert str(error.value) == f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'
+    assert (
+        str(error.value)
+        == f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'
+    )
 
 
 @pytest.mark.parametrize("text", ["[clock]\nspeed = 2\n", "fault = 3\n", 'name = "x"\n'])
 def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text: str) -> None:
-    with pytest.raises(ConfigError, match=r"script.toml: \w+: a fault script contains \[\[fault\]\] tables and"):
+    with pytest.raises(
+        ConfigError, match=r"script.toml: \w+: a fault script contains \[\[fault\]\] tables and"
+    ):
         load(small, faults=write("script.toml", text))
 
 
 def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
     plain = load(small)
-    assert (plain.supervision.restarts, plain.supervision.within_s, plain.supervision.lockstep_restart_s) == (
+    assert (
+        plain.supervision.restarts,
+        plain.supervision.within_s,
+        plain.supervision.lockstep_restart_s,
+    ) == (
         5,
         10,
         0.5,
@@ -78,7 +107,11 @@ def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
     assert (plain.board["lower"].restarts, plain.board["lower"].on_loss) == (None, "hold")
     settings = ["supervision.restarts=2", "board.lower.restarts=0", "board.lower.on_loss=brake"]
     config = load(small, settings)
-    assert (config.supervision.restarts, config.board["lower"].restarts, config.board["lower"].on_loss) == (
+    assert (
+        config.supervision.restarts,
+        config.board["lower"].restarts,
+        config.board["lower"].on_loss,
+    ) == (
         2,
         0,
         "brake",
@@ -89,7 +122,10 @@ def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
-        ("supervision.restarts=-1", "supervision.restarts = -1: should be greater than or equal to 0"),
+        (
+            "supervision.restarts=-1",
+            "supervision.restarts = -1: should be greater than or equal to 0",
+        ),
         ("supervision.within_s=0", "supervision.within_s = 0: should be greater than 0"),
         ("supervision.lockstep_restart_s=inf", "should be a finite number"),
         ("board.lower.on_loss=stay", "'hold', 'stop' or 'brake'"),

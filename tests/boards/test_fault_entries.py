@@ -26,7 +26,14 @@ def injected(config: MakeConfig, *faults: dict[str, Any]) -> tuple[Injection, ..
 
 @pytest.mark.parametrize(
     ("begin", "tick"),
-    [({}, -1), ({"tick": 40}, 40), ({"tick": 0}, 0), ({"at": 0.1}, 40), ({"at": 0.1012}, 40), ({"at": 0.1013}, 41)],
+    [
+        ({}, -1),
+        ({"tick": 40}, 40),
+        ({"tick": 0}, 0),
+        ({"at": 0.1}, 40),
+        ({"at": 0.1012}, 40),
+        ({"at": 0.1013}, 41),
+    ],
 )
 def test_a_fault_begins_at_a_tick_or_at_the_tick_nearest_to_its_time(
     config: MakeConfig, begin: dict[str, Any], tick: int
@@ -62,7 +69,10 @@ def test_targets_are_places_in_the_layout(config: MakeConfig) -> None:
     ]
     layout = wire(rack(config))
     first, second, third = injected(config, *faults)
-    assert (layout.tasks[first.task].name, layout.mailboxes[first.mailbox].name) == ("watch", "watch.status")
+    assert (layout.tasks[first.task].name, layout.mailboxes[first.mailbox].name) == (
+        "watch",
+        "watch.status",
+    )
     assert (second.task, second.mailbox, second.parameters) == (-1, -1, (3.0,))
     assert (layout.tasks[third.task].name, third.mailbox) == ("wave", -1)
 
@@ -74,18 +84,25 @@ def test_a_forged_message_goes_to_the_first_mailbox_that_is_read(config: MakeCon
 
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
 def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
-    (found,) = injected(config, {"kind": "kill", "board": "wave", "when": f"watch.status.state=={value}"})
+    (found,) = injected(
+        config, {"kind": "kill", "board": "wave", "when": f"watch.status.state=={value}"}
+    )
     layout = wire(rack(config))
     assert found.when is not None
     box, field, number = found.when
-    assert (layout.mailboxes[box].name, layout.mailboxes[box].fields[field].name) == ("watch.status", "state")
+    assert (layout.mailboxes[box].name, layout.mailboxes[box].fields[field].name) == (
+        "watch.status",
+        "state",
+    )
     assert number == State.DONE
 
 
 def test_verbs_of_elemental_moves_have_names() -> None:
     from rack.boards.config import load
 
-    setting = 'fault=[{ kind = "kill", board = "servo", when = "elemental_move.status.verb == grasp" }]'
+    setting = (
+        'fault=[{ kind = "kill", board = "servo", when = "elemental_move.status.verb == grasp" }]'
+    )
     config = load("nasrem", [setting])
     (found,) = injections(config, wire(config))
     assert found.when is not None
@@ -104,7 +121,9 @@ def test_a_phase_is_rounded_down_to_thousandths_of_a_tick(config: MakeConfig) ->
     assert found.phase == 250
 
 
-def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(config: MakeConfig) -> None:
+def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(
+    config: MakeConfig,
+) -> None:
     drop = {"kind": "drop", "board": "wave"}
     first, second, given = injected(config, drop, drop, {**drop, "seed": 7})
     assert first.seed != second.seed
@@ -117,13 +136,22 @@ def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(co
 def test_a_fault_injected_live_is_checked_in_the_same_way(config: MakeConfig) -> None:
     found = rack(config)
     fault = FaultConfig.model_validate({"kind": "hang", "board": "wave", "for": 0.1, "size": 1})
-    with pytest.raises(ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"):
+    with pytest.raises(
+        ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"
+    ):
         injection(fault, found, wire(found))
 
 
 def test_the_fault_table_returns_the_faults_added(config: MakeConfig, rack_name: str) -> None:
     faults = [
-        {"kind": "corrupt", "board": "wave", "mailbox": "wave.status", "tick": 8, "cycles": 2, "bits": 5},
+        {
+            "kind": "corrupt",
+            "board": "wave",
+            "mailbox": "wave.status",
+            "tick": 8,
+            "cycles": 2,
+            "bits": 5,
+        },
         {"kind": "sensor-bias", "board": "driven", "joint": 1, "size": 0.1},
     ]
     found = rack(config, *faults)
@@ -134,12 +162,19 @@ def test_the_fault_table_returns_the_faults_added(config: MakeConfig, rack_name:
         entries = [table.add(each) for each in injections(found, layout)]
         assert [entry.stage for entry in entries] == [Stage.WAITING] * 2
         assert (entries[0][Entry.KIND], entries[0][Entry.FROM]) == (KINDS["corrupt"].number, 8)
-        assert describe(entries[0], layout, ()) == "corrupt of wave (wave.status, probability 1, bits 5)"
+        assert (
+            describe(entries[0], layout, ())
+            == "corrupt of wave (wave.status, probability 1, bits 5)"
+        )
         assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
         assert document(entries[0], layout, ())["until"] is None
         entries[1].words[Entry.STAGE], entries[1].words[Entry.UNTIL] = Stage.ACTIVE, NEVER
         entry = document(entries[1], layout, ("a", "b"))
-        assert (entry["stage"], entry["until"], entry["parameters"]) == ("active", None, {"joint": 1.0, "size": 0.1})
+        assert (entry["stage"], entry["until"], entry["parameters"]) == (
+            "active",
+            None,
+            {"joint": 1.0, "size": 0.1},
+        )
     finally:
         segment.close()
         unlink(rack_name)

@@ -1,4 +1,5 @@
-"""The table of kinds: a campaign's seed draws the same faults in every version, and a config means the same fault."""
+"""The table of kinds: a campaign's seed draws the same faults in every version, and a config means
+the same fault."""
 
 from __future__ import annotations
 
@@ -22,12 +23,33 @@ KIND_TABLE: dict[str, tuple[object, ...]] = {
         (0.25, False, False),
         {"by": (1.5, 0.0, 100.0, 1.375), "random": (0, 0, 1, None)},
     ),
-    "planner-slow": ("load", 502, None, "r", (0.25, False, False), {"by": (2.0, 0.5, 100.0, 1.836)}),
+    "planner-slow": (
+        "load",
+        502,
+        None,
+        "r",
+        (0.25, False, False),
+        {"by": (2.0, 0.5, 100.0, 1.836)},
+    ),
     "hog": ("core", 86, None, "r", (0.25, False, False), {}),
     "mute": ("writer", 16, None, "q", (0.25, False, False), {}),
-    "drop": ("writer", 16, None, "", (0.25, False, False), {"probability": (0.3, 0.001, 1.0, 0.5537)}),
+    "drop": (
+        "writer",
+        16,
+        None,
+        "",
+        (0.25, False, False),
+        {"probability": (0.3, 0.001, 1.0, 0.5537)},
+    ),
     "delay": ("writer", 26, None, "", (0.25, False, False), {"by": (2, 1, 50, 2)}),
-    "reorder": ("writer", 16, None, "q", (0.25, False, False), {"probability": (0.3, 0.001, 1.0, 0.5537)}),
+    "reorder": (
+        "writer",
+        16,
+        None,
+        "q",
+        (0.25, False, False),
+        {"probability": (0.3, 0.001, 1.0, 0.5537)},
+    ),
     "corrupt": (
         "writer",
         16,
@@ -41,7 +63,14 @@ KIND_TABLE: dict[str, tuple[object, ...]] = {
     "lock-held": ("lock", None, None, "ro", (0.25, True, False), {"killed": (0, 0, 1, 0)}),
     "clock-stop": ("clock", 33, None, "rot", (0.25, True, False), {}),
     "clock-skip": ("clock", None, None, "o", (0.25, False, False), {"ticks": (1, 1, 20, 5)}),
-    "clock-jitter": ("clock", 216, None, "r", (0.25, False, False), {"late": (0.9, 0.65, 0.95, 0.7769)}),
+    "clock-jitter": (
+        "clock",
+        216,
+        None,
+        "r",
+        (0.25, False, False),
+        {"late": (0.9, 0.65, 0.95, 0.7769)},
+    ),
     "sensor-nan": ("arm", 37, None, "", (1.0, False, True), {"joint": (0, -1, 15, 0)}),
     "sensor-stuck": ("arm", 302, None, "", (1.0, False, True), {"joint": (0, -1, 15, -1)}),
     "sensor-dropout": ("arm", 23, None, "", (1.0, False, True), {}),
@@ -70,7 +99,14 @@ KIND_TABLE: dict[str, tuple[object, ...]] = {
         (0.6, False, True),
         {"joint": (1, -1, 15, 0), "part": (0.1, 0.0, 0.9, 0.01275)},
     ),
-    "tendon-torn": ("arm", 56, None, "", (0.25, False, False), {"joint": (0, -1, 15, 0), "side": (0, 0, 1, None)}),
+    "tendon-torn": (
+        "arm",
+        56,
+        None,
+        "",
+        (0.25, False, False),
+        {"joint": (0, -1, 15, 0), "side": (0, 0, 1, None)},
+    ),
     "command-nan": ("arm", 23, None, "", (0.25, False, False), {"joint": (0, -1, 15, 0)}),
     "command-limit": (
         "arm",
@@ -82,7 +118,8 @@ KIND_TABLE: dict[str, tuple[object, ...]] = {
     ),
     "self-test": ("start", None, None, "o", (0.25, False, False), {}),
 }
-"""Where it acts, ticks drawn, smallest size to be found, flags, recovery (s, by a restart, may latch), parameters."""
+"""Where it acts, ticks drawn, smallest size to be found, flags, recovery (s, by a restart, may
+latch), parameters."""
 FLAGS = {"r": "realtime", "o": "once", "t": "within_tick", "q": "not_queued"}
 
 
@@ -94,7 +131,9 @@ def drawing(seed: int = 1) -> Drawing:
 def row(kind: Kind) -> tuple[object, ...]:
     """Return a kind as in `KIND_TABLE`."""
     d = drawing()
-    parameters = {p.name: (p.default, p.least, p.most, p.drawn and p.drawn(d)) for p in kind.parameters}
+    parameters = {
+        p.name: (p.default, p.least, p.most, p.drawn and p.drawn(d)) for p in kind.parameters
+    }
     lasts = kind.lasts and kind.lasts(d)
     flags = "".join(letter for letter, name in FLAGS.items() if getattr(kind, name))
     after = kind.consequence

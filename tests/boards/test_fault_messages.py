@@ -1,4 +1,5 @@
-"""Faults of a writer: they act on its messages, are detected by the reader within their bounds, and end."""
+"""Faults of a writer: they act on its messages, are detected by the reader within their bounds, and
+end."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ FAULTS: dict[str, tuple[float, ...]] = {
     "babble": (16,),
 }
 ALSO = {"delay": {Alarm.MUTE}, "reorder": {Alarm.HELD_BACK}}
-"""Other permitted alarms: a delayed message is at first missing; the last swapped message is late."""
+"""Other permitted alarms: a delayed message is at first missing; the last swapped message is
+late."""
 BEGIN, END, LAST = 64, 160, 320
 
 
@@ -88,7 +90,9 @@ def test_a_fault_is_detected_within_its_bound_and_identified(
 @pytest.mark.slow
 @pytest.mark.parametrize("rates", RATES)
 @pytest.mark.parametrize("kind", [*FAULTS, "masquerade"])
-def test_reads_with_a_fault_depend_on_ticks_alone(link: MakeLink, kind: str, rates: tuple[int, int]) -> None:
+def test_reads_with_a_fault_depend_on_ticks_alone(
+    link: MakeLink, kind: str, rates: tuple[int, int]
+) -> None:
     runs = []
     for reader_first in (False, True):
         rack = link("time-slice", rates, reader_first)
@@ -104,7 +108,8 @@ def test_reads_with_a_fault_depend_on_ticks_alone(link: MakeLink, kind: str, rat
     (seen, alarms, written), (seen_again, alarms_again, written_again) = runs
     assert seen == seen_again
     assert written == written_again
-    # A forged message lasts until the true writer's next one: only a reader that comes before sees it.
+    # A forged message lasts until the true writer's next one: only a reader that comes before sees
+    # it.
     assert alarms == alarms_again or kind == "masquerade"
 
 
@@ -134,7 +139,9 @@ def test_a_dropped_message_uses_a_serial_but_fills_no_slot(link: MakeLink) -> No
 
 
 @pytest.mark.parametrize("every", [1, 4])
-def test_a_delayed_message_keeps_its_tick_and_comes_cycles_later(link: MakeLink, every: int) -> None:
+def test_a_delayed_message_keeps_its_tick_and_comes_cycles_later(
+    link: MakeLink, every: int
+) -> None:
     rack = link(rates=(every, 1))
     rack.run(0, 8 * every)
     rack.fault("delay", 3)
@@ -192,7 +199,9 @@ def test_every_damage_is_detected(link: MakeLink, bits: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_babble_writes_the_given_number_of_messages_per_cycle(link: MakeLink, protocol: Protocol) -> None:
+def test_babble_writes_the_given_number_of_messages_per_cycle(
+    link: MakeLink, protocol: Protocol
+) -> None:
     rack = link(protocol)
     rack.run(0, 4)
     rack.fault("babble", 40)
@@ -298,7 +307,9 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
     rack = link("lock")
     rack.run(0, 4)
     rack.writer.close()
-    entry = FaultTable(rack.segment).add(Injection(KINDS["lock-held"].number, 0, parameters=(float(is_killed),)))
+    entry = FaultTable(rack.segment).add(
+        Injection(KINDS["lock-held"].number, 0, parameters=(float(is_killed),))
+    )
 
     def write() -> None:
         writer = WritingTask(rack.segment)

@@ -24,13 +24,34 @@ TASKS = "wave, wave.planner, watch, driven, clock"
 MISTAKES: Mapping[str, tuple[Fault, str]] = {
     "no kind": ({"board": "wave"}, "fault[0].kind: missing; kind of fault"),
     "no board": ({"kind": "kill"}, "fault[0].board: missing; task to strike"),
-    "unknown kind": ({"kind": "kil", "board": "wave"}, f'.kind = "kil": no such kind; kinds: {", ".join(KINDS.names)}'),
-    "unknown board": ({"kind": "kill", "board": "wve"}, f'.board = "wve": no such task; tasks: {TASKS}'),
-    "no such planner": ({"kind": "kill", "board": "watch.planner"}, f"no such task; tasks: {TASKS}"),
-    "tick below 0": ({"kind": "kill", "board": "wave", "tick": -1}, ".tick = -1: should be greater than or equal to 0"),
-    "tick and a half": ({"kind": "kill", "board": "wave", "tick": 1.5}, ".tick = 1.5: should be a valid integer"),
-    "at below 0": ({"kind": "kill", "board": "wave", "at": -0.1}, ".at = -0.1: should be greater than or equal to 0"),
-    "at, endless": ({"kind": "kill", "board": "wave", "at": float("inf")}, ".at = inf: should be a finite number"),
+    "unknown kind": (
+        {"kind": "kil", "board": "wave"},
+        f'.kind = "kil": no such kind; kinds: {", ".join(KINDS.names)}',
+    ),
+    "unknown board": (
+        {"kind": "kill", "board": "wve"},
+        f'.board = "wve": no such task; tasks: {TASKS}',
+    ),
+    "no such planner": (
+        {"kind": "kill", "board": "watch.planner"},
+        f"no such task; tasks: {TASKS}",
+    ),
+    "tick below 0": (
+        {"kind": "kill", "board": "wave", "tick": -1},
+        ".tick = -1: should be greater than or equal to 0",
+    ),
+    "tick and a half": (
+        {"kind": "kill", "board": "wave", "tick": 1.5},
+        ".tick = 1.5: should be a valid integer",
+    ),
+    "at below 0": (
+        {"kind": "kill", "board": "wave", "at": -0.1},
+        ".at = -0.1: should be greater than or equal to 0",
+    ),
+    "at, endless": (
+        {"kind": "kill", "board": "wave", "at": float("inf")},
+        ".at = inf: should be a finite number",
+    ),
     "two beginnings": (
         {"kind": "kill", "board": "wave", "tick": 1, "at": 1.0},
         ".at = 1.0: tick is also given; permitted: one of tick, at, when",
@@ -39,22 +60,43 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
         {"kind": "mute", "board": "wave", "for": "1s", "cycles": 4},
         ".cycles = 4: for is also given; permitted: one of for, cycles",
     ),
-    "no time": ({"kind": "mute", "board": "wave", "for": "1 min"}, 'should be a time, as in "0.5s", "20ms" or 0.5'),
-    "for nothing": ({"kind": "mute", "board": "wave", "for": "0s"}, '.for = "0s": should be greater than 0'),
-    "no cycles": ({"kind": "mute", "board": "wave", "cycles": 0}, ".cycles = 0: should be greater than or equal to 1"),
+    "no time": (
+        {"kind": "mute", "board": "wave", "for": "1 min"},
+        'should be a time, as in "0.5s", "20ms" or 0.5',
+    ),
+    "for nothing": (
+        {"kind": "mute", "board": "wave", "for": "0s"},
+        '.for = "0s": should be greater than 0',
+    ),
+    "no cycles": (
+        {"kind": "mute", "board": "wave", "cycles": 0},
+        ".cycles = 0: should be greater than or equal to 1",
+    ),
     "phase": ({"kind": "kill", "board": "wave", "phase": 1}, ".phase = 1: should be less than 1"),
-    "phase below 0": ({"kind": "kill", "board": "wave", "phase": -0.1}, "should be greater than or equal to 0"),
-    "seed": ({"kind": "drop", "board": "wave", "seed": -1}, ".seed = -1: should be greater than or equal to 0"),
+    "phase below 0": (
+        {"kind": "kill", "board": "wave", "phase": -0.1},
+        "should be greater than or equal to 0",
+    ),
+    "seed": (
+        {"kind": "drop", "board": "wave", "seed": -1},
+        ".seed = -1: should be greater than or equal to 0",
+    ),
     "parameter, no number": (
         {"kind": "drop", "board": "wave", "probability": "often"},
         '.probability = "often": should be a valid number',
     ),
-    "parameter, no finite one": ({"kind": "drop", "board": "wave", "probability": float("nan")}, "a finite number"),
+    "parameter, no finite one": (
+        {"kind": "drop", "board": "wave", "probability": float("nan")},
+        "a finite number",
+    ),
     "mailbox of another": (
         {"kind": "mute", "board": "watch", "mailbox": "wave.status"},
         ".mailbox = \"wave.status\": 'watch' does not write it; it writes: watch.status",
     ),
-    "no mailbox": ({"kind": "mute", "board": "watch", "mailbox": "sea"}, "does not write it; it writes: watch.status"),
+    "no mailbox": (
+        {"kind": "mute", "board": "watch", "mailbox": "sea"},
+        "does not write it; it writes: watch.status",
+    ),
     "overrun of a planner": (
         {"kind": "overrun", "board": "wave.planner"},
         "overrun strikes only executors; executors: wave, watch, driven",
@@ -67,7 +109,10 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
         {"kind": "sensor-nan", "board": "wave"},
         "sensor-nan cannot strike this board; boards that it can: driven",
     ),
-    "clock kind": ({"kind": "clock-skip", "board": "wave"}, 'clock-skip strikes only the clock; permitted: "clock"'),
+    "clock kind": (
+        {"kind": "clock-skip", "board": "wave"},
+        'clock-skip strikes only the clock; permitted: "clock"',
+    ),
     "no kind of the clock": (
         {"kind": "mute", "board": "clock"},
         "mute cannot strike the clock; kinds that can: kill, clock-stop, clock-skip, clock-jitter",
@@ -76,8 +121,14 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
         {"kind": "hang", "board": "clock"},
         "hang cannot strike the clock; kinds that can: kill, clock-stop",
     ),
-    "no lock": ({"kind": "lock-held", "board": "wave"}, "needs protocol lock; mailboxes of 'wave' that use it: none"),
-    "nobody reads": ({"kind": "masquerade", "board": "watch"}, "missing; no mailbox of 'watch' has a reader"),
+    "no lock": (
+        {"kind": "lock-held", "board": "wave"},
+        "needs protocol lock; mailboxes of 'wave' that use it: none",
+    ),
+    "nobody reads": (
+        {"kind": "masquerade", "board": "watch"},
+        "missing; no mailbox of 'watch' has a reader",
+    ),
     "condition": (
         {"kind": "kill", "board": "wave", "when": "wave.status.state > 1"},
         'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"',
@@ -141,7 +192,9 @@ def only_mistake(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] =
 
 
 @pytest.mark.parametrize(("fault", "line"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_reported_with_the_permitted_values(config: MakeConfig, fault: Fault, line: str) -> None:
+def test_a_mistake_is_reported_with_the_permitted_values(
+    config: MakeConfig, fault: Fault, line: str
+) -> None:
     found = only_mistake(config, fault)
     assert line in found
     assert found.startswith("fault[0]")
@@ -164,7 +217,9 @@ def test_a_parameter_that_a_kind_lacks_lists_those_it_has(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize(("kind", "parameter"), PARAMETERS, ids=lambda given: given.name)
-def test_a_parameter_out_of_range_is_reported_with_its_range(kind: Kind, parameter: Parameter) -> None:
+def test_a_parameter_out_of_range_is_reported_with_its_range(
+    kind: Kind, parameter: Parameter
+) -> None:
     for value in (parameter.least - 0.25, parameter.most + 0.25):
         line = mistake_of(kind, **{parameter.name: value})
         assert line.startswith(f"fault[0].{parameter.name} = {value!r}: out of range")
@@ -172,7 +227,9 @@ def test_a_parameter_out_of_range_is_reported_with_its_range(kind: Kind, paramet
 
 
 @pytest.mark.parametrize(
-    ("kind", "parameter"), [(k, p) for k, p in PARAMETERS if p.is_whole], ids=lambda given: given.name
+    ("kind", "parameter"),
+    [(k, p) for k, p in PARAMETERS if p.is_whole],
+    ids=lambda given: given.name,
 )
 def test_fractions_of_whole_numbers_are_refused(kind: Kind, parameter: Parameter) -> None:
     assert "permitted: whole numbers" in mistake_of(kind, **{parameter.name: parameter.least + 0.5})
@@ -181,17 +238,20 @@ def test_fractions_of_whole_numbers_are_refused(kind: Kind, parameter: Parameter
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.realtime], ids=lambda kind: kind.name)
 def test_a_kind_that_needs_real_time_says_so_in_lockstep(kind: Kind) -> None:
     line = mistake_of(kind, lockstep=True)
-    assert line == (
-        f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for every task; '
-        "run without --lockstep"
+    assert (
+        line
+        == f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for'
+        " every task; run without --lockstep"
     )
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if not k.within_tick], ids=lambda kind: kind.name)
+@pytest.mark.parametrize(
+    "kind", [k for k in KINDS if not k.within_tick], ids=lambda kind: kind.name
+)
 def test_a_kind_that_begins_with_a_cycle_has_no_phase(kind: Kind) -> None:
     line = mistake_of(kind, phase=0.5)
-    assert line == (
-        f"fault[0].phase = 0.5: {kind.name} cannot strike within a tick; kinds that can: "
+    assert (
+        line == f"fault[0].phase = 0.5: {kind.name} cannot strike within a tick; kinds that can: "
         "kill, hang, masquerade, clock-stop"
     )
 
@@ -204,14 +264,22 @@ def test_a_kind_that_strikes_once_does_not_last(kind: Kind, key: str) -> None:
     assert f"{kind.name} strikes once and has no duration; remove it" in line
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name)
+@pytest.mark.parametrize(
+    "kind", [k for k in KINDS if not k.takes_mailbox], ids=lambda kind: kind.name
+)
 def test_a_kind_without_mailboxes_lists_the_kinds_that_have_them(kind: Kind) -> None:
     takers = ", ".join(other.name for other in KINDS if other.takes_mailbox)
     line = mistake_of(kind, mailbox="wave.status")
-    assert line == f'fault[0].mailbox = "wave.status": {kind.name} does not affect mailboxes; kinds that do: {takers}'
+    assert (
+        line
+        == f'fault[0].mailbox = "wave.status": {kind.name} does not affect mailboxes; kinds that'
+        f" do: {takers}"
+    )
 
 
-@pytest.mark.parametrize("begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}])
+@pytest.mark.parametrize(
+    "begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}]
+)
 def test_a_self_test_fails_at_the_start_and_at_no_other_time(begin: Fault) -> None:
     line = mistake_of(KINDS["self-test"], **begin)
     assert "self-test strikes as the board starts; remove it" in line
@@ -220,14 +288,17 @@ def test_a_self_test_fails_at_the_start_and_at_no_other_time(begin: Fault) -> No
 def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> None:
     fault = {"kind": "lock-held", "board": "wave", "mailbox": "wave.status"}
     setting = 'protocol.mailbox={ "watch.status" = "lock" }'
-    assert "mailboxes of 'wave' that use it: none" in only_mistake(config, fault, settings=(setting,))
+    assert "mailboxes of 'wave' that use it: none" in only_mistake(
+        config, fault, settings=(setting,)
+    )
     wire(rack(config, fault, settings=(LOCKED,)))
 
 
 def test_a_joint_that_the_arm_lacks_is_refused() -> None:
     settings = ['fault=[{ kind = "sensor-nan", board = "servo", joint = 6 }]']
     with pytest.raises(
-        ConfigError, match="joint = 6: out of range; permitted: whole numbers -1 to 5; joint, counted from 0"
+        ConfigError,
+        match="joint = 6: out of range; permitted: whole numbers -1 to 5; joint, counted from 0",
     ):
         wire(load("nasrem", settings))
 
@@ -243,7 +314,15 @@ def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None
 def test_all_mistakes_of_all_faults_are_reported_at_once(config: MakeConfig) -> None:
     faults = (
         {"kind": "kil", "board": "wve", "tick": 1, "at": 1.0},
-        {"kind": "mute", "board": "wave", "mailbox": "sea", "when": "sea", "strength": 1, "for": 1, "cycles": 1},
+        {
+            "kind": "mute",
+            "board": "wave",
+            "mailbox": "sea",
+            "when": "sea",
+            "strength": 1,
+            "for": 1,
+            "cycles": 1,
+        },
     )
     places = [mistake.place for mistake in mistakes(config, *faults)]
     assert sorted(places) == sorted(

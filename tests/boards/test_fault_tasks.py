@@ -1,4 +1,5 @@
-"""Faults of one task: the hog takes a core when its fault begins, and not before; what computing time costs."""
+"""Faults of one task: the hog takes a core when its fault begins, and not before; what computing
+time costs."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ LEAST_S = 0.5
 
 @needs_fifo
 @pytest.mark.filterwarnings(FORKS)
-def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: MakeBus) -> None:  # noqa: F811
+def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = 2_500_000
     segment.block("level")[Block.CORE] = 0
@@ -39,11 +42,17 @@ def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: Make
 
 def load(segment: Segment, kind: str, until: LoadStep, *parameters: float) -> ExtraComputing:
     """Return extra computing time of a task of three ticks, whose plans have two cycles."""
-    entry = FaultTable(segment).add(Injection(KINDS[kind].number, 0, tick=0, seed=5, parameters=parameters))
-    return ExtraComputing(entry, task("level", every=3, within_cycles=2), SystemClock(segment), until)
+    entry = FaultTable(segment).add(
+        Injection(KINDS[kind].number, 0, tick=0, seed=5, parameters=parameters)
+    )
+    return ExtraComputing(
+        entry, task("level", every=3, within_cycles=2), SystemClock(segment), until
+    )
 
 
-def test_extra_computing_takes_the_time_that_its_step_asks_for(make_bus: MakeBus) -> None:  # noqa: F811
+def test_extra_computing_takes_the_time_that_its_step_asks_for(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     ends: list[int] = []
 
     def step(of: ExtraComputing, tick: int, now: int) -> int:
@@ -57,7 +66,9 @@ def test_extra_computing_takes_the_time_that_its_step_asks_for(make_bus: MakeBus
     assert (extra.entry[Entry.COUNT], extra.entry[Entry.STRUCK_TICK]) == (1, 20)
 
 
-def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus: MakeBus) -> None:  # noqa: F811
+def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = period = 2_500_000
     segment.words[System.EPOCH_NS] = epoch = 1_000_000_000

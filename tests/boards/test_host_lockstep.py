@@ -1,4 +1,5 @@
-"""Programs of host boards in lockstep: the rack waits until they wait, so that runs repeat, and never for ever."""
+"""Programs of host boards in lockstep: the rack waits until they wait, so that runs repeat, and
+never for ever."""
 
 from __future__ import annotations
 
@@ -33,12 +34,22 @@ sum = { from = "adder.status", every = 2 }
 )
 """The program reads through a second bridge, too."""
 SLOW = "host.program.program=host_programs:Slow"
-STRUCK = (*(f"{{ kind='kill', board='{board}', at={at} }}" for at, board in ((0.15, "program"), (0.35, "bridge"))),)
+STRUCK = (
+    *(
+        f"{{ kind='kill', board='{board}', at={at} }}"
+        for at, board in ((0.15, "program"), (0.35, "bridge"))
+    ),
+)
 
 
 def slow(config: MakeConfig, lag: float, *settings: str) -> str:
     """Return the digest of a run with a program that takes up to `lag` seconds for each number."""
-    lines = (SLOW, f"host.program.params.lag={lag}", "supervision.lockstep_restart_s=0.1", *settings)
+    lines = (
+        SLOW,
+        f"host.program.params.lag={lag}",
+        "supervision.lockstep_restart_s=0.1",
+        *settings,
+    )
     with Rack(config(*lines, text=SECOND)) as rack:
         outcome = rack.run()
         assert (outcome.cause, outcome.faults) == ("task done", ())
@@ -56,13 +67,20 @@ def slow(config: MakeConfig, lag: float, *settings: str) -> str:
     ],
     ids=["alone", "computing", "killed", "stopped"],
 )
-def test_a_run_repeats_however_long_its_program_takes(config: MakeConfig, settings: tuple[str, ...]) -> None:
+def test_a_run_repeats_however_long_its_program_takes(
+    config: MakeConfig, settings: tuple[str, ...]
+) -> None:
     assert slow(config, 0.0, *settings) == slow(config, 0.03, *settings)
 
 
 @pytest.mark.parametrize("kind", ["kill", "hang"])
-def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(config: MakeConfig, kind: str) -> None:
-    settings = ("host.program.program=host_programs:Lingering", f"fault=[{{ kind='{kind}', board='program', at=0.2 }}]")
+def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
+    config: MakeConfig, kind: str
+) -> None:
+    settings = (
+        "host.program.program=host_programs:Lingering",
+        f"fault=[{{ kind='{kind}', board='program', at=0.2 }}]",
+    )
     with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
         assert rack.run(0.5).cause == "time over"
         assert [strike.tick for strike in strikes(rack.segment, (), ())] == [-1]
@@ -79,13 +97,17 @@ def test_what_a_program_sends_is_taken_once_its_computing_is_over(
 
 
 def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: MakeConfig) -> None:
-    settings = ("host.program.program=host_programs:Deaf", "board.bridge.executor=host_programs:HastyAdapter")
+    settings = (
+        "host.program.program=host_programs:Deaf",
+        "board.bridge.executor=host_programs:HastyAdapter",
+    )
     with Rack(config(*settings, text=HOSTED)) as rack:
         outcome = rack.run()
     assert (outcome.cause, outcome.worked) == ("board lost", False)
     (fault,) = outcome.faults
     assert fault.startswith(
-        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time: lockstep cannot go on"
+        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time:"
+        " lockstep cannot go on"
     )
 
 
@@ -113,7 +135,11 @@ def test_a_program_that_dies_while_the_rack_waits_for_it_does_not_hold_the_rack(
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
         os.kill(block[Block.PID], number)
         watch(rack, lambda: "rejoined" in codes(rack, "program"))
-    assert [code for code in codes(rack, "program") if code in ENDS] == ["died", "restart", "rejoined"]
+    assert [code for code in codes(rack, "program") if code in ENDS] == [
+        "died",
+        "restart",
+        "rejoined",
+    ]
 
 
 def test_a_program_that_is_given_up_ends_the_run_at_the_same_tick(config: MakeConfig) -> None:

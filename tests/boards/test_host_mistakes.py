@@ -12,9 +12,18 @@ from tests.boards.test_host_side import HOSTED
 
 IDLE = "rack.levels.host_program:HostProgram"
 MISTAKES = {
-    "a rate": (["host.program.rate_hz=10"], "host.program.rate_hz = 10: unknown key; known: program, external, below"),
-    "a priority": (["host.program.priority=3"], "host.program.priority = 3: unknown key; known: program"),
-    "no program": (["host.program.program=host_programs:Adder"], "has no HostProgram named 'Adder'; it has: Console, "),
+    "a rate": (
+        ["host.program.rate_hz=10"],
+        "host.program.rate_hz = 10: unknown key; known: program, external, below",
+    ),
+    "a priority": (
+        ["host.program.priority=3"],
+        "host.program.priority = 3: unknown key; known: program",
+    ),
+    "no program": (
+        ["host.program.program=host_programs:Adder"],
+        "has no HostProgram named 'Adder'; it has: Console, ",
+    ),
     "the name of a board": (
         [f"host.adder={{ program = '{IDLE}' }}"],
         "host.adder: board.adder has this name",
@@ -25,22 +34,42 @@ MISTAKES = {
     ),
     "where determinism is demanded": (
         ["protocol.strict=true"],
-        "host.program: a board without real time makes a run depend on timing, refused by protocol.strict = true",
+        (
+            "host.program: a board without real time makes a run depend on timing, refused by"
+            " protocol.strict = true"
+        ),
     ),
-    "below": (["host.program.below=brigde"], 'host.program.below = "brigde": no board has this name; boards: bridge'),
-    "no bridge below": (["host.program.below=[]"], "host.program.below: missing; port 'sum' of the host needs it"),
+    "below": (
+        ["host.program.below=brigde"],
+        'host.program.below = "brigde": no board has this name; boards: bridge',
+    ),
+    "no bridge below": (
+        ["host.program.below=[]"],
+        "host.program.below: missing; port 'sum' of the host needs it",
+    ),
     "real time reads the host side": (
         ["board.adder.reads.number=program.numbers"],
-        'board.adder.reads.number = "program.numbers": it is on the host side; pass it through a bus adapter',
+        (
+            'board.adder.reads.number = "program.numbers": it is on the host side; pass it through'
+            " a bus adapter"
+        ),
     ),
     "the host side reads real time": (
         ["host.program.reads.sum=adder.status"],
-        'host.program.reads.sum = "adder.status": it is on the real-time side; pass it through a bus adapter',
+        (
+            'host.program.reads.sum = "adder.status": it is on the real-time side; pass it through'
+            " a bus adapter"
+        ),
     ),
     "a bridge on the real-time side": (
-        ["board.second={ slot = 9, every = 1, executor = 'host_programs:Repeater', below = 'bridge' }"],
-        'board.second.reads.sum = "bridge.sum": a bus adapter joins the two sides; '
-        "'adder' and 'second' are both on the real-time side",
+        [
+            "board.second={ slot = 9, every = 1, executor = 'host_programs:Repeater', below ="
+            " 'bridge' }"
+        ],
+        (
+            'board.second.reads.sum = "bridge.sum": a bus adapter joins the two sides; '
+            "'adder' and 'second' are both on the real-time side"
+        ),
     ),
     "a bridge on the host side": (
         ["host.second={ program = 'host_programs:Listener', below = 'bridge' }"],
@@ -48,7 +77,10 @@ MISTAKES = {
     ),
     "a second bridge": (
         [
-            "board.second={ slot = 9, every = 1, executor = 'rack.boards.host.bus_adapter:BusAdapter' }",
+            (
+                "board.second={ slot = 9, every = 1, executor ="
+                " 'rack.boards.host.bus_adapter:BusAdapter' }"
+            ),
             "board.second.params.pass.sum={ from = 'bridge.sum' }",
         ],
         'board.second.params.pass.sum = "bridge.sum": it is on the host side already',
@@ -59,7 +91,10 @@ MISTAKES = {
     ),
     "both modes": (
         ["board.bridge.params.pass.numbers.every=2"],
-        "board.bridge.params.pass.numbers: every = 2: the entry is asynchronous; permitted: one of the two",
+        (
+            "board.bridge.params.pass.numbers: every = 2: the entry is asynchronous; permitted: one"
+            " of the two"
+        ),
     ),
     "a phase": (
         ["board.bridge.params.pass.sum={ every = 2, phase = 2 }"],

@@ -1,4 +1,5 @@
-"""Boards of the host side as real processes: whatever they do, the real-time side goes on as without them."""
+"""Boards of the host side as real processes: whatever they do, the real-time side goes on as
+without them."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def others(**programs: str) -> str:
     """Return the tables of more host boards, and of an entry for each that no level reads."""
     entries = [f'{name} = {{ from = "{name}.numbers" }}\n' for name in programs]
     tables = [
-        f'[host.{name}]\nprogram = "host_programs:{program}"\nbelow = "bridge"\n' for name, program in programs.items()
+        f'[host.{name}]\nprogram = "host_programs:{program}"\nbelow = "bridge"\n'
+        for name, program in programs.items()
     ]
     return HOSTED.replace("sum = {", "".join(entries) + "sum = {") + "".join(tables)
 
@@ -84,7 +86,11 @@ def codes(rack: Rack, board: str) -> list[str]:
 
 @pytest.mark.slow
 def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: MakeConfig) -> None:
-    with Rack(config("host.program.params.count=50", "protocol.depth={ 'program.numbers' = 8 }", text=HOSTED)) as rack:
+    with Rack(
+        config(
+            "host.program.params.count=50", "protocol.depth={ 'program.numbers' = 8 }", text=HOSTED
+        )
+    ) as rack:
         outcome = rack.run()
         assert (outcome.cause, status(rack.segment, "adder").sum) == ("task done", 50 * 51 / 2)
         entry = status(rack.segment).numbers
@@ -108,7 +114,10 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
         ends = {"killed": "rejoined", "failed": "given_up", "finished": "done"}
         watch(rack, lambda: all(code in codes(rack, board) for board, code in ends.items()))
         assert rack.segment.words[System.EMERGENCY_STOP] == 0
-        assert sum(rack.segment.block(task.name)[Block.MISSED] for task in rack.segment.layout.tasks) == 0
+        assert (
+            sum(rack.segment.block(task.name)[Block.MISSED] for task in rack.segment.layout.tasks)
+            == 0
+        )
         assert rack.outcome is not None
         ticks = rack.outcome.ticks
         found = chains(rack.segment, ticks)["adder.status"]
@@ -118,8 +127,13 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
     assert failed == ["died", "restart", "died", "given_up"]
     line = inspect.getsourcelines(Failing.run)[1] + 2
     printed = [event.text for event in rack.events if event.kind == "printed"]
-    assert printed == [f"host board 'failed': ValueError: no numbers (host_programs.py, line {line})"] * 2
-    external = [f"host.{name}.external=true" for name in ("program", "hung", "failed", "finished", "killed")]
+    assert (
+        printed
+        == [f"host board 'failed': ValueError: no numbers (host_programs.py, line {line})"] * 2
+    )
+    external = [
+        f"host.{name}.external=true" for name in ("program", "hung", "failed", "finished", "killed")
+    ]
     with Rack(config(*settings, *external, text=text)) as alone:
         alone.run(ticks * 0.0025)
         assert chains(alone.segment, ticks)["adder.status"] == found
@@ -127,10 +141,19 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
 
 @pytest.mark.slow
 def test_a_flood_is_bounded_in_every_cycle_and_its_writer_is_refused(config: MakeConfig) -> None:
-    settings = ("host.program.program=host_programs:Flooding", "board.bridge.params.pass.numbers.most=3")
+    settings = (
+        "host.program.program=host_programs:Flooding",
+        "board.bridge.params.pass.numbers.most=3",
+    )
     with Rack(config(*settings, text=HOSTED)) as rack:
         rack.start()
-        watch(rack, lambda: status(rack.segment).numbers["full"] > 100 and status(rack.segment).numbers["passed"] > 100)
+        watch(
+            rack,
+            lambda: (
+                status(rack.segment).numbers["full"] > 100
+                and status(rack.segment).numbers["passed"] > 100
+            ),
+        )
         entry, bridge = status(rack.segment).numbers, rack.segment.block("bridge")
         assert entry["passed"] <= 3 * bridge[Block.CYCLES]
         assert entry["waiting"] <= 32
@@ -139,19 +162,29 @@ def test_a_flood_is_bounded_in_every_cycle_and_its_writer_is_refused(config: Mak
 
 @pytest.mark.slow
 def test_what_is_improper_is_refused_at_the_bridge(config: MakeConfig) -> None:
-    settings = ("host.program.program=host_programs:Improper", "board.bridge.params.pass.sum={ every = 3, phase = 1 }")
+    settings = (
+        "host.program.program=host_programs:Improper",
+        "board.bridge.params.pass.sum={ every = 3, phase = 1 }",
+    )
     with Rack(config(*settings, text=HOSTED)) as rack:
         assert rack.run().cause == "task done"
         entry = status(rack.segment).numbers
         assert (entry["passed"], entry["refused"], status(rack.segment, "adder").sum) == (1, 2, 7.0)
         # The other entry is exchanged in the second of every three cycles.
-        assert status(rack.segment).sum["passed"] == (rack.segment.block("bridge")[Block.CYCLES] + 1) // 3
+        assert (
+            status(rack.segment).sum["passed"]
+            == (rack.segment.block("bridge")[Block.CYCLES] + 1) // 3
+        )
 
 
 @pytest.mark.slow
-def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(config: MakeConfig) -> None:
+def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(
+    config: MakeConfig,
+) -> None:
     # The fixture checks that no process is left.
-    with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=HOSTED)) as rack:
+    with Rack(
+        config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=HOSTED)
+    ) as rack:
         rack.start()
         watch(rack, lambda: status(rack.segment, "adder").sum > 0)
 
@@ -162,8 +195,12 @@ def daemons(rack: Rack) -> list[int]:
 
 
 @pytest.mark.parametrize("ends_first", [False, True])
-def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(config: MakeConfig, ends_first: bool) -> None:
-    with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Escaping", text=HOSTED)) as rack:
+def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(
+    config: MakeConfig, ends_first: bool
+) -> None:
+    with Rack(
+        config("clock.mode=realtime", "host.program.program=host_programs:Escaping", text=HOSTED)
+    ) as rack:
         rack.start()
         wait_until(lambda: rack.watch(0.01) and bool(daemons(rack)))
         (daemon,) = daemons(rack)
@@ -177,20 +214,32 @@ def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(config: MakeC
 
 def test_output_without_end_is_cut_and_counted_and_hides_no_other_board(config: MakeConfig) -> None:
     text = others(loud="Printing", long="Printing", failed="Failing")
-    settings = ["clock.mode=realtime", "board.bridge.ends_run=false", "host.program.program=host_programs:Console"]
+    settings = [
+        "clock.mode=realtime",
+        "board.bridge.ends_run=false",
+        "host.program.program=host_programs:Console",
+    ]
     settings += ["host.loud.params.length=10", "host.long.params={ length = 3000000, once = true }"]
 
     def printed(word: str) -> list[str]:
-        return [event.text for event in rack.events if event.kind == "printed" and word in event.text]
+        return [
+            event.text for event in rack.events if event.kind == "printed" and word in event.text
+        ]
 
     with Rack(config(*settings, text=text)) as rack:
         rack.start()
         watch(
             rack,
-            lambda: len(printed("dropped")) > 3 and printed("'failed': ValueError") and len(printed("xx" * 99)) > 2999,
+            lambda: (
+                len(printed("dropped")) > 3
+                and printed("'failed': ValueError")
+                and len(printed("xx" * 99)) > 2999
+            ),
         )
         memory = os.fstat(rack._line._printed).st_size
-    assert printed("host board 'loud': ")[0].endswith(" lines dropped so far; a run keeps the first 10000")
+    assert printed("host board 'loud': ")[0].endswith(
+        " lines dropped so far; a run keeps the first 10000"
+    )
     assert len([line for line in printed("x") if line == "x" * 10]) == 10_000
     assert {len(line) for line in printed("xx" * 99)} == {1000}
     assert memory < 5_000_000
@@ -198,20 +247,37 @@ def test_output_without_end_is_cut_and_counted_and_hides_no_other_board(config: 
 
 @pytest.mark.slow
 def test_a_stopped_program_is_found_killed_and_started_again(config: MakeConfig) -> None:
-    text = HOSTED + '\n[[fault]]\nkind = "hang"\nboard = "program"\nwhen = "adder.status.last == 1"\n'
-    with Rack(config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=text)) as rack:
+    text = (
+        HOSTED + '\n[[fault]]\nkind = "hang"\nboard = "program"\nwhen = "adder.status.last == 1"\n'
+    )
+    with Rack(
+        config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=text)
+    ) as rack:
         rack.start()
         watch(rack, lambda: "rejoined" in codes(rack, "program"))
-    assert [code for code in codes(rack, "program") if code in ENDS] == ["died", "restart", "rejoined"]
-    assert "'program' is not responding: stopped by a signal" in [event.text for event in rack.events]
+    assert [code for code in codes(rack, "program") if code in ENDS] == [
+        "died",
+        "restart",
+        "rejoined",
+    ]
+    assert "'program' is not responding: stopped by a signal" in [
+        event.text for event in rack.events
+    ]
 
 
 @pytest.mark.slow
 def test_a_killed_bridge_goes_on_where_it_was(config: MakeConfig) -> None:
-    text = HOSTED + '\n[[fault]]\nkind = "kill"\nboard = "bridge"\nwhen = "adder.status.last == 20"\n'
-    with Rack(config("host.program.params.count=60", "supervision.lockstep_restart_s=0.1", text=text)) as rack:
+    text = (
+        HOSTED + '\n[[fault]]\nkind = "kill"\nboard = "bridge"\nwhen = "adder.status.last == 20"\n'
+    )
+    with Rack(
+        config("host.program.params.count=60", "supervision.lockstep_restart_s=0.1", text=text)
+    ) as rack:
         assert rack.run().cause == "task done"
-        assert (status(rack.segment).numbers["passed"], status(rack.segment, "adder").sum) == (60, 60 * 61 / 2)
+        assert (status(rack.segment).numbers["passed"], status(rack.segment, "adder").sum) == (
+            60,
+            60 * 61 / 2,
+        )
 
 
 def check_memory(bus: HostBus, segment: Segment) -> None:
@@ -222,7 +288,9 @@ def check_memory(bus: HostBus, segment: Segment) -> None:
     assert bus.words(8 * System.TICK)[0] <= segment.words[System.TICK]
     (newest,) = bus.words(bus.address("adder.status"))
     assert newest > 0
-    with pytest.raises(LookupError, match="nothing on the bus is called 'added'; known: bridge, adder, "):
+    with pytest.raises(
+        LookupError, match="nothing on the bus is called 'added'; known: bridge, adder, "
+    ):
         bus.address("added")
     for address in (12, -8, segment.map.size):
         with pytest.raises(ValueError, match="words of 8 bytes at 0x"):
@@ -231,12 +299,16 @@ def check_memory(bus: HostBus, segment: Segment) -> None:
 
 @pytest.mark.slow
 def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConfig) -> None:
-    found = config("host.program.program=host_programs:Console", "host.program.external=true", text=HOSTED)
+    found = config(
+        "host.program.program=host_programs:Console", "host.program.external=true", text=HOSTED
+    )
     with Rack(found) as rack:
         rack.start()
         (wiring,) = resolve(found).hosts
         first = HostBus(rack.segment, wiring)
-        with pytest.raises(MailboxError, match=f"'program' is run by process {os.getpid()} already; permitted: one"):
+        with pytest.raises(
+            MailboxError, match=f"'program' is run by process {os.getpid()} already; permitted: one"
+        ):
             HostBus(rack.segment, wiring)
         assert first.send("numbers", value=2.0)
         first.close()

@@ -1,4 +1,5 @@
-"""`clock.idle_cores`: a rack leaves idle cores alone unless it is asked to hold them awake, and says so at launch."""
+"""`clock.idle_cores`: a rack leaves idle cores alone unless it is asked to hold them awake, and
+says so at launch."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ from tests.processes import named, wait_until
 
 pytestmark = pytest.mark.slow
 
-needs_request = pytest.mark.skipif(not os.access(LATENCY_REQUEST, os.W_OK), reason="needs root, for the request")
+needs_request = pytest.mark.skipif(
+    not os.access(LATENCY_REQUEST, os.W_OK), reason="needs root, for the request"
+)
 AWAKE = "clock.idle_cores=awake"
 
 
@@ -42,7 +45,9 @@ def held_in(rack: Rack) -> tuple[list[str], list[str]]:
 
 
 @pytest.mark.parametrize(
-    "settings", [("clock.mode=realtime", "clock.priority=90"), (AWAKE,)], ids=["default", "lockstep"]
+    "settings",
+    [("clock.mode=realtime", "clock.priority=90"), (AWAKE,)],
+    ids=["default", "lockstep"],
 )
 def test_a_rack_leaves_idle_cores_alone_by_default_and_in_lockstep(
     config: MakeConfig, settings: tuple[str, ...]
@@ -64,5 +69,8 @@ def test_a_launch_says_why_idle_cores_cannot_be_held_awake(
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
     with Rack(config("clock.mode=realtime", AWAKE), share=True) as rack:
         (note,) = [event.text for event in rack.events if "idle" in event.text]
-    reason = f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or directory"
+    reason = (
+        f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or"
+        " directory"
+    )
     assert note == f'clock.idle_cores = "awake": {reason}'

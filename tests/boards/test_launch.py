@@ -52,11 +52,16 @@ def test_a_level_that_cannot_be_made_is_reported_with_its_error(config: MakeConf
 
 @pytest.mark.slow
 def test_a_board_that_exits_silently_fails_the_launch(config: MakeConfig) -> None:
-    assert refusal(Rack(config("board.wave.params.trouble='leave early'"))) == "board 'wave' ended: exit status 0"
+    assert (
+        refusal(Rack(config("board.wave.params.trouble='leave early'")))
+        == "board 'wave' ended: exit status 0"
+    )
 
 
 @pytest.mark.slow
-def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_board_that_is_never_ready_is_named(
+    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
     settings = ("board.watch.executor=wave_levels:Endless",)
     assert refusal(Rack(config(*settings))) == "boards watch: not ready within 2 s"
@@ -65,7 +70,9 @@ def test_a_board_that_is_never_ready_is_named(config: MakeConfig, monkeypatch: p
 def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> None:
     def kill_crate(event: Event) -> None:
         if event.kind == "launch":
-            crates = [pid for pid in children_of(os.getpid()) if b"rack.boards.crate" in command_of(pid)]
+            crates = [
+                pid for pid in children_of(os.getpid()) if b"rack.boards.crate" in command_of(pid)
+            ]
             for pid in crates:
                 os.kill(pid, signal.SIGKILL)
 
@@ -85,7 +92,10 @@ def test_a_level_is_preloaded_once_in_the_process_that_forks_its_boards(config: 
 @pytest.mark.slow
 def test_a_level_that_cannot_be_preloaded_fails_the_launch_in_one_line(config: MakeConfig) -> None:
     reason = refusal(Rack(config("board.watch.executor=wave_levels:Unpreloadable", text=PLAIN)))
-    assert reason == "'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code"
+    assert (
+        reason
+        == "'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code"
+    )
 
 
 def fifo(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -126,10 +136,14 @@ def test_a_preload_that_does_not_end_is_named(
 
 
 @pytest.mark.slow
-def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(config: MakeConfig) -> None:
+def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(
+    config: MakeConfig,
+) -> None:
     with CrateLine() as crate:
         with Rack(config(text=PLAIN), crate=crate) as rack:
-            boards = [rack.segment.block(task.name)[Block.PID] for task in rack.segment.layout.tasks]
+            boards = [
+                rack.segment.block(task.name)[Block.PID] for task in rack.segment.layout.tasks
+            ]
             assert set(boards) <= set(children_of(crate.pid))
         assert not runs(crate.pid)
 
@@ -140,7 +154,9 @@ def command_of(pid: int) -> bytes:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["refuse", "leave early"])
-def test_failed_launches_leave_no_file_open_and_no_process_running(config: MakeConfig, trouble: str) -> None:
+def test_failed_launches_leave_no_file_open_and_no_process_running(
+    config: MakeConfig, trouble: str
+) -> None:
     children, before = children_of(os.getpid()), descriptors()
     for _ in range(2):
         refusal(Rack(config(f"board.wave.params.trouble='{trouble}'")))
@@ -148,7 +164,9 @@ def test_failed_launches_leave_no_file_open_and_no_process_running(config: MakeC
     assert descriptors() == before
 
 
-def test_a_config_that_cannot_be_wired_starts_no_process(config: MakeConfig, rack_name: str) -> None:
+def test_a_config_that_cannot_be_wired_starts_no_process(
+    config: MakeConfig, rack_name: str
+) -> None:
     good = config()
     board = good.board["watch"].model_copy(update={"executor": "wave_levels:Nobody"})
     bad = good.model_copy(update={"board": {**good.board, "watch": board}})

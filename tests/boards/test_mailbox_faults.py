@@ -1,4 +1,5 @@
-"""Mailbox faults in a whole rack: each is found by its reader, none where none is, and the run repeats with them."""
+"""Mailbox faults in a whole rack: each is found by its reader, none where none is, and the run
+repeats with them."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ pytestmark = pytest.mark.slow
 KINDS_OF_WRITERS = ("mute", "drop", "delay", "reorder", "corrupt", "babble", "masquerade")
 
 
-def run(config: RackConfig, *faults: dict[str, Any], seconds: float = 1.0) -> tuple[Outcome, list[Event]]:
+def run(
+    config: RackConfig, *faults: dict[str, Any], seconds: float = 1.0
+) -> tuple[Outcome, list[Event]]:
     """Run a rack with faults; return how it ended and what was detected."""
     given = config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
     with Rack(given) as rack:
@@ -36,7 +39,9 @@ def fault(kind: str, board: str, tick: int, ticks: int = 80) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", KINDS_OF_WRITERS)
-def test_a_fault_of_an_executor_is_detected_and_the_run_repeats(config: MakeConfig, kind: str) -> None:
+def test_a_fault_of_an_executor_is_detected_and_the_run_repeats(
+    config: MakeConfig, kind: str
+) -> None:
     runs = [run(config(), fault(kind, "wave", 101)) for _ in range(2)]
     outcomes, found = zip(*runs, strict=True)
     assert outcomes[0].digest == outcomes[1].digest
@@ -51,7 +56,9 @@ def test_a_fault_of_an_executor_is_detected_and_the_run_repeats(config: MakeConf
     ("kind", "coupling"),
     [*((kind, ()) for kind in KINDS_OF_WRITERS), ("delay", LOOSE), ("masquerade", LOOSE)],
 )
-def test_a_run_with_a_fault_of_a_planner_repeats(config: MakeConfig, kind: str, coupling: tuple[str, ...]) -> None:
+def test_a_run_with_a_fault_of_a_planner_repeats(
+    config: MakeConfig, kind: str, coupling: tuple[str, ...]
+) -> None:
     runs = [run(config(*coupling), fault(kind, "wave.planner", 101)) for _ in range(2)]
     outcomes, _ = zip(*runs, strict=True)
     assert outcomes[0].digest == outcomes[1].digest
@@ -59,7 +66,9 @@ def test_a_run_with_a_fault_of_a_planner_repeats(config: MakeConfig, kind: str, 
 
 
 @pytest.mark.parametrize("victim", ["wave", "wave.planner", "watch"])
-def test_a_lost_board_raises_alarms_for_its_own_silence_alone(config: MakeConfig, victim: str) -> None:
+def test_a_lost_board_raises_alarms_for_its_own_silence_alone(
+    config: MakeConfig, victim: str
+) -> None:
     _, found = run(config(), {"kind": "kill", "board": victim, "tick": 100})
     # Nobody reads the watch, and plans have no period.
     assert {(event.code, event.subject) for event in found} == (
@@ -74,7 +83,9 @@ def test_without_a_fault_nothing_is_detected(config: MakeConfig, protocol: str) 
 
 
 def test_the_bus_counters_continue_after_a_restart(config: MakeConfig) -> None:
-    given = config().model_copy(update={"fault": (FaultConfig(kind="kill", board="watch", tick=804),)})
+    given = config().model_copy(
+        update={"fault": (FaultConfig(kind="kill", board="watch", tick=804),)}
+    )
     with Rack(given) as rack:
         rack.run(3.0)
         block = rack.segment.block("watch")
@@ -85,11 +96,16 @@ def test_the_bus_counters_continue_after_a_restart(config: MakeConfig) -> None:
 
 
 def flows(config: RackConfig, *faults: dict[str, Any]) -> list[tuple[int, str, float]]:
-    """Run a rack with faults; return when messages were seen to flow again, of which mailbox, and after how long."""
+    """Run a rack with faults; return when messages were seen to flow again, of which mailbox, and
+    after how long."""
     given = config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
     with Rack(given) as rack:
         rack.run(1.0)
-        return [(event.tick, event.subject, event.value) for event in rack.events if event.code == "flows"]
+        return [
+            (event.tick, event.subject, event.value)
+            for event in rack.events
+            if event.code == "flows"
+        ]
 
 
 @pytest.mark.parametrize("kind", KINDS_OF_WRITERS)

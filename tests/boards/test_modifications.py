@@ -1,4 +1,5 @@
-"""Control modifications on real boards: switched at their ticks, without a step, and repeated bit for bit."""
+"""Control modifications on real boards: switched at their ticks, without a step, and repeated bit
+for bit."""
 
 from __future__ import annotations
 
@@ -69,7 +70,10 @@ def switch(name: str, is_on: bool, tick: int) -> str:
 
 
 SWITCHED = commands(
-    switch("lean", True, 300), switch("lean", False, 400), switch("pd", True, 450), switch("breaks", True, 550)
+    switch("lean", True, 300),
+    switch("lean", False, 400),
+    switch("pd", True, 450),
+    switch("breaks", True, 550),
 )
 
 
@@ -101,7 +105,11 @@ def run(rack_of: Callable[..., RackConfig]) -> Callable[..., Ran]:
     def run(*settings: str) -> Ran:
         with Rack(rack_of(*settings)) as rack:
             outcome = rack.run(SECONDS)
-            return Ran(outcome.digest, rack.events, MailboxRing(rack.segment, "shoulder.status").drain().rows)
+            return Ran(
+                outcome.digest,
+                rack.events,
+                MailboxRing(rack.segment, "shoulder.status").drain().rows,
+            )
 
     return run
 
@@ -117,31 +125,50 @@ def without(run: Callable[..., Ran]) -> Ran:
 
 
 @pytest.mark.slow
-def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(switched: Ran, without: Ran) -> None:
-    for tick, reason in ((300, ""), (301, "modified by lean"), (400, "modified by lean"), (401, "")):
+def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(
+    switched: Ran, without: Ran
+) -> None:
+    for tick, reason in (
+        (300, ""),
+        (301, "modified by lean"),
+        (400, "modified by lean"),
+        (401, ""),
+    ):
         assert switched.reason(tick) == reason
     for tick in (301, 401, 451):
         assert switched.torque(tick) == pytest.approx(switched.torque(tick - 1), abs=1e-12)
-    steps, in_motion = (np.diff([ran.torque(tick) for tick in range(290, 450)], axis=0) for ran in (switched, without))
+    steps, in_motion = (
+        np.diff([ran.torque(tick) for tick in range(290, 450)], axis=0)
+        for ran in (switched, without)
+    )
     assert np.abs(steps).max() < np.abs(in_motion).max() + LARGEST_STEP
 
 
 @pytest.mark.slow
-def test_a_run_with_its_switches_repeats_and_is_that_of_a_board_without_modifications_up_to_the_first(
+def test_a_run_with_switches_repeats_and_equals_that_without_modifications_up_to_the_first(
     switched: Ran, without: Ran, run: Callable[..., Ran]
 ) -> None:
     again = run(SWITCHED)
     assert again.digest == switched.digest != without.digest
     assert (again.rows["message"] == switched.rows["message"]).all()
-    differs = [tick for tick in range(100, 400) if (without.torque(tick) != switched.torque(tick)).any()]
+    differs = [
+        tick for tick in range(100, 400) if (without.torque(tick) != switched.torque(tick)).any()
+    ]
     assert differs[0] == 301
 
 
-def test_one_that_fails_is_taken_out_with_its_reason_in_status_and_events_and_the_arm_goes_on(switched: Ran) -> None:
+def test_one_that_fails_is_taken_out_with_its_reason_in_status_and_events_and_the_arm_goes_on(
+    switched: Ran,
+) -> None:
     assert switched.reason(649) == "modified by pd, breaks"
-    assert switched.reason(650) == "modification 'breaks' taken out: KeyError: 'nothing left'; modified by pd"
+    assert (
+        switched.reason(650)
+        == "modification 'breaks' taken out: KeyError: 'nothing left'; modified by pd"
+    )
     found = [event for event in switched.events if event.kind == "detection"]
-    assert [(e.tick, e.board, e.subject, e.code) for e in found] == [(650, "shoulder", "breaks", "modification")]
+    assert [(e.tick, e.board, e.subject, e.code) for e in found] == [
+        (650, "shoulder", "breaks", "modification")
+    ]
     assert found[0].text == "control modification 'breaks' failed and was taken out"
     assert not (switched.rows["message"]["stopped"][-50:]).any()
 
@@ -153,11 +180,18 @@ MISTAKES = {
         "has no class 'Pd'",
     ),
     "no suitable parameter": (
-        "modifications.notch={class='rack.levels.servo.common_modifications:Notch', params={frequency=600.0}}",
+        (
+            "modifications.notch={class='rack.levels.servo.common_modifications:Notch',"
+            " params={frequency=600.0}}"
+        ),
         "board.shoulder.params.modifications.notch",
         "params.frequency = 600 Hz: permitted: below half the law's rate, 500 Hz",
     ),
-    "no class given": ("modifications.notch={on=true}", "board.shoulder.params.modifications.notch.class", "missing"),
+    "no class given": (
+        "modifications.notch={on=true}",
+        "board.shoulder.params.modifications.notch.class",
+        "missing",
+    ),
     "no name": (
         "modifications.No={class='law_modifications:Lean'}",
         "board.shoulder.params.modifications",

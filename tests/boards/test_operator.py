@@ -1,4 +1,5 @@
-"""Commands of an operator on real boards: given at their ticks by the clock, answered, logged, repeated bit for bit."""
+"""Commands of an operator on real boards: given at their ticks by the clock, answered, logged,
+repeated bit for bit."""
 
 from __future__ import annotations
 
@@ -11,7 +12,13 @@ import pytest
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.operator_table import OperatorTable, Request, RequestEntry, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    OperatorTable,
+    Request,
+    RequestEntry,
+    RequestStage,
+    RequestWord,
+)
 from rack.backplane.words import Run, System
 from rack.boards import Rack
 from rack.boards.config import load, wire
@@ -35,12 +42,18 @@ def commanded(config: MakeConfig) -> Callable[..., RackConfig]:
     return lambda *settings: config(*settings, text=COMMANDED)
 
 
-def run(config: RackConfig, seconds: float = SECONDS) -> tuple[Outcome, list[Event], dict[str, np.ndarray]]:
+def run(
+    config: RackConfig, seconds: float = SECONDS
+) -> tuple[Outcome, list[Event], dict[str, np.ndarray]]:
     """Run a rack; return how it ended, what happened, and what the mailboxes hold, by name."""
     with Rack(config) as rack:
         boxes = [box.name for box in rack.segment.layout.mailboxes]
         outcome = rack.run(seconds)
-        return outcome, rack.events, {name: MailboxRing(rack.segment, name).drain().rows for name in boxes}
+        return (
+            outcome,
+            rack.events,
+            {name: MailboxRing(rack.segment, name).drain().rows for name in boxes},
+        )
 
 
 def first(rows: np.ndarray, serial: int) -> int:
@@ -49,16 +62,25 @@ def first(rows: np.ndarray, serial: int) -> int:
 
 
 @pytest.mark.slow
-def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(commanded: Callable[..., RackConfig]) -> None:
+def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(
+    commanded: Callable[..., RackConfig],
+) -> None:
     _, events, boxes = run(commanded(HELD))
     given = boxes["upper.operator"]
     assert given["tick"].tolist() == [101, 203]
     assert given["visible_at"].tolist() == [102, 204]
     assert given["message"]["id"].tolist() == [1, 2]
-    # Read at the next release of the upper level, 104 and 208, and visible below when that cycle is over.
+    # Read at the next release of the upper level, 104 and 208, and visible below when that cycle is
+    # over.
     assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
     assert [first(boxes["lower.status"], serial) for serial in (1, 2)] == [112, 216]
-    counts = dict(zip(boxes["lower.status"]["tick"].tolist(), boxes["lower.status"]["message"]["count"], strict=True))
+    counts = dict(
+        zip(
+            boxes["lower.status"]["tick"].tolist(),
+            boxes["lower.status"]["message"]["count"],
+            strict=True,
+        )
+    )
     assert counts[111] == counts[110] + 1
     assert counts[112] == counts[111] == counts[215]
     assert counts[216] == counts[215] + 1
@@ -77,7 +99,9 @@ def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., Ra
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
-def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., RackConfig], protocol: str) -> None:
+def test_commands_reach_their_level_under_any_protocol(
+    commanded: Callable[..., RackConfig], protocol: str
+) -> None:
     config = commanded(HELD, f"protocol.default={protocol}")
     # The clock must never wait.
     assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
@@ -86,7 +110,9 @@ def test_commands_reach_their_level_under_any_protocol(commanded: Callable[..., 
 
 
 @pytest.mark.slow
-def test_serials_rise_over_all_levels_in_order_of_issue(commanded: Callable[..., RackConfig]) -> None:
+def test_serials_rise_over_all_levels_in_order_of_issue(
+    commanded: Callable[..., RackConfig],
+) -> None:
     setting = commands(
         "level='lower', what='hold', at=0.5",
         "level='upper', what='hold', tick=50",
@@ -111,7 +137,9 @@ def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., Rack
 
 @pytest.mark.slow
 @pytest.mark.parametrize("board", ["upper", "lower"])
-def test_a_restarted_board_continues_with_its_last_command(commanded: Callable[..., RackConfig], board: str) -> None:
+def test_a_restarted_board_continues_with_its_last_command(
+    commanded: Callable[..., RackConfig], board: str
+) -> None:
     config = commanded(commands(f"level='{board}', what='hold', tick=50"))
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
     outcome, events, boxes = run(config, 2.0)
@@ -126,7 +154,8 @@ def test_a_restarted_board_continues_with_its_last_command(commanded: Callable[.
 def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     commanded: Callable[..., RackConfig], board: str
 ) -> None:
-    # The lower level never takes a goto: its config would refuse it, an intruder in the table may say it all the same.
+    # The lower level never takes a goto: its config would refuse it, an intruder in the table may
+    # say it all the same.
     config = commanded(commands(f"level='{board}', what='hold', tick=50"))
     config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
     with Rack(config) as rack:
@@ -137,13 +166,22 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
         assert rack.run(1.0).worked
         last = MailboxRing(rack.segment, f"{board}.status").drain().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
-    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (2, Answer.REFUSED, Operation.HOLD, 1)
+    assert (last["order"], last["answer"], last["standing"], last["operator"]) == (
+        2,
+        Answer.REFUSED,
+        Operation.HOLD,
+        1,
+    )
 
 
 @pytest.mark.slow
-def test_a_command_stays_in_force_when_the_next_one_is_refused(commanded: Callable[..., RackConfig]) -> None:
+def test_a_command_stays_in_force_when_the_next_one_is_refused(
+    commanded: Callable[..., RackConfig],
+) -> None:
     # Both come within one cycle of the level.
-    setting = commands("level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52")
+    setting = commands(
+        "level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52"
+    )
     _, _, boxes = run(commanded(setting))
     last = boxes["upper.status"]["message"][-1]
     assert (last["order"], last["answer"], last["standing"]) == (2, Answer.REFUSED, Operation.HOLD)
@@ -162,7 +200,14 @@ def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
     _, events, boxes = run(commanded(setting))
     rows = boxes["lower.status"]
     counts = np.diff(rows["message"]["count"])
-    assert [counts[rows["tick"][1:] == tick].item() for tick in (50, 51, 60, 61, 80, 81)] == [1, 2, 2, 0, 0, 1]
+    assert [counts[rows["tick"][1:] == tick].item() for tick in (50, 51, 60, 61, 80, 81)] == [
+        1,
+        2,
+        2,
+        0,
+        0,
+        1,
+    ]
     at = rows["message"][rows["tick"] == 71]
     assert (at["standing"], at["answer"], at["operator"]) == (Operation.HOLD, Answer.DONE, 3)
     texts = [event.text for event in events if event.kind == "command" and event.code == "modify"]
@@ -172,7 +217,9 @@ def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
 @pytest.mark.slow
 def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:
     config = commanded(HELD)
-    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)})
+    config = config.model_copy(
+        update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)}
+    )
     _, events, boxes = run(config)
     assert [event.board for event in events if event.code == "rejoined"] == ["clock"]
     assert boxes["upper.operator"]["message"]["id"].tolist() == [1, 2]
@@ -198,10 +245,14 @@ def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., Rac
 @pytest.mark.slow
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("is_killed", [False, True])
-def test_a_command_is_issued_only_while_its_client_lives(commanded: Callable[..., RackConfig], is_killed: bool) -> None:
+def test_a_command_is_issued_only_while_its_client_lives(
+    commanded: Callable[..., RackConfig], is_killed: bool
+) -> None:
     with Rack(commanded(commands("level='upper', what='hold', tick=50"))) as rack:
         table = OperatorTable(rack.segment)
-        wanted = Request(table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100)
+        wanted = Request(
+            table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100
+        )
 
         def wait() -> None:
             with OperatorTable(rack.segment).claim(wanted):
@@ -212,7 +263,10 @@ def test_a_command_is_issued_only_while_its_client_lives(commanded: Callable[...
             if is_killed:
                 kill(pid)
             assert rack.run(1.0).worked
-        assert MailboxRing(rack.segment, "upper.operator").drain().rows["tick"].tolist() == [50, 100][: 2 - is_killed]
+        assert (
+            MailboxRing(rack.segment, "upper.operator").drain().rows["tick"].tolist()
+            == [50, 100][: 2 - is_killed]
+        )
 
 
 @pytest.mark.slow
@@ -239,13 +293,22 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 MISTAKES = {
     "no such level": (
         "level='uper', what='hold'",
-        'command[0].level = "uper": no level of this name takes commands; levels that do: upper, lower',
+        (
+            'command[0].level = "uper": no level of this name takes commands; levels that do:'
+            " upper, lower"
+        ),
     ),
     "not for this level": (
         "level='lower', what='goto', home=true",
-        "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume, modify on|off",
+        (
+            "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume, modify"
+            " on|off"
+        ),
     ),
-    "no goal": ("level='upper', what='goto'", "command[0].goal: missing; goto of 'upper' takes one of: home"),
+    "no goal": (
+        "level='upper', what='goto'",
+        "command[0].goal: missing; goto of 'upper' takes one of: home",
+    ),
     "another goal": (
         "level='upper', what='goto', joints=[1.0]",
         "command[0].joints: not a goal for goto of 'upper'; permitted: home",
@@ -254,7 +317,10 @@ MISTAKES = {
         "level='upper', what='goto', joints=[1.0], home=true",
         "command[0].goal: several given: joints|home; goto of 'upper' takes one of: home",
     ),
-    "a goal too much": ("level='upper', what='hold', home=true", "command[0].home: hold takes no goal; remove it"),
+    "a goal too much": (
+        "level='upper', what='hold', home=true",
+        "command[0].home: hold takes no goal; remove it",
+    ),
     "a setting of nothing": (
         "level='lower', what='modify', on=true",
         "command[0].name: modify of 'lower' knows: twice",
@@ -271,8 +337,14 @@ MISTAKES = {
         "level='lower', what='hold', name='twice'",
         'command[0].name = "twice": hold takes no name; remove it',
     ),
-    "two times": ("level='upper', what='hold', tick=3, at=1", "command[0].at = 1.0: tick is also given"),
-    "unknown key": ("level='upper', what='hold', tik=3", "command[0].tik = 3: unknown key; did you mean 'tick'?"),
+    "two times": (
+        "level='upper', what='hold', tick=3, at=1",
+        "command[0].at = 1.0: tick is also given",
+    ),
+    "unknown key": (
+        "level='upper', what='hold', tik=3",
+        "command[0].tik = 3: unknown key; did you mean 'tick'?",
+    ),
 }
 
 
@@ -282,7 +354,9 @@ def test_mistakes_of_a_command_name_place_value_and_what_is_permitted(
 ) -> None:
     with pytest.raises(ConfigError) as caught:
         wire(config(commands(table), text=COMMANDED))
-    assert any(str(mistake).startswith(expected) for mistake in caught.value.mistakes), str(caught.value)
+    assert any(str(mistake).startswith(expected) for mistake in caught.value.mistakes), str(
+        caught.value
+    )
 
 
 def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
@@ -291,7 +365,9 @@ def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
     beyond = [*robot.home[:2], 9.0, *robot.home[3:]]
     with pytest.raises(ConfigError) as caught:
         wire(load("nasrem", [commands(f"level='servo', what='setpoint', joints={beyond}")]))
-    assert str(caught.value).startswith("command[0].joints = 9.0: out of range for joint 'j3'; permitted: ")
+    assert str(caught.value).startswith(
+        "command[0].joints = 9.0: out of range for joint 'j3'; permitted: "
+    )
     with pytest.raises(ConfigError, match="2 values; permitted: 6, one per joint: j1, j2, "):
         wire(load("nasrem", [commands("level='servo', what='setpoint', joints=[0.0, 0.0]")]))
 
@@ -299,5 +375,7 @@ def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
     with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
         wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))
-    with pytest.raises(ConfigError, match="the clock writes it, not a board; permitted: time-slice, double-buffer"):
+    with pytest.raises(
+        ConfigError, match="the clock writes it, not a board; permitted: time-slice, double-buffer"
+    ):
         wire(config("protocol.mailbox={'upper.operator' = 'interrupt'}", text=COMMANDED))

@@ -1,4 +1,5 @@
-"""A new kind of fault is one record: listed, checked, acted, detected, drawn and judged with no other change."""
+"""A new kind of fault is one record: listed, checked, acted, detected, drawn and judged with no
+other change."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from tests.processes import RACK
 
 BOUND_S = 60
 MODULE = "gauge_levels"
-GAUGED = PLAIN.replace("wave_levels:Wave", f"{MODULE}:Gauge").replace("wave_levels:Watch", f"{MODULE}:GaugeWatch")
+GAUGED = PLAIN.replace("wave_levels:Wave", f"{MODULE}:Gauge").replace(
+    "wave_levels:Watch", f"{MODULE}:GaugeWatch"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -56,21 +59,31 @@ def test_a_kind_of_a_users_own_is_checked_in_a_config(config: MakeConfig) -> Non
 
 
 @pytest.mark.parametrize("valve", ["open", "OPEN", "3"])
-def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(config: MakeConfig, valve: str) -> None:
+def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
+    config: MakeConfig, valve: str
+) -> None:
     found = config(fault(f'cycles = 80, when = "wave.status.valve == {valve}"'), text=GAUGED)
     layout = wire(found)
     (injection,) = injections(found, layout)
-    assert injection.when == (0, [field.name for field in layout.mailboxes[0].fields].index("valve"), 3)
+    assert injection.when == (
+        0,
+        [field.name for field in layout.mailboxes[0].fields].index("valve"),
+        3,
+    )
 
 
 def test_a_value_that_a_users_own_enum_lacks_lists_those_it_has(config: MakeConfig) -> None:
-    with pytest.raises(ConfigError, match="'ajar' is not a value of 'valve'; permitted: shut, open"):
+    with pytest.raises(
+        ConfigError, match="'ajar' is not a value of 'valve'; permitted: shut, open"
+    ):
         wire(config(fault('when = "wave.status.valve == ajar"'), text=GAUGED))
 
 
 @pytest.mark.slow
 def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
-    with Rack(config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)) as rack:
+    with Rack(
+        config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)
+    ) as rack:
         outcome = rack.run(1.0)
         events = rack.events
     assert outcome.worked
@@ -85,7 +98,16 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
 def test_a_campaign_draws_and_judges_a_kind_of_a_users_own(tmp_path: Path) -> None:
     path, out = tmp_path / "gauge.toml", tmp_path / "campaign"
     path.write_text(GAUGED)
-    command = [*RACK, "campaign", str(path), "--lockstep", "--injections", "2", "--kinds", "lose-every"]
+    command = [
+        *RACK,
+        "campaign",
+        str(path),
+        "--lockstep",
+        "--injections",
+        "2",
+        "--kinds",
+        "lose-every",
+    ]
     done = subprocess.run(
         [*command, "--seconds", "6", "--out", str(out), "--json"],
         capture_output=True,

@@ -1,4 +1,5 @@
-"""Racks with queues: nothing lost or repeated, killed boards, repeatable runs, and what `rack check` refuses."""
+"""Racks with queues: nothing lost or repeated, killed boards, repeatable runs, and what `rack
+check` refuses."""
 
 from __future__ import annotations
 
@@ -33,7 +34,11 @@ rate_hz = 4
 above = "upper"
 executor = "queue_levels:Answering"
 """
-FAST = ("board.upper.rate_hz=100", "board.lower.rate_hz=50", "protocol.depth={ 'upper.requests' = 512 }")
+FAST = (
+    "board.upper.rate_hz=100",
+    "board.lower.rate_hz=50",
+    "protocol.depth={ 'upper.requests' = 512 }",
+)
 PLANNING = f"""{CLOCK}
 [board.wave]
 slot = 2
@@ -50,7 +55,9 @@ def counts(rack: Rack, board: str) -> dict[str, int]:
     """Return the counts in the newest status of a board."""
     status = open_observer(rack.segment, f"{board}.status").peek().value
     names = status.record.dtype.names
-    return {name: int(status.record[name]) for name in names if status.record[name].dtype.kind != "S"}
+    return {
+        name: int(status.record[name]) for name in names if status.record[name].dtype.kind != "S"
+    }
 
 
 def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str]:
@@ -64,13 +71,23 @@ def test_a_slower_reader_gets_every_request_of_a_burst(config: MakeConfig) -> No
     with Rack(config("board.upper.params.until=360", text=QUEUES)) as rack:
         rack.run(2.0)
         assert counts(rack, "upper")["sent"] == 27
-        assert counts(rack, "lower") | {"taken": 27, "newest": 27, "repeated": 0, "missing": 0} == counts(rack, "lower")
+        assert counts(rack, "lower") | {
+            "taken": 27,
+            "newest": 27,
+            "repeated": 0,
+            "missing": 0,
+        } == counts(rack, "lower")
 
 
 @pytest.mark.slow
 def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> None:
-    faults = tuple(FaultConfig(kind="kill", board=board, tick=tick) for board, tick in (("upper", 97), ("lower", 501)))
-    found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(update={"fault": faults})
+    faults = tuple(
+        FaultConfig(kind="kill", board=board, tick=tick)
+        for board, tick in (("upper", 97), ("lower", 501))
+    )
+    found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(
+        update={"fault": faults}
+    )
     digests = set()
     for _ in range(2):
         with Rack(found) as rack:
@@ -86,7 +103,9 @@ def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
     depth = "protocol.depth={ 'upper.requests' = 7 }"
     runs = []
     for mode in ("lockstep", "realtime"):
-        with Rack(config(f"clock.mode={mode}", "board.lower.params.most=4", depth, text=QUEUES)) as rack:
+        with Rack(
+            config(f"clock.mode={mode}", "board.lower.params.most=4", depth, text=QUEUES)
+        ) as rack:
             rack.run(1.0)
             runs.append(Written.on(rack.segment))
     exact, real = runs
@@ -112,7 +131,9 @@ REALTIME = ("clock.mode=realtime", "supervision.restarts=100", *FAST)
 
 
 @pytest.mark.slow
-def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(config: MakeConfig) -> None:
+def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(
+    config: MakeConfig,
+) -> None:
     with Rack(config(*REALTIME, "board.lower.params.most=8", text=QUEUES)) as rack:
         rack.start(60.0)
         kill_often(rack, "lower", 2, random.Random(1))
@@ -135,7 +156,9 @@ def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfi
     assert not lost
     ids, ticks = rows["message"]["id"].tolist(), rows["tick"].tolist()
     assert ids == sorted(set(ids))
-    assert [ids[at : at + 3] for at in range(0, len(ids), 3)] == [[at, at + 1, at + 2] for at in ids[::3]]
+    assert [ids[at : at + 3] for at in range(0, len(ids), 3)] == [
+        [at, at + 1, at + 2] for at in ids[::3]
+    ]
     assert [ticks.count(tick) for tick in set(ticks)] == [3] * len(set(ticks))
     assert found["repeated"] == 0
     assert found["missing"] % 3 == 0
@@ -143,7 +166,8 @@ def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfi
 
 
 def settle(rack: Rack, board: str) -> dict[str, int]:
-    """Let a rack run on until the board has cycled again, then stop it; return the board's counts."""
+    """Let a rack run on until the board has cycled again, then stop it; return the board's
+    counts."""
     block = rack.segment.block(board)
     while block[Block.LOST]:
         assert rack.watch(0.01)
@@ -174,7 +198,12 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
         with Rack(config("board.upper.params.until=360", *planner, *slow, text=QUEUES)) as rack:
             digests.add(rack.run(3.0).digest)
             found = counts(rack, "lower")
-            assert (found["taken"], found["newest"], found["repeated"], found["missing"]) == (27, 27, 0, 0)
+            assert (found["taken"], found["newest"], found["repeated"], found["missing"]) == (
+                27,
+                27,
+                0,
+                0,
+            )
     assert len(digests) == 1
 
 
@@ -183,7 +212,9 @@ def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
     with Rack(config("protocol.mailbox={ 'wave.status' = 'queue' }", text=PLAIN)) as rack:
         rack.run(0.5)
         taken = open_observer(rack.segment, "wave.status_taken").peek().value
-        box, position = (rack.segment.layout.mailbox(name) for name in ("wave.status", "wave.status_taken"))
+        box, position = (
+            rack.segment.layout.mailbox(name) for name in ("wave.status", "wave.status_taken")
+        )
     assert (box.protocol, box.capacity) == ("queue", 32)
     assert (position.writer, position.readers, position.every) == ("watch", ("wave",), 8)
     # At tick 192 the messages of all earlier ticks were visible.
@@ -191,8 +222,11 @@ def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
 
 
 def test_a_queue_keeps_what_a_recorder_may_be_behind(config: MakeConfig) -> None:
-    box = wire(config("protocol.depth={ 'upper.requests' = 5 }", text=QUEUES)).mailbox("upper.requests")
-    # 40 ticks and 100 are the least time in which 5 messages can be sent and taken; 800 ticks are 2 s.
+    box = wire(config("protocol.depth={ 'upper.requests' = 5 }", text=QUEUES)).mailbox(
+        "upper.requests"
+    )
+    # 40 ticks and 100 are the least time in which 5 messages can be sent and taken; 800 ticks are 2
+    # s.
     assert box.depth >= 5 * (800 // 140 + 1)
     assert box.capacity == 5
 
@@ -201,13 +235,27 @@ def test_a_queue_keeps_what_a_recorder_may_be_behind(config: MakeConfig) -> None
     ("settings", "expected"),
     [
         (
-            ("board.third={ slot = 4, every = 1, above = 'upper', executor = 'queue_levels:Answering' }",),
-            "mailbox upper.requests: a queue gives each message once, so it has one reader, not 2: lower (requests)",
+            (
+                (
+                    "board.third={ slot = 4, every = 1, above = 'upper', executor ="
+                    " 'queue_levels:Answering' }"
+                ),
+            ),
+            (
+                "mailbox upper.requests: a queue gives each message once, so it has one reader, not"
+                " 2: lower (requests)"
+            ),
         ),
         (("board.lower.reads.requests=lower.requests",), "no task writes it"),
         (("protocol.default=queue",), 'protocol.default = "queue"'),
-        (("protocol.mailbox={ 'upper.requests' = 'time-slice' }",), "sends any number of messages in a cycle"),
-        (("protocol.depth={ 'upper.status' = 3 }",), "not a queue: it holds one message; queues: upper.requests"),
+        (
+            ("protocol.mailbox={ 'upper.requests' = 'time-slice' }",),
+            "sends any number of messages in a cycle",
+        ),
+        (
+            ("protocol.depth={ 'upper.status' = 3 }",),
+            "not a queue: it holds one message; queues: upper.requests",
+        ),
         (("protocol.depth={ 'upper.nothing' = 3 }",), "no such mailbox"),
         (("protocol.depth={ 'upper.requests' = 0 }",), "protocol.depth"),
     ],
@@ -228,14 +276,24 @@ def test_a_queue_without_a_reader_is_refused(config: MakeConfig) -> None:
 @pytest.mark.parametrize(
     ("fault", "why"),
     [
-        ({"kind": "mute", "mailbox": "upper.requests"}, "'upper.requests' is a queue, which mute does not strike"),
+        (
+            {"kind": "mute", "mailbox": "upper.requests"},
+            "'upper.requests' is a queue, which mute does not strike",
+        ),
         ({"kind": "babble", "mailbox": "upper.requests"}, "refuses those that it cannot hold"),
-        ({"kind": "drop", "board": "lower", "mailbox": "upper.requests_taken"}, "'lower' does not write it"),
+        (
+            {"kind": "drop", "board": "lower", "mailbox": "upper.requests_taken"},
+            "'lower' does not write it",
+        ),
     ],
 )
-def test_faults_that_a_queue_cannot_show_are_refused(config: MakeConfig, fault: dict[str, str], why: str) -> None:
+def test_faults_that_a_queue_cannot_show_are_refused(
+    config: MakeConfig, fault: dict[str, str], why: str
+) -> None:
     text = (
-        QUEUES + "[[fault]]\n" + "\n".join(f'{key} = "{value}"' for key, value in ({"board": "upper"} | fault).items())
+        QUEUES
+        + "[[fault]]\n"
+        + "\n".join(f'{key} = "{value}"' for key, value in ({"board": "upper"} | fault).items())
     )
     (line,) = mistakes(config, text=text)
     assert why in line

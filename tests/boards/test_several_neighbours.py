@@ -1,4 +1,5 @@
-"""Boards with several neighbours, as real processes: one command read by many, many statuses read by one."""
+"""Boards with several neighbours, as real processes: one command read by many, many statuses read
+by one."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def jointed(config: MakeConfig) -> MakeConfig:
 
 def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, Written]:
     """Run the rack; return its digest and everything that it wrote."""
-    with Rack(config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})) as rack:
+    with Rack(
+        config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
+    ) as rack:
         digest = rack.run(SECONDS).digest
         return digest, Written.on(rack.segment)
 
@@ -41,7 +44,9 @@ def at(rows: np.ndarray, tick: int) -> np.void:
 
 
 @pytest.mark.slow
-def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(jointed: MakeConfig) -> None:
+def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(
+    jointed: MakeConfig,
+) -> None:
     digest, written = run(jointed())
     assert run(jointed())[0] == digest
     arm, path = written.messages["arm.status"], written.messages["path.status"]
@@ -55,7 +60,8 @@ def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(join
 @pytest.mark.slow
 def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeConfig) -> None:
     written = run(jointed("board.joint2.rate_hz=100"))[1].messages
-    # joint1 rests on the arm's cycle one tick before its own, joint2 on that before its last cycle at a multiple of 4.
+    # joint1 rests on the arm's cycle one tick before its own, joint2 on that before its last cycle
+    # at a multiple of 4.
     assert at(written["joint1.status"], 95)["basis"] == 94
     assert at(written["joint2.status"], 88)["basis"] == 87
     assert at(written["path.status"], 96)["basis"] == 91
@@ -75,24 +81,42 @@ def test_a_reader_of_many_sees_which_of_them_is_lost(jointed: MakeConfig) -> Non
         while_lost, after = (at(rows, tick)["message"]["lost"].tolist() for tick in ticks)
         assert (while_lost, after) == ([0, 1, 0], [0, 0, 0])
     # The others go on: joint2's part is the one of its last message.
-    assert at(written.messages["arm.status"], 121)["message"]["position"].tolist() == [112.0, 96.0, 336.0]
+    assert at(written.messages["arm.status"], 121)["message"]["position"].tolist() == [
+        112.0,
+        96.0,
+        336.0,
+    ]
 
 
-def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(jointed: MakeConfig) -> None:
+def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
+    jointed: MakeConfig,
+) -> None:
     config = jointed("board.watch={ slot = 10, rate_hz = 400, executor = 'vector_levels:Lone' }")
     supervision = Supervision(config, wire(config))
     lost = ["path", "watch", "joint2", "arm", "clock"]
     assert supervision.in_order(lost)[0] == "clock"
-    assert [name for name in supervision.in_order(lost) if name != "watch"] == ["clock", "arm", "joint2", "path"]
+    assert [name for name in supervision.in_order(lost) if name != "watch"] == [
+        "clock",
+        "arm",
+        "joint2",
+        "path",
+    ]
     assert [name for name in lost if supervision.must_wait(name, ["arm"])] == ["path", "joint2"]
     assert [name for name in lost if supervision.must_wait(name, ["joint1"])] == ["path"]
-    assert [name for name in lost if supervision.must_wait(name, ["clock"])] == ["path", "watch", "joint2", "arm"]
+    assert [name for name in lost if supervision.must_wait(name, ["clock"])] == [
+        "path",
+        "watch",
+        "joint2",
+        "arm",
+    ]
 
 
 def test_neighbours_are_the_same_whichever_of_them_names_the_other(jointed: MakeConfig) -> None:
     both = jointed()
     # The board of the arm is still above nobody, by what the joints say of it.
-    once = jointed("board.arm.reads.parts=['joint1.part', 'joint2.part', 'joint3.part']", "board.arm.above=[]")
+    once = jointed(
+        "board.arm.reads.parts=['joint1.part', 'joint2.part', 'joint3.part']", "board.arm.above=[]"
+    )
     found = [rack_timing(config, wire(config)) for config in (both, once)]
     assert found[0].parallel == found[1].parallel
     assert [chains.text for chains in found[0].parallel] == ["path > joint1 ... joint3 > arm"]
@@ -104,7 +128,10 @@ def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConf
     layout = wire(config)
     down = mailboxes_along(layout, ("path", "joint2", "arm"))
     assert [box.name for box in down] == ["path.command", "joint2.part"]
-    assert [box.name for box in mailboxes_along(layout, ("arm", "joint2", "path"))] == ["arm.status", "joint2.status"]
+    assert [box.name for box in mailboxes_along(layout, ("arm", "joint2", "path"))] == [
+        "arm.status",
+        "joint2.status",
+    ]
     assert command_paths(rack_timing(config, layout), layout)["path"].cycles == (8, 1, 1)
 
 
@@ -117,7 +144,9 @@ CIRCLES = {
 
 
 @pytest.mark.parametrize(("setting", "place", "circle"), CIRCLES.values(), ids=CIRCLES)
-def test_a_circle_is_one_mistake_with_its_members(jointed: MakeConfig, setting: str, place: str, circle: str) -> None:
+def test_a_circle_is_one_mistake_with_its_members(
+    jointed: MakeConfig, setting: str, place: str, circle: str
+) -> None:
     with pytest.raises(ConfigError) as found:
         wire(jointed(setting))
     (mistake,) = [mistake for mistake in found.value.mistakes if "circle" in str(mistake)]
@@ -126,9 +155,18 @@ def test_a_circle_is_one_mistake_with_its_members(jointed: MakeConfig, setting: 
 
 
 WRONG = {
-    "twice": ("board.path.below=['joint1', 'joint1']", 'board.path.below = "joint1": listed 2 times'),
-    "itself": ("board.path.below=['joint1', 'path']", 'board.path.below = "path": no other board has this name'),
-    "unknown": ("board.path.below=['joint1', 'j2']", 'board.path.below = "j2": no other board has this name; boards: '),
+    "twice": (
+        "board.path.below=['joint1', 'joint1']",
+        'board.path.below = "joint1": listed 2 times',
+    ),
+    "itself": (
+        "board.path.below=['joint1', 'path']",
+        'board.path.below = "path": no other board has this name',
+    ),
+    "unknown": (
+        "board.path.below=['joint1', 'j2']",
+        'board.path.below = "j2": no other board has this name; boards: ',
+    ),
     "many for one port": (
         "board.joint1.reads.command=['path.command', 'joint2.part']",
         "port 'command' of the executor reads one mailbox, not 2",

@@ -1,4 +1,5 @@
-"""A level whose executor is a state table: the row that fires, swaps at a tick, restarts, an operator's commands."""
+"""A level whose executor is a state table: the row that fires, swaps at a tick, restarts, an
+operator's commands."""
 
 from __future__ import annotations
 
@@ -62,7 +63,9 @@ def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -
 
 @pytest.mark.slow
 def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
-    statuses, _ = counted(counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9)
+    statuses, _ = counted(
+        counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9
+    )
     assert statuses["table"][-1] == b"slow"
     assert [name.decode() for name in statuses["fired"][9:12]] == ["count up", "settle", "rest"]
     assert set(statuses["fired"][11:].tolist()) == {b"rest"}
@@ -70,7 +73,9 @@ def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
 
 
 @pytest.mark.slow
-def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(counter: MakeConfig, tmp_path: Path) -> None:
+def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(
+    counter: MakeConfig, tmp_path: Path
+) -> None:
     with Rack(counter(EDIT)) as rack:
         (tmp_path / "saw.toml").write_text(SAW.replace('name = "count up"', 'name = "up it goes"'))
         rack.run(0.9)
@@ -94,26 +99,37 @@ def test_an_operator_does_a_command_of_the_level_until_resume(counter: MakeConfi
 
 
 @pytest.mark.slow
-def test_an_operators_command_that_fails_is_refused_with_the_tables_reason(counter: MakeConfig, tmp_path: Path) -> None:
+def test_an_operators_command_that_fails_is_refused_with_the_tables_reason(
+    counter: MakeConfig, tmp_path: Path
+) -> None:
     given = counter(commands(RESET))
-    text = SAW.replace('do = ["take", "set"]\nstatus = "done"', 'do = ["take"]\nstatus = "error"\nreason = "no way"')
+    text = SAW.replace(
+        'do = ["take", "set"]\nstatus = "done"',
+        'do = ["take"]\nstatus = "error"\nreason = "no way"',
+    )
     (tmp_path / "saw.toml").write_text(text)
     statuses, _ = counted(given)
     assert statuses["answer"][5:].tolist() == [Answer.REFUSED] * (len(statuses) - 5)
     assert statuses["objection"][5] == b"no way"
 
 
-def test_a_table_with_a_hole_is_refused_with_its_state_and_case(counter: MakeConfig, tmp_path: Path) -> None:
+def test_a_table_with_a_hole_is_refused_with_its_state_and_case(
+    counter: MakeConfig, tmp_path: Path
+) -> None:
     given = counter()
     (tmp_path / "saw.toml").write_text(HOLE)
     with pytest.raises(ConfigError) as caught:
         resolve(given)
-    assert str(caught.value) == (
-        "board.counter.params.tables.saw = \"saw.toml\": hole: no row of 'down' takes count = low, late = yes, new = no"
+    assert (
+        str(caught.value)
+        == "board.counter.params.tables.saw = \"saw.toml\": hole: no row of 'down' takes count ="
+        " low, late = yes, new = no"
     )
 
 
-def test_unknown_tables_and_commands_are_refused_with_those_that_there_are(counter: MakeConfig) -> None:
+def test_unknown_tables_and_commands_are_refused_with_those_that_there_are(
+    counter: MakeConfig,
+) -> None:
     given = commands(
         'level = "counter", what = "table", name = "swift", tick = 4',
         'level = "counter", what = "do", name = "reset middle", tick = 4',
@@ -129,5 +145,7 @@ def test_unknown_tables_and_commands_are_refused_with_those_that_there_are(count
 
 
 def test_a_missing_file_is_a_mistake_of_the_config(counter: MakeConfig) -> None:
-    with pytest.raises(ConfigError, match=r'params\.tables\.saw = "none\.toml": cannot be read: No such file'):
+    with pytest.raises(
+        ConfigError, match=r'params\.tables\.saw = "none\.toml": cannot be read: No such file'
+    ):
         resolve(counter("board.counter.params.tables.saw=none.toml"))

@@ -1,6 +1,8 @@
-"""Levels for tests of boards with several neighbours: a board a joint between one level above and one below.
+"""Levels for tests of boards with several neighbours: a board a joint between one level above and
+one below.
 
-Each joint takes its own part of the vector that the level above commands, and the level below adds the parts up.
+Each joint takes its own part of the vector that the level above commands, and the level below adds
+the parts up.
 """
 
 from __future__ import annotations
@@ -14,16 +16,28 @@ from rack.levels.tables import Table, read_params
 
 JOINTS = 3
 PATH = command("test_path", 1, RESTS_ON, Field("position", "f8", "1", "of every joint", (JOINTS,)))
-PART = command("test_part", 1, RESTS_ON, Field("position", "f8", "1", "of this board's joint; others 0", (JOINTS,)))
+PART = command(
+    "test_part",
+    1,
+    RESTS_ON,
+    Field("position", "f8", "1", "of this board's joint; others 0", (JOINTS,)),
+)
 SEEN = status(
-    "test_seen", 1, *ANSWER, Field("position", "f8", "1", "", (JOINTS,)), Field("lost", "u1", "1", "", (JOINTS,))
+    "test_seen",
+    1,
+    *ANSWER,
+    Field("position", "f8", "1", "", (JOINTS,)),
+    Field("lost", "u1", "1", "", (JOINTS,)),
 )
 
 
 class PathLevel(Executor):
     """Commands all joints at once; reads a status of each."""
 
-    inputs = {"operator": Input(OPERATOR_COMMAND, "own.operator"), "joints": Input(SEEN, "below.status", many=True)}
+    inputs = {
+        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "joints": Input(SEEN, "below.status", many=True),
+    }
     outputs = {"command": PATH, "status": Output(SEEN, rests_on="joints")}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
 

@@ -1,4 +1,5 @@
-"""A rack for tests of several neighbours: one level above three boards of a joint, which are above one."""
+"""A rack for tests of several neighbours: one level above three boards of a joint, which are above
+one."""
 
 from __future__ import annotations
 

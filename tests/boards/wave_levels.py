@@ -1,4 +1,5 @@
-"""Levels for tests of boards: a wave scaled by a planner, a level that watches it, and trouble on request.
+"""Levels for tests of boards: a wave scaled by a planner, a level that watches it, and trouble on
+request.
 
 A level's parameter `trouble` selects the trouble, `at` its tick and `ticks` its duration.
 """
@@ -16,7 +17,9 @@ from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
 from rack.levels.messages import TASK_STATUS
 
 WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
-GAIN = MessageType("gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_at", "i8", "tick", "release")))
+GAIN = MessageType(
+    "gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_at", "i8", "tick", "release"))
+)
 
 
 class Trouble:
@@ -66,7 +69,9 @@ class Wave(Executor):
         """Write the wave's height."""
         self.trouble.at(tick)
         write.status.state = self._final if tick >= self._done_at else State.EXECUTING
-        write.status.reason = "the tide" if self._final is State.ERROR and tick >= self._done_at else ""
+        write.status.reason = (
+            "the tide" if self._final is State.ERROR and tick >= self._done_at else ""
+        )
         write.status.value = 0.5 * tick * self.gain(read)
 
     def gain(self, read: Ports) -> float:
@@ -157,7 +162,8 @@ class Endless(Watch):
 
 
 class Preloaded(Watch):
-    """A level that fails its self-test with the processes in which it was preloaded, and that forked it."""
+    """A level that fails its self-test with the processes in which it was preloaded, and that
+    forked it."""
 
     preloaded_in: list[int] = []
 
@@ -181,7 +187,8 @@ class Unpreloadable(Watch):
 
 
 class SlowlyPreloaded(Watch):
-    """A level that is preloaded once another process opens the FIFO named by the variable WAVE_MAY_LOAD."""
+    """A level that is preloaded once another process opens the FIFO named by the variable
+    WAVE_MAY_LOAD."""
 
     @classmethod
     def preload(cls) -> None:

@@ -13,7 +13,10 @@ from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 CLOCK_NS = 2_500_000
 ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
 
-BLOCK = '<body name="block" pos=".6 0 .049"><freejoint/><geom name="block" type="box" size=".05 .05 .05"/></body>'
+BLOCK = (
+    '<body name="block" pos=".6 0 .049"><freejoint/><geom name="block" type="box" size=".05 .05'
+    ' .05"/></body>'
+)
 """A free body, for the start of `PENDULUM`'s world; its weight presses it 1 mm into the floor."""
 
 PENDULUM = """
@@ -104,9 +107,11 @@ GRIPPER = {"actuator": "grip", "joint": "crank_left", "open": 0.6, "closed": 0.0
 
 
 def four_bar(folder: Path) -> tuple[RobotConfig, SceneConfig]:
-    """Write the PUMA in its cell with a gripper of closed loops to `folder`: a parallelogram a finger, two gears.
+    """Write the PUMA in its cell with a gripper of closed loops to `folder`: a parallelogram a
+    finger, two gears.
 
-    The cranks turn outwards by the opening, in rad; each tip stays parallel because a rod closes its loop.
+    The cranks turn outwards by the opening, in rad; each tip stays parallel because a rod closes
+    its loop.
     """
     sides = [
         FOUR_BAR_FINGER.format(side=side, y=y, back=back, x=x)
@@ -115,8 +120,14 @@ def four_bar(folder: Path) -> tuple[RobotConfig, SceneConfig]:
     before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
     text = before + FOUR_BAR.format(left=sides[0], right=sides[1]) + rest.split("</body>", 3)[3]
     text = text.replace('<exclude body1="finger_left" body2="finger_right"/>', "")
-    text = text[: text.index("<equality>") + 10] + FOUR_BAR_EQUALITY + text[text.index("</equality>") :]
-    text = text.replace('<motor name="grip" joint="finger_left"', '<motor name="grip" joint="crank_left"')
+    text = (
+        text[: text.index("<equality>") + 10]
+        + FOUR_BAR_EQUALITY
+        + text[text.index("</equality>") :]
+    )
+    text = text.replace(
+        '<motor name="grip" joint="finger_left"', '<motor name="grip" joint="crank_left"'
+    )
     (folder / "puma560.xml").write_text(text)
     cell_file = folder / "puma560_cell.xml"
     cell_file.write_text((ROBOTS / "puma560_cell.xml").read_text())

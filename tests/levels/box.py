@@ -10,19 +10,23 @@ import numpy as np
 from rack.backplane.message import Message, MessageType
 
 SILENT_CYCLES = 4
-"""Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the one it waits."""
+"""Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the
+one it waits."""
 Disturbance = Callable[[int, bytes], "Sequence[tuple[int, bytes | None]]"]
-"""A writer's fault: of a message visible at a tick, the messages that become visible, and when; None: a damaged one."""
+"""A writer's fault: of a message visible at a tick, the messages that become visible, and when;
+None: a damaged one."""
 
 
 class Box:
     """A mailbox under time-slice: messages wait until they are visible.
 
-    `every` is the cycle of a writer that writes in every one of them; None: planners and tests do not. `lost`: the
-    writer is known to be dead or to hang.
+    `every` is the cycle of a writer that writes in every one of them; None: planners and tests do
+    not. `lost`: the writer is known to be dead or to hang.
     """
 
-    def __init__(self, kind: MessageType, sizes_: Mapping[str, int], every: int | None = None) -> None:
+    def __init__(
+        self, kind: MessageType, sizes_: Mapping[str, int], every: int | None = None
+    ) -> None:
         self.kind, self.dtype = kind, kind.dtype(sizes_)
         self.lost = False
         self.disturbance: Disturbance | None = None
@@ -36,7 +40,11 @@ class Box:
     def publish(self, message: Message, visible_at: int) -> None:
         """Make `message` visible from tick `visible_at` on, unless a fault interferes."""
         data = bytes(message.raw)
-        for one in ((visible_at, data),) if self.disturbance is None else self.disturbance(visible_at, data):
+        for one in (
+            ((visible_at, data),)
+            if self.disturbance is None
+            else self.disturbance(visible_at, data)
+        ):
             insort(self._waiting, one, key=lambda waiting: waiting[0])
 
     def withdraw(self, tick: int) -> None:
@@ -44,7 +52,8 @@ class Box:
         self._waiting = [one for one in self._waiting if one[0] <= tick]
 
     def at(self, tick: int) -> tuple[int, bytes | None]:
-        """Return serial and bytes of the newest message visible at `tick`, None if damaged; serial 0: none yet."""
+        """Return serial and bytes of the newest message visible at `tick`, None if damaged; serial
+        0: none yet."""
         while self._waiting and self._waiting[0][0] <= tick:
             since, self._now = self._waiting.pop(0)
             self._serial += 1
@@ -73,7 +82,8 @@ def mute(visible_at: int, data: bytes) -> Shown:
 
 
 def lose_some(probability: float, seed: int) -> Disturbance:
-    """Damage messages with that probability; to a reader, a dropped one is the same: a serial without a message."""
+    """Damage messages with that probability; to a reader, a dropped one is the same: a serial
+    without a message."""
     chance = np.random.default_rng(seed)
     return lambda visible_at, data: ((visible_at, None if chance.random() < probability else data),)
 

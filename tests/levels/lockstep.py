@@ -1,8 +1,9 @@
 """Runs levels in one process, tick by tick, with the visibility of the time-slice protocol.
 
-Messages that a task released at tick T writes are visible from T + n, a plan from T + within_cycles * n, and a task
-reads what was visible at its release. So a test sees what boards see, without processes and without waiting.
-Tasks can be lost and come back, mailboxes can be disturbed, as in a rack whose boards fail; an operator can command.
+Messages that a task released at tick T writes are visible from T + n, a plan from T + within_cycles
+* n, and a task reads what was visible at its release. So a test sees what boards see, without
+processes and without waiting. Tasks can be lost and come back, mailboxes can be disturbed, as in a
+rack whose boards fail; an operator can command.
 """
 
 from __future__ import annotations
@@ -13,7 +14,17 @@ from typing import Any
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
-from rack.levels.level import Demand, Executor, Input, LevelContext, MadePorts, Output, Pace, Planner, Ports
+from rack.levels.level import (
+    Demand,
+    Executor,
+    Input,
+    LevelContext,
+    MadePorts,
+    Output,
+    Pace,
+    Planner,
+    Ports,
+)
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -40,7 +51,11 @@ class Task:
     """An executor or a planner with its ports."""
 
     def __init__(
-        self, level: Executor | Planner, spec: BoardSpec, boxes: Mapping[str, Box], outputs: Mapping[str, Box]
+        self,
+        level: Executor | Planner,
+        spec: BoardSpec,
+        boxes: Mapping[str, Box],
+        outputs: Mapping[str, Box],
     ) -> None:
         self.level, self.spec, self.due = level, spec, 0
         # A port that reads many has an input for each board, by (port, board).
@@ -49,7 +64,10 @@ class Task:
         self._many = [port for port, input_ in ports.items() if input_.many]
         for port, input_ in ports.items():
             names = sources(input_, spec)
-            self._inputs |= {(port, name.partition(".")[0]) if input_.many else port: boxes[name] for name in names}
+            self._inputs |= {
+                (port, name.partition(".")[0]) if input_.many else port: boxes[name]
+                for name in names
+            }
         self._values = {port: Message(box.dtype) for port, box in self._inputs.items()}
         self._seen = dict.fromkeys(self._inputs, 0)
         self._has = dict.fromkeys(self._inputs, False)
@@ -113,7 +131,8 @@ class Task:
 
 
 class Lockstep:
-    """A rack in one process. `boxes` are its mailboxes by name, `tick` the tick that is due next."""
+    """A rack in one process. `boxes` are its mailboxes by name, `tick` the tick that is due
+    next."""
 
     def __init__(
         self,
@@ -126,7 +145,8 @@ class Lockstep:
         clock_ns: int = CLOCK_NS,
         name: str = "",
     ) -> None:
-        """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`; `name` is the rack's."""
+        """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`; `name`
+        is the rack's."""
         self.tick, self._clock_ns = 0, clock_ns
         self.demand = Demand.NONE
         self._coming: dict[int, list[Callable[[], None]]] = {}
@@ -136,7 +156,9 @@ class Lockstep:
         for board in boards:
             for port, kind in outputs_of(board).items():
                 output = kind if isinstance(kind, Output) else Output(kind)
-                self.boxes[f"{board.name}.{port}"] = Box(output.type, self.sizes, output.cycles * board.every)
+                self.boxes[f"{board.name}.{port}"] = Box(
+                    output.type, self.sizes, output.cycles * board.every
+                )
             if board.planner is not None:
                 self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
             self.boxes[f"{board.name}.operator"] = Box(OPERATOR_COMMAND, self.sizes)
@@ -170,18 +192,21 @@ class Lockstep:
         return started
 
     def restart(self, name: str) -> None:
-        """Replace a task ("primitive", "primitive.planner") by a fresh one, as after the death of its board."""
+        """Replace a task ("primitive", "primitive.planner") by a fresh one, as after the death of
+        its board."""
         self.tasks[name].level.close()
         self.tasks[name] = self._start(self.tasks[name].spec)[name]
         self.tasks[name].rejoin(self.tick)
 
     def lose(self, name: str, ticks: int, finished: bool = True) -> None:
-        """Kill a task now and restart it `ticks` later; without `finished`, its present plan is never made."""
+        """Kill a task now and restart it `ticks` later; without `finished`, its present plan is
+        never made."""
         self.tasks[name].lose(self.tick, finished)
         self.after(ticks, lambda: self.restart(name))
 
     def forget(self, name: str) -> None:
-        """Replace a task by one that finds its own mailboxes empty, as after a new launch of its rack."""
+        """Replace a task by one that finds its own mailboxes empty, as after a new launch of its
+        rack."""
         self.restart(name)
         self.tasks[name].forget(self.sizes)
 
@@ -223,7 +248,8 @@ class Lockstep:
         self.tick += 1
 
     def run(self, seconds: float, until: Callable[[Lockstep], bool] = lambda rack: False) -> bool:
-        """Run for simulated `seconds`, or until `until`, asked every 10 ticks, says so; return what it said last."""
+        """Run for simulated `seconds`, or until `until`, asked every 10 ticks, says so; return what
+        it said last."""
         end = self.tick + round(seconds * 1e9 / self._clock_ns)
         while self.tick < end:
             self.step()
@@ -244,7 +270,9 @@ def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
 
 def made_ports(board: BoardSpec, level: Executor | Planner) -> MadePorts:
     """Return the ports that the parameters of a board make; a planner has none."""
-    return board.executor.made_ports(board.params, {}) if isinstance(level, Executor) else MadePorts()
+    return (
+        board.executor.made_ports(board.params, {}) if isinstance(level, Executor) else MadePorts()
+    )
 
 
 def outputs_of(board: BoardSpec) -> dict[str, MessageType | Output]:
@@ -265,8 +293,11 @@ class Operator:
     def __init__(self, rack: Lockstep) -> None:
         self._rack, self.serial = rack, 0
 
-    def say(self, level: str, what: Operation, joints: Sequence[float] = (), goal: Goal = Goal.NONE) -> int:
-        """Give a command now; return its serial. `joints`, rad, are its goal where there are any."""
+    def say(
+        self, level: str, what: Operation, joints: Sequence[float] = (), goal: Goal = Goal.NONE
+    ) -> int:
+        """Give a command now; return its serial. `joints`, rad, are its goal where there are
+        any."""
         message = self._message(level, what, Goal.JOINTS if len(joints) else goal)
         message.count = len(joints)
         message.joints[: len(joints)] = joints

@@ -14,23 +14,55 @@ from rack.levels import algebra
 LEVELS = Path(algebra.__file__).parent
 RNG = np.random.default_rng(3)
 ELSEWHERE = (
-    {"dot", "vdot", "inner", "vecdot", "matmul", "matvec", "tensordot", "power", "float_power", "argsort"}
-    | {name for stem in ("sin", "cos", "tan", "sinh", "cosh", "tanh") for name in (stem, f"a{stem}", f"arc{stem}")}
-    | {"exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "cbrt", "atan2", "arctan2", "logaddexp"}
+    {
+        "dot",
+        "vdot",
+        "inner",
+        "vecdot",
+        "matmul",
+        "matvec",
+        "tensordot",
+        "power",
+        "float_power",
+        "argsort",
+    }
+    | {
+        name
+        for stem in ("sin", "cos", "tan", "sinh", "cosh", "tanh")
+        for name in (stem, f"a{stem}", f"arc{stem}")
+    }
+    | {
+        "exp",
+        "exp2",
+        "expm1",
+        "log",
+        "log2",
+        "log10",
+        "log1p",
+        "cbrt",
+        "atan2",
+        "arctan2",
+        "logaddexp",
+    }
 )
-"""Functions of numpy whose results depend on the processor: BLAS, vector code of its own, ties sorted in any order."""
+"""Functions of numpy whose results depend on the processor: BLAS, vector code of its own, ties
+sorted in any order."""
 
 
 @pytest.mark.parametrize("joints", [1, 6, 7])
 def test_results_are_those_of_linear_algebra(joints: int) -> None:
-    square, tall, x, y = (RNG.normal(size=shape) for shape in ((joints, joints), (6, joints), joints, 6))
+    square, tall, x, y = (
+        RNG.normal(size=shape) for shape in ((joints, joints), (6, joints), joints, 6)
+    )
     inertia = square.T @ square + np.eye(joints)
     assert algebra.mat_vec(tall, x) == pytest.approx(tall @ x)
     assert algebra.transposed_mat_vec(tall, y) == pytest.approx(tall.T @ y)
     assert algebra.gram(tall) == pytest.approx(tall.T @ tall)
     assert algebra.solve(inertia, x) == pytest.approx(np.linalg.solve(inertia, x))
     assert algebra.norm(x) == pytest.approx(np.linalg.norm(x))
-    assert np.array_equal(algebra.each(math.tanh, tall), [[math.tanh(value) for value in row] for row in tall])
+    assert np.array_equal(
+        algebra.each(math.tanh, tall), [[math.tanh(value) for value in row] for row in tall]
+    )
 
 
 def test_a_solution_leaves_its_arguments_alone() -> None:
@@ -65,10 +97,13 @@ def test_levels_multiply_no_arrays_with_an_operator() -> None:
 
 
 def depends_on_processor(call: ast.Call) -> bool:
-    """Say whether this is a call of numpy's BLAS or of its vector code; a norm over an axis is neither."""
+    """Say whether this is a call of numpy's BLAS or of its vector code; a norm over an axis is
+    neither."""
     match call.func:
         case ast.Attribute(attr="argsort"):  # of equal values, each vector unit has its own order
-            return not any(k.arg == "kind" and ast.unparse(k.value) == "'stable'" for k in call.keywords)
+            return not any(
+                k.arg == "kind" and ast.unparse(k.value) == "'stable'" for k in call.keywords
+            )
         case ast.Attribute(value=ast.Name(id="np"), attr=name):
             return name in ELSEWHERE
         case ast.Attribute(value=ast.Attribute(value=ast.Name(id="np"), attr="linalg"), attr=name):

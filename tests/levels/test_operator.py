@@ -10,7 +10,15 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State, status
 from rack.levels.messages import Verb
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Answer, Goal, Operation, Orders, joints_of
+from rack.levels.operator import (
+    ANSWER,
+    OPERATOR_COMMAND,
+    Answer,
+    Goal,
+    Operation,
+    Orders,
+    joints_of,
+)
 from tests.levels.lockstep import Operator
 from tests.levels.whole_rack import WholeRack
 
@@ -19,7 +27,9 @@ STATUS = status("answering", 1, *ANSWER)
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])
 
 
-def said(serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict = Verdict.NEW) -> Reading:
+def said(
+    serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict = Verdict.NEW
+) -> Reading:
     message = Message(OPERATOR_COMMAND.dtype({}))
     message.id, message.what, message.goal = serial, what, goal
     return Reading(message, verdict)
@@ -50,16 +60,22 @@ def test_a_command_given_twice_is_taken_up_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "goal"), [(Operation.SETPOINT, Goal.JOINTS), (Operation.GOTO, Goal.POSE), (Operation.HOLD, Goal.HOME)]
+    ("what", "goal"),
+    [(Operation.SETPOINT, Goal.JOINTS), (Operation.GOTO, Goal.POSE), (Operation.HOLD, Goal.HOME)],
 )
-def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(what: Operation, goal: Goal) -> None:
+def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
+    what: Operation, goal: Goal
+) -> None:
     orders = Orders(TAKES)
     orders.take(said(1, Operation.HOLD))
     assert not orders.take(said(2, what, goal))
     shown = report(orders)
     assert (shown.order, shown.answer, shown.standing) == (2, Answer.REFUSED, Operation.HOLD)
     name = f"{what.name} {goal.name}".lower()
-    assert shown.objection == f"{name} is not a command of this level; permitted: hold, resume, goto joints|home"
+    assert (
+        shown.objection
+        == f"{name} is not a command of this level; permitted: hold, resume, goto joints|home"
+    )
     # The torque still rests on the one before.
     assert shown.operator == 1
 
@@ -85,7 +101,11 @@ def test_a_command_given_up_holds() -> None:
     orders.take(said(5, Operation.GOTO, Goal.HOME))
     orders.fail("out of reach")
     shown = report(orders)
-    assert (shown.standing, shown.answer, shown.objection) == (Operation.HOLD, Answer.REFUSED, "out of reach")
+    assert (shown.standing, shown.answer, shown.objection) == (
+        Operation.HOLD,
+        Answer.REFUSED,
+        "out of reach",
+    )
     assert shown.operator == 5
     orders.done()
     assert report(orders, message=shown).answer == Answer.REFUSED
@@ -109,7 +129,9 @@ def test_only_a_command_under_way_becomes_done() -> None:
         ((np.nan, 1.0), "joint 'base' at nan rad; permitted: -1 to 1"),
     ],
 )
-def test_joints_that_cannot_be_name_the_joint_and_its_range(joints: tuple[float, ...], why: str) -> None:
+def test_joints_that_cannot_be_name_the_joint_and_its_range(
+    joints: tuple[float, ...], why: str
+) -> None:
     message = said(1, Operation.GOTO, Goal.JOINTS).value
     message.count = len(joints)
     message.joints[: len(joints)] = joints
@@ -159,7 +181,9 @@ def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> No
     assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
     # It has been passed down to the lowest level, and no level above knows of it.
     above = LEVELS.index(level)
-    assert [rack.read(f"{name}.status").operator for name in LEVELS] == above * [0] + (4 - above) * [serial]
+    assert [rack.read(f"{name}.status").operator for name in LEVELS] == above * [0] + (
+        4 - above
+    ) * [serial]
     # But each of them reports that it is held, and by whom.
     statuses = [rack.read(f"{name}.status") for name in LEVELS[: min(above, 2) + 1]]
     for shown in [s for s in statuses if s.state != State.DONE]:
@@ -199,7 +223,10 @@ def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> N
     assert np.abs(scene.tool_position - ASIDE).max() < 5e-3
     assert rack.task.detour > 0
     assert rack.task.state == State.HOLDING
-    assert rack.task.reason == "diverted by the operator: goto direction done; `resume` continues the program"
+    assert (
+        rack.task.reason
+        == "diverted by the operator: goto direction done; `resume` continues the program"
+    )
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
     operator.say("task", Operation.RESUME)

@@ -1,6 +1,8 @@
-"""The whole rack when boards are lost and come back and mailboxes fail, at any time: the task is done all the same.
+"""The whole rack when boards are lost and come back and mailboxes fail, at any time: the task is
+done all the same.
 
-Boards are lost as in a rack: their messages stay, readers see the loss, the new process is on the grid.
+Boards are lost as in a rack: their messages stay, readers see the loss, the new process is on the
+grid.
 """
 
 from __future__ import annotations
@@ -52,14 +54,21 @@ def test_task_is_done_whichever_tasks_are_lost_whenever_and_for_however_long(see
         name, finished = str(chance.choice(sorted(rack.tasks))), bool(chance.random() < 0.5)
         ticks = int(np.exp(chance.uniform(0.0, np.log(2 * SECOND))))
         at = int(chance.integers(NOMINAL))
-        rack.after(at, lambda name=name, ticks=ticks, finished=finished: rack.lose(name, ticks, finished))
+        rack.after(
+            at, lambda name=name, ticks=ticks, finished=finished: rack.lose(name, ticks, finished)
+        )
     check(rack)
 
 
 def disturbance(chance: np.random.Generator, every: int) -> Disturbance:
     """Draw a fault of a writer that writes every so many ticks."""
     seed = int(chance.integers(1 << 30))
-    kinds = (mute, lose_some(0.5, seed), hold_back(every * int(chance.integers(2, 6))), SwapPairs(0.5, seed))
+    kinds = (
+        mute,
+        lose_some(0.5, seed),
+        hold_back(every * int(chance.integers(2, 6))),
+        SwapPairs(0.5, seed),
+    )
     return kinds[int(chance.integers(len(kinds)))]
 
 
@@ -68,16 +77,24 @@ def test_task_is_done_whatever_is_muted_dropped_held_back_or_out_of_order() -> N
     rack = WholeRack(actions=[TRANSFER])
     for mailbox in chance.permutation(MAILBOXES):
         every = rack.tasks[mailbox.partition(".")[0]].spec.every
-        fault, ticks = disturbance(chance, every), max(int(chance.uniform(1.0, 2.0) * SECOND), 4 * every)
+        fault, ticks = (
+            disturbance(chance, every),
+            max(int(chance.uniform(1.0, 2.0) * SECOND), 4 * every),
+        )
         at = int(chance.integers(NOMINAL))
-        rack.after(at, lambda name=str(mailbox), fault=fault, ticks=ticks: rack.disturb(name, fault, ticks))
+        rack.after(
+            at, lambda name=str(mailbox), fault=fault, ticks=ticks: rack.disturb(name, fault, ticks)
+        )
     check(rack)
 
 
 def test_object_stays_in_the_gripper_while_everything_that_holds_it_is_lost() -> None:
     rack = WholeRack(actions=[TRANSFER])
     assert rack.run(
-        15.0, lambda _: rack.move.held == BLOCK1 and rack.move.verb == Verb.MOVE and not rack.primitive.resting
+        15.0,
+        lambda _: (
+            rack.move.held == BLOCK1 and rack.move.verb == Verb.MOVE and not rack.primitive.resting
+        ),
     )
     for name in ("servo", "primitive", "world"):
         rack.lose(name, SECOND)

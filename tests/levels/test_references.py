@@ -22,7 +22,11 @@ def as_saved_before(config: RackConfig) -> tuple[RackConfig, list[str]]:
     """Return a config as a run of an earlier version saved it, and the old names in it."""
     text, used = config.text(), []
     for old, new in MOVED.items():
-        if (changed := text.replace(f'"{new}:', f'"{old}:') if ":" not in old else text.replace(new, old)) != text:
+        if (
+            changed := text.replace(f'"{new}:', f'"{old}:')
+            if ":" not in old
+            else text.replace(new, old)
+        ) != text:
             text, used = changed, [*used, old]
     return loads(text), used
 
@@ -36,7 +40,10 @@ def test_each_old_name_leads_to_what_is_there() -> None:
 def test_names_that_only_begin_like_a_moved_one_stay() -> None:
     assert current("rack.levels.handle:Grip") == "rack.levels.handle:Grip"
     assert current("rack.levels.servo:ServoExecutor") == "rack.levels.servo:ServoExecutor"
-    assert current("rack.levels.hand.workstation:Workstation") == "rack.levels.systems.hand.workstation:Workstation"
+    assert (
+        current("rack.levels.hand.workstation:Workstation")
+        == "rack.levels.systems.hand.workstation:Workstation"
+    )
 
 
 @pytest.mark.slow
@@ -63,15 +70,26 @@ def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
 def importing(folder: Path, source: str, *setup: str) -> subprocess.Popen[str]:
     """Return a process that imports a user's module of this source."""
     (folder / "theirs.py").write_text(source)
-    lines = ("from rack.levels import references", *setup, "references.module_and_name('theirs:Level')")
+    lines = (
+        "from rack.levels import references",
+        *setup,
+        "references.module_and_name('theirs:Level')",
+    )
     return subprocess.Popen(
-        [sys.executable, "-c", "\n".join(lines)], cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True
+        [sys.executable, "-c", "\n".join(lines)],
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
 
 
 def test_a_module_that_ends_the_process_is_named(tmp_path: Path) -> None:
     process = importing(tmp_path, "import os\nos._exit(5)\n")
-    assert process.communicate(timeout=BOUND_S) == (None, "'theirs' ended the process while it was imported\n")
+    assert process.communicate(timeout=BOUND_S) == (
+        None,
+        "'theirs' ended the process while it was imported\n",
+    )
     assert process.returncode == 5
 
 

@@ -1,4 +1,5 @@
-"""The world model: poses, velocities, and a revision that rises when a body starts or stops moving."""
+"""The world model: poses, velocities, and a revision that rises when a body starts or stops
+moving."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class WorldRig:
         return cast(Message, self.rack.tasks["world"].write.model)
 
     def run(self, seconds: float, poses: Poses | None) -> list[int]:
-        """Run for `seconds`, with a scene every tick while `poses` is given; return the revisions that were seen."""
+        """Run for `seconds`, with a scene every tick while `poses` is given; return the revisions
+        that were seen."""
         revisions = [self.model.revision]
         for _ in range(round(seconds / TICK_S)):
             if poses is not None:
@@ -74,7 +76,9 @@ def test_bodies_at_rest_keep_one_revision_and_have_no_velocity() -> None:
     rig, rng = WorldRig(), np.random.default_rng(2)
     rig.run(0.1, resting)
     first = rig.model.revision
-    assert rig.run(2.0, lambda _: (START + rng.normal(0.0, 2e-5, (3, 3)), np.tile(UPRIGHT, (3, 1)))) == [first]
+    assert rig.run(
+        2.0, lambda _: (START + rng.normal(0.0, 2e-5, (3, 3)), np.tile(UPRIGHT, (3, 1)))
+    ) == [first]
     assert not rig.model.velocity.any()
     assert rig.model.position == pytest.approx(START, abs=2e-4)
 
@@ -91,7 +95,9 @@ def test_the_revision_rises_when_a_body_starts_and_when_it_rests_again() -> None
 def test_the_velocity_of_a_moving_body_is_estimated() -> None:
     rig = WorldRig()
     rig.run(1.4, sliding(1.0, 2.0, 0.25))
-    assert rig.model.velocity == pytest.approx(np.array([[0.25, 0, 0], [0, 0, 0], [0, 0, 0]]), abs=1e-9)
+    assert rig.model.velocity == pytest.approx(
+        np.array([[0.25, 0, 0], [0, 0, 0], [0, 0, 0]]), abs=1e-9
+    )
     assert rig.model.position[0, 0] == pytest.approx(0.5 + 0.25 * 0.4, abs=0.26 * PERIOD * TICK_S)
 
 
@@ -157,15 +163,24 @@ def test_a_moving_body_keeps_its_velocity_until_the_next_scene_is_due() -> None:
 def test_compiled_code_gives_the_bits_of_numpy() -> None:
     WorldModel.preload()
     rng, memories = np.random.default_rng(3), []
-    scenes = np.cumsum(rng.normal(0.0, 0.002, (200, 4, 7)) * (rng.random((200, 1, 1)) < 0.3), axis=0)
+    scenes = np.cumsum(
+        rng.normal(0.0, 0.002, (200, 4, 7)) * (rng.random((200, 1, 1)) < 0.3), axis=0
+    )
     for find in (find_motion, find_motion.load()):
-        poses, moving, slow_s, velocity = np.zeros((2, 4, 7)), np.zeros(4, dtype=bool), np.zeros(4), np.zeros((4, 3))
+        poses, moving, slow_s, velocity = (
+            np.zeros((2, 4, 7)),
+            np.zeros(4, dtype=bool),
+            np.zeros(4),
+            np.zeros((4, 3)),
+        )
         memories.append([])
         for scene in scenes:
             quaternion = np.array([1.0, 0.0, 0.0, 0.0]) + scene[:, 3:]
             quaternion /= np.linalg.norm(quaternion, axis=1)[:, None]
             rules = 0.002, 0.02, 0.005, 0.1, 0.06, 0.02
             changed = find(scene[:, :3].copy(), quaternion, *poses, moving, slow_s, velocity, rules)
-            memories[-1].append((changed, poses.tolist(), moving.tolist(), slow_s.tolist(), velocity.tolist()))
+            memories[-1].append(
+                (changed, poses.tolist(), moving.tolist(), slow_s.tolist(), velocity.tolist())
+            )
     assert memories[0] == memories[1]
     assert {changed for changed, *_ in memories[0]} == {False, True}

@@ -1,4 +1,5 @@
-"""The `rack` command line within the test's own process: without a second of imports for every call."""
+"""The `rack` command line within the test's own process: without a second of imports for every
+call."""
 
 from __future__ import annotations
 
@@ -12,11 +13,13 @@ from rack.tools.cli import run_commands
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 50
-"""Bound of a command that a test starts as a process: for its signals, or to go on while it runs."""
+"""Bound of a command that a test starts as a process: for its signals, or to go on while it
+runs."""
 
 
 def rack(*arguments: object, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run a command from a folder, the project's unless given; return what a process would have left."""
+    """Run a command from a folder, the project's unless given; return what a process would have
+    left."""
     before, out, err, status = sys.argv, StringIO(), StringIO(), 0
     sys.argv = ["rack", *map(str, arguments)]
     try:

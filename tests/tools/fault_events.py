@@ -25,11 +25,16 @@ def box(name: str, writer: str, reader: str, every: int) -> MailboxSpec:
 
 
 LAYOUT = Layout(
-    "small", TICK_NS, TASKS, (box("upper.command", "upper", "lower", 8), box("lower.status", "lower", "upper", 1))
+    "small",
+    TICK_NS,
+    TASKS,
+    (box("upper.command", "upper", "lower", 8), box("lower.status", "lower", "upper", 1)),
 )
 
 
-def event(tick: int, kind: EventKind, code: str, board: str = "", subject: str = "", value: float = 0.0) -> Event:
+def event(
+    tick: int, kind: EventKind, code: str, board: str = "", subject: str = "", value: float = 0.0
+) -> Event:
     """Return an event in the middle of its tick."""
     return Event(tick * TICK_NS + TICK_NS // 2, tick, kind, board, code, code, -1, subject, value)
 
@@ -45,7 +50,8 @@ def flows(tick: int, mailbox: str = "lower.status") -> Event:
 
 
 def strike(kind: str, board: str, tick: int, ends: int = -1, place: int = 0, **more: Any) -> Strike:
-    """Return a fault that struck at the beginning of a tick, and is over at `ends`; once, where that is not said."""
+    """Return a fault that struck at the beginning of a tick, and is over at `ends`; once, where
+    that is not said."""
     number = KINDS["kill" if kind == EXTERNAL else kind].number
     parameters = tuple(parameter.default or 0.0 for parameter in KINDS[number].parameters)
     tasks = [task.name for task in TASKS]
@@ -58,6 +64,8 @@ def strike(kind: str, board: str, tick: int, ends: int = -1, place: int = 0, **m
         tick=tick,
         time_ns=tick * TICK_NS,
         mailboxes=tuple(m.name for m in LAYOUT.mailboxes if m.writer == board),
-        injection=Injection(number, tasks.index(board) if board in tasks else -1, parameters=parameters),
+        injection=Injection(
+            number, tasks.index(board) if board in tasks else -1, parameters=parameters
+        ),
     )
     return replace(made, **more)

@@ -16,13 +16,15 @@ from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Panel
 
 SLOWER = 4
-"""Times of these runs as multiples of the figures': long compared with the boards' own work, on a slow machine too."""
+"""Times of these runs as multiples of the figures': long compared with the boards' own work, on a
+slow machine too."""
 COMPUTED = 0.95
 """Part of its budget that a figure computes; some of the rest is the board's own work."""
 SECONDS = 0.6
 ATTEMPTS = 10
 QUIET, DISTURBED = 0.1, 0.25
-"""Parts of a run's time lost to other programs: below the first a run is good, above the second useless."""
+"""Parts of a run's time lost to other programs: below the first a run is good, above the second
+useless."""
 
 
 def slowed(name: str) -> list[str]:
@@ -30,9 +32,20 @@ def slowed(name: str) -> list[str]:
     budget = load(name).board["level"].budget
     assert budget is not None
     times = {key: SLOWER * ms for key, ms in budget.model_dump(exclude_none=True).items()}
-    made = {"params": ("process_ms", "plan_ms"), "transfer": ("read_ms", "write_ms", "exchange_ms", "update_ms")}
-    settings = [f"board.level.{table}.{key}={COMPUTED * times[key]}" for table, keys in made.items() for key in keys]
-    return [f"clock.speed={1 / SLOWER}", *settings, *(f"board.level.budget.{key}={ms}" for key, ms in times.items())]
+    made = {
+        "params": ("process_ms", "plan_ms"),
+        "transfer": ("read_ms", "write_ms", "exchange_ms", "update_ms"),
+    }
+    settings = [
+        f"board.level.{table}.{key}={COMPUTED * times[key]}"
+        for table, keys in made.items()
+        for key in keys
+    ]
+    return [
+        f"clock.speed={1 / SLOWER}",
+        *settings,
+        *(f"board.level.budget.{key}={ms}" for key, ms in times.items()),
+    ]
 
 
 def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> TracedRun:
@@ -44,7 +57,8 @@ def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> Tr
 
 
 def undisturbed(name: str, folder: Path, *settings: str) -> TracedRun:
-    """Return a run in which other programs had its cores only briefly: the best of several attempts."""
+    """Return a run in which other programs had its cores only briefly: the best of several
+    attempts."""
     best, least = None, DISTURBED
     for attempt in range(ATTEMPTS):
         found = run(name, folder / str(attempt), *slowed(name), *settings)
@@ -58,12 +72,15 @@ def undisturbed(name: str, folder: Path, *settings: str) -> TracedRun:
 
 
 def lost(found: TracedRun) -> float:
-    """Return the part of a run in which its tasks waited for a core, or were on one without computing.
+    """Return the part of a run in which its tasks waited for a core, or were on one without
+    computing.
 
     An executor is ready at its release, a planner when its executor has let go of the core.
     """
     cycles = found.recording.cycles
-    waited = sum(int((rows["start_ns"] - rows["release_ns"]).clip(0).sum()) for rows in (cycles["level"],))
+    waited = sum(
+        int((rows["start_ns"] - rows["release_ns"]).clip(0).sum()) for rows in (cycles["level"],)
+    )
     charted = sum(span.end_ns - span.start_ns for span in found.chart(0, found.end_ns).spans)
     computed = sum(int(rows["processor_ns"].sum()) for rows in cycles.values())
     return (waited + max(0, charted - computed)) / found.end_ns
@@ -75,5 +92,6 @@ def whole(found: TracedRun) -> Panel:
 
 
 def usual(counts: Counter[str]) -> str:
-    """Return the most frequent pattern: a machine that wakes processes late makes many others, each rare."""
+    """Return the most frequent pattern: a machine that wakes processes late makes many others, each
+    rare."""
     return counts.most_common(1)[0][0]

@@ -27,7 +27,8 @@ ERROR_NS = 200 * US
 
 @dataclass(frozen=True)
 class Machine:
-    """A machine, and the rack on it: its CLOCK_MONOTONIC at true time 0, its drift, and when the rack's tick 0 was."""
+    """A machine, and the rack on it: its CLOCK_MONOTONIC at true time 0, its drift, and when the
+    rack's tick 0 was."""
 
     rack: str
     clock_ns: int
@@ -51,7 +52,9 @@ class Machine:
 
     def true_ns(self, tick: int) -> int:
         """Return the true time of a tick."""
-        return round((self.epoch_ns + tick * self.period_ns - self.clock_ns) / (1 + self.drift_ppm * 1e-6))
+        return round(
+            (self.epoch_ns + tick * self.period_ns - self.clock_ns) / (1 + self.drift_ppm * 1e-6)
+        )
 
     def time_ns(self, true_ns: int) -> int:
         """Return the rack's simulated time at a true time."""
@@ -69,9 +72,11 @@ def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConf
 def recorded(
     machine: Machine, others: Sequence[Machine], folder: Path, seed: int = 1, counts_from: int = 0
 ) -> Recording:
-    """Write the recording of a rack that compared its clock with those of others, each time with an error.
+    """Write the recording of a rack that compared its clock with those of others, each time with an
+    error.
 
-    In lockstep it counts from a number, and takes the count of the others from there, each 4 ticks late.
+    In lockstep it counts from a number, and takes the count of the others from there, each 4 ticks
+    late.
     """
     config = config_of(machine, [other.rack for other in others], folder)
     (folder / "config.toml").write_text(config.text())
@@ -83,12 +88,17 @@ def recorded(
         rows[name] = machine.epoch_ns + rows["tick"] * machine.period_ns
     cycles.add("pulse", rows)
     cycles.close({})
-    signals = SignalsFile(folder / "signals.parquet", layout, Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S))
+    signals = SignalsFile(
+        folder / "signals.parquet", layout, Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S)
+    )
     for other in others:
         box = layout.mailbox(f"lan.{peer_port(other.rack)}")
         signals.add(box.name, sightings(machine, other, box, seed))
     if machine.mode == "lockstep":
-        for name, ticks in (("pulse.status", TICKS), *([("lan.other", TICKS - 4)] if others else [])):
+        for name, ticks in (
+            ("pulse.status", TICKS),
+            *([("lan.other", TICKS - 4)] if others else []),
+        ):
             rows = np.zeros(ticks // 4, row_dtype(layout.mailbox(name)))
             rows["basis"] = np.arange(0, ticks, 4)
             rows["tick"] = rows["basis"] + TICKS - ticks
@@ -109,7 +119,11 @@ def sightings(machine: Machine, other: Machine, box: MailboxSpec, seed: int) -> 
     message["uncertainty"] = -1.0
     for row in range(3, len(rows)):
         true_ns = machine.true_ns(int(rows["tick"][row]))
-        offset_ns = other.shows(true_ns) - machine.shows(true_ns) + int(random.integers(-ERROR_NS, ERROR_NS))
+        offset_ns = (
+            other.shows(true_ns)
+            - machine.shows(true_ns)
+            + int(random.integers(-ERROR_NS, ERROR_NS))
+        )
         message["offset"][row], message["uncertainty"][row] = offset_ns * 1e-9, ERROR_NS * 1e-9
         stamp_ns = machine.epoch_ns + int(rows["tick"][row]) * machine.period_ns + offset_ns
         theirs_ns = max(0, stamp_ns - other.epoch_ns) * other.speed

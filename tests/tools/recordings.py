@@ -22,7 +22,8 @@ Row = tuple[int, ...]
 
 
 class Cycle(NamedTuple):
-    """One trace record, ms: `parts` are the stamped lengths of C, R, X, W; `processor` is None for their sum."""
+    """One trace record, ms: `parts` are the stamped lengths of C, R, X, W; `processor` is None for
+    their sum."""
 
     tick: int
     parts: tuple[float, float, float, float]
@@ -39,7 +40,12 @@ class Cycle(NamedTuple):
 
 
 def cycle(
-    tick: int, tick_us: int, *moments_us: int, processor_us: int | None = None, skipped: int = 0, planned: bool = False
+    tick: int,
+    tick_us: int,
+    *moments_us: int,
+    processor_us: int | None = None,
+    skipped: int = 0,
+    planned: bool = False,
 ) -> Row:
     """Return a trace record released at `tick`; its moments, start to end, are us since tick 0."""
     moments = [EPOCH_NS + moment * US for moment in moments_us]
@@ -55,13 +61,19 @@ def recorded(
     events: Sequence[Mapping[str, Any]] = (),
     messages: Mapping[str, np.ndarray] | None = None,
 ) -> Recording:
-    """Write the recording of a rack whose tasks left these traces, and messages, into `folder`; return it."""
+    """Write the recording of a rack whose tasks left these traces, and messages, into `folder`;
+    return it."""
     folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(config.text())
     (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
-    cycles, signals = CyclesFile(folder / "cycles.parquet"), SignalsFile(folder / "signals.parquet", wire(config))
+    cycles, signals = (
+        CyclesFile(folder / "cycles.parquet"),
+        SignalsFile(folder / "signals.parquet", wire(config)),
+    )
     for task, trace in traces.items():
-        rows = [cycle.row(tick_ns(config)) if isinstance(cycle, Cycle) else cycle for cycle in trace]
+        rows = [
+            cycle.row(tick_ns(config)) if isinstance(cycle, Cycle) else cycle for cycle in trace
+        ]
         cycles.add(task, np.array(rows, RECORD))
     for mailbox, rows in (messages or {}).items():
         signals.add(mailbox, rows)

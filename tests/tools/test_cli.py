@@ -1,4 +1,5 @@
-"""The command line before any command: arguments that none can use, paths that cannot be, completion by the shell."""
+"""The command line before any command: arguments that none can use, paths that cannot be,
+completion by the shell."""
 
 from __future__ import annotations
 
@@ -37,7 +38,9 @@ def test_an_argument_without_end_is_refused_in_one_line(arguments: tuple[str, ..
     assert len(done.stderr) < 200
 
 
-@pytest.mark.parametrize("arguments", [("report",), ("analyze",), ("replay",), ("gantt",), ("run", "fig2", "--out")])
+@pytest.mark.parametrize(
+    "arguments", [("report",), ("analyze",), ("replay",), ("gantt",), ("run", "fig2", "--out")]
+)
 def test_a_name_that_no_file_can_have_is_refused_in_one_line(arguments: tuple[str, ...]) -> None:
     done = rack(*arguments, "a" * 300)
     assert done.returncode == 2
@@ -63,19 +66,34 @@ def test_a_usage_error_of_any_command_is_a_document_under_json(command: str) -> 
 
 
 def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
-    """Return command lines that print: the help of each command, and answers of all ways of printing them."""
+    """Return command lines that print: the help of each command, and answers of all ways of
+    printing them."""
     run = ("run", str(small), "--set", f"name={rack_name}", "--seconds", "0.1", "--no-record")
-    answers = [("check", "fig2"), ("check", "fig2", "--json"), ("list",), ("list", "--json"), ("status", "--json"), run]
+    answers = [
+        ("check", "fig2"),
+        ("check", "fig2", "--json"),
+        ("list",),
+        ("list", "--json"),
+        ("status", "--json"),
+        run,
+    ]
     return [*((name, "--help") for name, _, _ in ALL), *answers, (*run, "--json")]
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_output_that_cannot_be_printed_is_one_line(small: Path, rack_name: str, unbuffered: str) -> None:
+def test_output_that_cannot_be_printed_is_one_line(
+    small: Path, rack_name: str, unbuffered: str
+) -> None:
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     for arguments in outputs(small, rack_name)[-7 if unbuffered else 0 :]:
         with Path("/dev/full").open("wb") as full:
             done = subprocess.run(
-                [*RACK, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, timeout=BOUND_S
+                [*RACK, *arguments],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=environment,
+                timeout=BOUND_S,
             )
         *before, last = done.stderr.splitlines()
         assert (done.returncode, last) == (1, "stdout: No space left on device"), arguments
@@ -85,14 +103,21 @@ def test_output_that_cannot_be_printed_is_one_line(small: Path, rack_name: str, 
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_that_has_seen_enough_hears_of_no_error(small: Path, rack_name: str, unbuffered: str) -> None:
+def test_a_reader_that_has_seen_enough_hears_of_no_error(
+    small: Path, rack_name: str, unbuffered: str
+) -> None:
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     for arguments in outputs(small, rack_name)[-7:]:
         reader, writer = os.pipe()
         os.close(reader)
         try:
             done = subprocess.run(
-                [*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True, env=environment, timeout=BOUND_S
+                [*RACK, *arguments],
+                stdout=writer,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=environment,
+                timeout=BOUND_S,
             )
         finally:
             os.close(writer)
@@ -106,17 +131,24 @@ def test_with_stdout_closed_commands_do_what_they_do(small: Path, rack_name: str
         line = ["sh", "-c", '"$@" >&-', "sh", *RACK, *arguments]
         done = subprocess.run(line, stderr=subprocess.PIPE, text=True, timeout=BOUND_S)
         missing = arguments[0] == "status"
-        assert (done.returncode, len(done.stderr.splitlines())) == ((2, 1) if missing else (0, 0)), done.stderr
+        assert (done.returncode, len(done.stderr.splitlines())) == (
+            (2, 1) if missing else (0, 0)
+        ), done.stderr
 
 
 @pytest.mark.parametrize("command", ["status", "stop", "record", "estop", "command", "inject"])
 def test_an_empty_name_is_no_rack(command: str) -> None:
     done = rack(command, "")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == 'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it\n'
+    assert (
+        done.stderr
+        == 'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it\n'
+    )
 
 
-@pytest.mark.parametrize("option", ["--faultless=nan", "--faultless=inf", "--faultless=-1", "--seconds=inf"])
+@pytest.mark.parametrize(
+    "option", ["--faultless=nan", "--faultless=inf", "--faultless=-1", "--seconds=inf"]
+)
 def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
     done = rack("campaign", "fig2", option)
     assert (done.returncode, done.stdout) == (2, "")
@@ -125,18 +157,31 @@ def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
 
 def test_bytes_that_are_no_text_are_refused() -> None:
     command = [*RACK, "check", b"\xff"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
     assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": not UTF-8\n')
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("words", "found"), [("rack che", "check"), ("rack check fig", "fig2\nfig3\nfig4\nfig4-overload")]
+    ("words", "found"),
+    [("rack che", "check"), ("rack check fig", "fig2\nfig3\nfig4\nfig4-overload")],
 )
 def test_the_shell_completes_commands_and_configs(words: str, found: str) -> None:
-    asked = {"_RACK_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    asked = {
+        "_RACK_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+    }
     command = list(RACK)
     done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | asked, capture_output=True, text=True, timeout=BOUND_S, check=False
+        command,
+        cwd=ROOT,
+        env=os.environ | asked,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
     )
     assert (done.returncode, done.stdout.strip()) == (0, found)

@@ -1,4 +1,5 @@
-"""A board a joint, as a user sees it: one line for all joints, and the response of all chains measured."""
+"""A board a joint, as a user sees it: one line for all joints, and the response of all chains
+measured."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recorded run in lockstep in which an operator held the highest level."""
     path = tmp_path_factory.mktemp("jointed")
     (path / "jointed.toml").write_text(JOINTED)
-    held = commands("level = 'path', what = 'hold', tick = 101", "level = 'path', what = 'resume', tick = 160")
+    held = commands(
+        "level = 'path', what = 'hold', tick = 101", "level = 'path', what = 'resume', tick = 160"
+    )
     config = load(path / "jointed.toml", [f"name=test-{path.name}", held])
     assert run_rack(config, 1.0, path / "run", Display()).recording == "complete"
     return path / "run"
@@ -58,7 +61,11 @@ def test_a_check_has_one_line_for_boards_with_equal_figures(jointed: Path) -> No
     ]
     assert sum(line.startswith("3.3") for line in text.splitlines()) == 1
     found = json.loads(rack("check", jointed, "--json").stdout)["timing"]
-    assert {v["subject"] for v in found["verdicts"] if v["equation"] == "3.1"} == {"path", *NAMES, "arm"}
+    assert {v["subject"] for v in found["verdicts"] if v["equation"] == "3.1"} == {
+        "path",
+        *NAMES,
+        "arm",
+    }
 
 
 def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path) -> None:
@@ -70,7 +77,10 @@ def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path)
 
 def test_figure_5_has_one_line_for_boards_of_one_cycle(jointed: Path) -> None:
     rows = [line for line in lines(load(jointed)) if line.rstrip().endswith("no planner to couple")]
-    assert [row.rpartition(" ms:")[0] for row in rows] == ["joint1 ... joint3, arm, 2.5", "path, 20"]
+    assert [row.rpartition(" ms:")[0] for row in rows] == [
+        "joint1 ... joint3, arm, 2.5",
+        "path, 20",
+    ]
 
 
 @pytest.mark.slow
@@ -85,7 +95,9 @@ def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_slower_joint_has_a_response_of_its_own(jointed: Path, rack_name: str, tmp_path: Path) -> None:
+def test_a_slower_joint_has_a_response_of_its_own(
+    jointed: Path, rack_name: str, tmp_path: Path
+) -> None:
     config = load(jointed, [f"name={rack_name}", "board.joint2.rate_hz=100"])
     recording = run_commands(config, (), tmp_path / "run", 1.0)
     first = write_report(recording.folder)[0]["system_response"]
@@ -95,7 +107,11 @@ def test_a_slower_joint_has_a_response_of_its_own(jointed: Path, rack_name: str,
     assert [found["command"]["measured_ms"]["max"] for found in (first, other)] == [32.5, 25.0]
     assert first["command"]["holds"]
     assert other["command"]["holds"]
-    subjects = {pair.subject for pair in Analysis.of(recording).pairs if pair.equation == "3.3" and pair.measured}
+    subjects = {
+        pair.subject
+        for pair in Analysis.of(recording).pairs
+        if pair.equation == "3.3" and pair.measured
+    }
     assert subjects == {"system, path > joint2 > arm", "system, path > joint1, joint3 > arm"}
 
 
@@ -103,13 +119,18 @@ def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> 
     response = response_of(Recording(folder))
     assert response is not None
     # Read at 104, by the joints at 112, by the arm at 113.
-    assert [(c.sampled, c.predicted, c.acts) for c in response.commands] == [(104, 113, 113), (168, 177, 177)]
+    assert [(c.sampled, c.predicted, c.acts) for c in response.commands] == [
+        (104, 113, 113),
+        (168, 177, 177),
+    ]
     assert response.held
     assert response.paths["path"].levels == ("path", "joint1", "arm")
 
 
 @pytest.mark.slow
-def test_the_levels_alone_write_what_they_write_in_the_rack(jointed: Path, rack_name: str, tmp_path: Path) -> None:
+def test_the_levels_alone_write_what_they_write_in_the_rack(
+    jointed: Path, rack_name: str, tmp_path: Path
+) -> None:
     config = load(jointed, [f"name={rack_name}"])
     recording = run_commands(config, (), tmp_path / "run", 0.5)
     resolved = resolve(config)
@@ -119,7 +140,12 @@ def test_the_levels_alone_write_what_they_write_in_the_rack(jointed: Path, rack_
 
 def test_the_graph_of_boards_has_a_row_for_every_level(folder: Path) -> None:
     names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
-    places = read(folder / "run.rrd", "/hierarchy", "GraphNodes:positions").values[0].reshape(-1, 2).tolist()
+    places = (
+        read(folder / "run.rrd", "/hierarchy", "GraphNodes:positions")
+        .values[0]
+        .reshape(-1, 2)
+        .tolist()
+    )
     rows = {name: row for name, (_, row) in zip(names, places, strict=True)}
     assert rows["path"] < rows["joint1"] == rows["joint2"] == rows["joint3"] < rows["arm"]
     assert len({tuple(place) for place in places}) == len(names)

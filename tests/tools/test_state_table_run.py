@@ -1,4 +1,5 @@
-"""A recorded run of a level with state tables: the rows that fired are in the report and in the viewer's recording."""
+"""A recorded run of a level with state tables: the rows that fired are in the report and in the
+viewer's recording."""
 
 from __future__ import annotations
 
@@ -22,7 +23,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("counting")
     path = here / "counting.toml"
     path.write_text(counting(here))
-    done = rack("run", path, "--seconds", "0.25", "--out", here / "run", "--set", "name=counting", "--set", SWAP)
+    done = rack(
+        "run",
+        path,
+        "--seconds",
+        "0.25",
+        "--out",
+        here / "run",
+        "--set",
+        "name=counting",
+        "--set",
+        SWAP,
+    )
     assert done.returncode == 0, done.stderr
     return here / "run"
 
@@ -38,7 +50,9 @@ def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
         ("slow", 4, "rest", 9),
     ]
     assert rows[1]["first_s"] == 0.1
-    assert "| counter | saw, then slow | 5          | 25     |" in (folder / "report.md").read_text()
+    assert (
+        "| counter | saw, then slow | 5          | 25     |" in (folder / "report.md").read_text()
+    )
 
 
 def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None:
@@ -52,7 +66,9 @@ def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None
         "3 settle",
         "4 rest",
     ]
-    assert "counter: row 4 'turn', now in 'down', table saw" in {str(value) for value in lines.values.ravel()}
+    assert "counter: row 4 'turn', now in 'down', table saw" in {
+        str(value) for value in lines.values.ravel()
+    }
 
 
 def test_the_recorded_config_names_the_same_files(folder: Path) -> None:

@@ -25,12 +25,19 @@ Percentile = Annotated[
         metavar="P",
         min=1.0,
         max=100.0,
-        help="judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6",
+        help=(
+            "judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6"
+        ),
     ),
 ]
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the results; default: the run's own")]
+Out = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="folder for the results; default: the run's own")
+]
 OnlyResponse = Annotated[
-    bool, typer.Option("--response", help="instead: the response to an operator's commands, with its bounds")
+    bool,
+    typer.Option(
+        "--response", help="instead: the response to an operator's commands, with its bounds"
+    ),
 ]
 
 
@@ -41,14 +48,15 @@ def analyze(
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Compare a run with the timing model: every equation that `rack check` predicts, with its measurement.
+    """Compare a run with the timing model: every equation that `rack check` predicts, with its
+    measurement.
 
-    Times of levels are processor time, without waiting and preemption. A virtual machine stalled by its host counts the
-    stall as processor time: cycles in which one is seen are not judged. Not every one is seen; --percentile 99 leaves
-    out whatever happens less than once in 100 cycles.
+    Times of levels are processor time, without waiting and preemption. A virtual machine stalled by
+    its host counts the stall as processor time: cycles in which one is seen are not judged. Not
+    every one is seen; --percentile 99 leaves out whatever happens less than once in 100 cycles.
 
-    It lists the cycles that broke an equation, and the tasks that had their core meanwhile. It writes analysis.json,
-    residuals.png and residuals.svg.
+    It lists the cycles that broke an equation, and the tasks that had their core meanwhile. It
+    writes analysis.json, residuals.png and residuals.svg.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
 
@@ -72,5 +80,8 @@ def analyze(
     if as_json:
         print_json(found)
     else:
-        print_wrapped(f"{text(analysis, terminal_width())}\n\n{folder}/analysis.json, residuals.png, residuals.svg")
+        print_wrapped(
+            f"{text(analysis, terminal_width())}\n\n{folder}/analysis.json, residuals.png,"
+            " residuals.svg"
+        )
     sys.exit(0 if analysis.holds else 1)

@@ -1,4 +1,5 @@
-"""Answers of `rack list` and `rack status`, apart from their options: parsing those takes longer."""
+"""Answers of `rack list` and `rack status`, apart from their options: parsing those takes
+longer."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ def list_racks(as_json: bool) -> None:
 
     found = [describe(name) for name in racks()]
     rows = [[str(rack[key]) for key in ("rack", "state", "detail")] for rack in found]
-    print_answer(found, table(("rack", "state", ""), rows, terminal_width()) if rows else "no racks", as_json)
+    print_answer(
+        found, table(("rack", "state", ""), rows, terminal_width()) if rows else "no racks", as_json
+    )
 
 
 def describe(name: str) -> dict[str, str | int | float]:
@@ -46,11 +49,18 @@ def describe(name: str) -> dict[str, str | int | float]:
     side = f" and {hosts} on the host side" if hosts else ""
     detail = f"{boards} boards{side}, tick {words[System.TICK]}, {by}"
     segment.close()
-    return {"rack": name, "state": state, "detail": detail, "launcher": launcher, "age_s": round(age_s, 3)}
+    return {
+        "rack": name,
+        "state": state,
+        "detail": detail,
+        "launcher": launcher,
+        "age_s": round(age_s, 3),
+    }
 
 
 def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
-    """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly one."""
+    """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
+    one."""
     from rack.backplane.segment import Segment
 
     if rack is not None and "/" in rack:
@@ -81,5 +91,9 @@ def _only_rack() -> str:
     running = racks()
     if len(running) != 1:
         names = ", ".join(running)
-        raise Failure(f"RACK is missing; racks: {names}", 2) if running else Failure("no rack is running")
+        raise (
+            Failure(f"RACK is missing; racks: {names}", 2)
+            if running
+            else Failure("no rack is running")
+        )
     return running[0]

@@ -35,15 +35,18 @@ def interruptible(context: typer.Context) -> None:
 
 @bench.command()
 def mailbox(
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="turns of every contestant")] = 200,
+    rounds: Annotated[
+        int, typer.Option(metavar="N", min=1, help="turns of every contestant")
+    ] = 200,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Measure a message, written and read, next to other ways of inter-process communication.
 
-    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes and queues of
-    multiprocessing, and zenoh. The ratio is to the best of these peers. A raw copy is the least that can be done, and
-    zenoh within one session never leaves its process: these two are no peers.
+    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes
+    and queues of multiprocessing, and zenoh. The ratio is to the best of these peers. A raw copy is
+    the least that can be done, and zenoh within one session never leaves its process: these two are
+    no peers.
     """
     from rack.tools.lab.benches.mailbox import CASES, measure
 
@@ -53,7 +56,9 @@ def mailbox(
 @bench.command()
 def cycle(
     against: Against = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")] = 6.0,
+    seconds: Annotated[
+        float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")
+    ] = 6.0,
     rounds: RackRounds = 3,
     share: Share = False,
     plot: Plot = None,
@@ -61,9 +66,10 @@ def cycle(
 ) -> None:
     """Measure the processor time of a board's cycle, by part.
 
-    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns with another checkout.
-    The servo board is also compared with bare mj_step calls: the physics of its recorded run, replayed alone. What
-    TREE needs and this environment lacks, give in PYTHONPATH.
+    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns
+    with another checkout. The servo board is also compared with bare mj_step calls: the physics of
+    its recorded run, replayed alone. What TREE needs and this environment lacks, give in
+    PYTHONPATH.
     """
     from rack.tools.lab.benches.cycle import measure
 
@@ -74,7 +80,8 @@ def cycle(
 def lockstep(
     against: Against = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most")
+        float | None,
+        typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most"),
     ] = None,
     rounds: RackRounds = 3,
     plot: Plot = None,
@@ -82,8 +89,9 @@ def lockstep(
 ) -> None:
     """Measure how fast nasrem, k1607 and fig4 run in lockstep.
 
-    Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one process without a rack.
-    Its messages must be those of the rack, bit for bit. What TREE needs and this environment lacks, give in PYTHONPATH.
+    Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one
+    process without a rack. Its messages must be those of the rack, bit for bit. What TREE needs and
+    this environment lacks, give in PYTHONPATH.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure
 
@@ -101,16 +109,19 @@ def recording(config: Config = "nasrem", as_json: Json = False) -> None:
     from rack.tools.lab.benches.recording import lines_of, measure
 
     costs = measure(config)
-    print_found({"recording": [asdict(cost) for cost in costs]}, lines_of(costs, terminal_width()), as_json)
+    print_found(
+        {"recording": [asdict(cost) for cost in costs]}, lines_of(costs, terminal_width()), as_json
+    )
 
 
 @bench.command()
 def switch(as_json: Json = False) -> None:
     """Measure the context switch t_cs of eqs 3.8 and 3.9.
 
-    On the paper's 68020 boards it took 100 us. An executor of real-time priority wakes up on the core of a busy
-    planner, as on a board with both. The times are those from the planner's last instant to the executor's first, and
-    back. Exit status 1 if the machine does not permit real-time priorities.
+    On the paper's 68020 boards it took 100 us. An executor of real-time priority wakes up on the
+    core of a busy planner, as on a board with both. The times are those from the planner's last
+    instant to the executor's first, and back. Exit status 1 if the machine does not permit
+    real-time priorities.
     """
     from rack.tools.lab.benches.switch import measure
 
@@ -121,15 +132,19 @@ def switch(as_json: Json = False) -> None:
 @bench.command()
 def partition(
     config: Config = "nasrem",
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run")] = 15.0,
-    rounds: Annotated[int, typer.Option(metavar="N", min=1, help="runs of each partition, interleaved")] = 2,
+    seconds: Annotated[
+        float, typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run")
+    ] = 15.0,
+    rounds: Annotated[
+        int, typer.Option(metavar="N", min=1, help="runs of each partition, interleaved")
+    ] = 2,
     as_json: Json = False,
 ) -> None:
     """Compare four partitions of a rack.
 
-    Its planners are coupled tightly or loosely, on one core or two. The runs are in real time, one after another. The
-    output shows misses, residuals and plan ages, and next to them the timing model's predictions from the budgets of
-    the config.
+    Its planners are coupled tightly or loosely, on one core or two. The runs are in real time, one
+    after another. The output shows misses, residuals and plan ages, and next to them the timing
+    model's predictions from the budgets of the config.
     """
     from rack.tools.console.progress import progress_for
     from rack.tools.console.tables import terminal_width
@@ -137,32 +152,53 @@ def partition(
 
     with progress_for(as_json) as progress:
         found = compare(config, seconds, rounds, progress)
-    document = {"config": config, "seconds": seconds, "rounds": rounds, "partitions": [asdict(p) for p in found]}
+    document = {
+        "config": config,
+        "seconds": seconds,
+        "rounds": rounds,
+        "partitions": [asdict(p) for p in found],
+    }
     print_found(document, lines_of(found, terminal_width()), as_json)
 
 
 @bench.command()
 def response(
     config: Config = "nasrem",
-    commands: Annotated[int, typer.Option(metavar="N", min=1, help="holds and resumes to measure, in all")] = 200,
+    commands: Annotated[
+        int, typer.Option(metavar="N", min=1, help="holds and resumes to measure, in all")
+    ] = 200,
     seed: Annotated[int, typer.Option(metavar="N", help="seed of their ticks")] = 1,
-    mode: Annotated[Literal["lockstep", "realtime"], typer.Option(help="how the racks run")] = "lockstep",
+    mode: Annotated[
+        Literal["lockstep", "realtime"], typer.Option(help="how the racks run")
+    ] = "lockstep",
     twins: Annotated[
-        int, typer.Option(metavar="N", min=0, help="in lockstep: holds whose run is compared with one without them")
+        int,
+        typer.Option(
+            metavar="N",
+            min=0,
+            help="in lockstep: holds whose run is compared with one without them",
+        ),
     ] = 4,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for response.png and response.svg")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder for response.png and response.svg")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure the response to an operator, from command to torque.
 
-    Racks run one after another, with holds and resumes at random ticks, at every level in turn; the response is
-    compared with its bounds R_s. In lockstep each command must act at the predicted tick; in a twin of the run without
-    that command, the torque must differ from that tick on. Exit status 1 if one does not, or a bound is exceeded.
+    Racks run one after another, with holds and resumes at random ticks, at every level in turn; the
+    response is compared with its bounds R_s. In lockstep each command must act at the predicted
+    tick; in a twin of the run without that command, the torque must differ from that tick on. Exit
+    status 1 if one does not, or a bound is exceeded.
     """
     from rack.tools.lab.benches.response import ResponseRuns
 
     twins = twins if mode == "lockstep" else 0
-    found = show(lambda progress: ResponseRuns(config, mode, seed, progress).measure(commands, twins), out, as_json)
+    found = show(
+        lambda progress: ResponseRuns(config, mode, seed, progress).measure(commands, twins),
+        out,
+        as_json,
+    )
     raise typer.Exit(0 if found.held else 1)
 
 
@@ -177,17 +213,22 @@ def clock(
 ) -> None:
     """Measure how late a board starts its cycle.
 
-    Lateness is the time from grid point to start. An empty board waits in each of the ways that a config permits. By
-    turns with it, on the same core at the same rate and priority: `cyclictest`, a bare loop of clock_nanosleep in
-    Python, and a thread of LinuxCNC. Ratios are to `cyclictest`. A board that sleeps and `cyclictest` also run with
-    idle cores held awake, as root; all others let them sleep. The last line says which `clock.idle_cores` suits this
-    machine: with fewer wake-ups late by a period, beyond chance, or else with the better worst one. Let nothing
-    else run meanwhile.
+    Lateness is the time from grid point to start. An empty board waits in each of the ways that a
+    config permits. By turns with it, on the same core at the same rate and priority: `cyclictest`,
+    a bare loop of clock_nanosleep in Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
+    A board that sleeps and `cyclictest` also run with idle cores held awake, as root; all others
+    let them sleep. The last line says which `clock.idle_cores` suits this machine: with fewer
+    wake-ups late by a period, beyond chance, or else with the better worst one. Let nothing else
+    run meanwhile.
     """
     from rack.tools.lab.benches.clock import RATES_HZ, measure
     from rack.tools.lab.benches.observed import Runs
 
-    show(lambda progress: measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress), plot, as_json)
+    show(
+        lambda progress: measure(tuple(rate or RATES_HZ), Runs(seconds, rounds, share), progress),
+        plot,
+        as_json,
+    )
 
 
 @bench.command()
@@ -202,22 +243,29 @@ def rate(
 ) -> None:
     """Find the highest servo rate that a rack holds.
 
-    The board that cycles at every tick runs at each rate in turn; the other levels keep their rates. A rate is held if
-    at most 0.1 % of its cycles are missed beyond those that `cyclictest` is late by a cycle, at that rate on that core
-    in the same minutes.
+    The board that cycles at every tick runs at each rate in turn; the other levels keep their
+    rates. A rate is held if at most 0.1 % of its cycles are missed beyond those that `cyclictest`
+    is late by a cycle, at that rate on that core in the same minutes.
     """
     from rack.tools.lab.benches.observed import Runs
     from rack.tools.lab.benches.rate import RATES_HZ, measure
 
-    show(lambda progress: measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress), plot, as_json)
+    show(
+        lambda progress: measure(config, rate or RATES_HZ, Runs(seconds, rounds, share), progress),
+        plot,
+        as_json,
+    )
 
 
 @bench.command()
 def boards(
     count: Annotated[
-        list[int] | None, typer.Option(metavar="N", min=1, help="boards; may be given several times")
+        list[int] | None,
+        typer.Option(metavar="N", min=1, help="boards; may be given several times"),
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="simulated time of one run")] = 3.0,
+    seconds: Annotated[
+        float, typer.Option(metavar="S", min=0.1, help="simulated time of one run")
+    ] = 3.0,
     rounds: Rounds = 3,
     share: Share = False,
     against: Against = None,
@@ -226,9 +274,10 @@ def boards(
 ) -> None:
     """Measure what empty boards cost by their number.
 
-    They pass a message down a chain at 400 Hz on all cores. The output shows processor time a tick, missed cycles next
-    to those of `cyclictest`, and the cycles that a message takes: as many as there are boards. In lockstep it shows the
-    time of a tick, with --against also that of another checkout. Exit status 1 if a message took another time.
+    They pass a message down a chain at 400 Hz on all cores. The output shows processor time a tick,
+    missed cycles next to those of `cyclictest`, and the cycles that a message takes: as many as
+    there are boards. In lockstep it shows the time of a tick, with --against also that of another
+    checkout. Exit status 1 if a message took another time.
     """
     from rack.tools.lab.benches.boards import COUNTS, measure
     from rack.tools.lab.benches.chain import LONGEST
@@ -236,7 +285,9 @@ def boards(
 
     counts = sorted(set(count or COUNTS))
     if counts[-1] > LONGEST:
-        raise Failure(f"--count {counts[-1]}: a crate takes up to {LONGEST} boards and the clock", 2)
+        raise Failure(
+            f"--count {counts[-1]}: a crate takes up to {LONGEST} boards and the clock", 2
+        )
     runs = Runs(seconds, rounds, share)
     found = show(lambda progress: measure(counts, runs, against, progress), plot, as_json)
     raise typer.Exit(0 if found.exact else 1)
@@ -254,14 +305,19 @@ def launch(
 ) -> None:
     """Measure what a user waits for: launches, short commands, and the reaction to a killed board.
 
-    A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to the checkout given by
-    --against. The ratio of a short command is to a Python that imports numpy and ends. `rack report` shows a report
-    that the run has made. Then boards of a running rack are killed: the output shows the time to detection, and the
-    time until the brakes of the arm are engaged.
+    A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to
+    the checkout given by --against. The ratio of a short command is to a Python that imports numpy
+    and ends. `rack report` shows a report that the run has made. Then boards of a running rack are
+    killed: the output shows the time to detection, and the time until the brakes of the arm are
+    engaged.
     """
     from rack.tools.lab.benches.launch import LaunchCounts, measure
 
-    show(lambda progress: measure(config, LaunchCounts(rounds, kills), against, share, progress), plot, as_json)
+    show(
+        lambda progress: measure(config, LaunchCounts(rounds, kills), against, share, progress),
+        plot,
+        as_json,
+    )
 
 
 @bench.command()
@@ -269,32 +325,39 @@ def systems(
     configs: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="CONFIG", help="config by name, or path to a .toml file; several", autocompletion=config_names
+            metavar="CONFIG",
+            help="config by name, or path to a .toml file; several",
+            autocompletion=config_names,
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, max=1e6, help="time of the run in real time")] = 6.0,
+    seconds: Annotated[
+        float, typer.Option(metavar="S", min=1.0, max=1e6, help="time of the run in real time")
+    ] = 6.0,
     share: Share = False,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Compare racks with each other: what their configs promise, and what their runs show.
 
-    Without CONFIG these are nasrem and the bundled racks that model other systems: about four minutes on two quiet
-    cores, 25 seconds a rack.
+    Without CONFIG these are nasrem and the bundled racks that model other systems: about four
+    minutes on two quiet cores, 25 seconds a rack.
 
-    Of each config: the levels of its longest chain, boards, processes, cores, rates, the longest cycle R_max, the
-    response R_s by eqs 3.2 and 3.3 and on the clock's grid, and whether it fits.
+    Of each config: the levels of its longest chain, boards, processes, cores, rates, the longest
+    cycle R_max, the response R_s by eqs 3.2 and 3.3 and on the clock's grid, and whether it fits.
 
-    Of a run in real time: R_s down and up, measured by what each message rests on; the age of commands when the lowest
-    level reads them, and of its statuses when they are read; the response to an operator's hold, from giving it to the
-    end of the cycle that acts on it; missed cycles next to those of `cyclictest` at that rate on those cores; how long
-    plans take; accesses to the bus, and processor time.
+    Of a run in real time: R_s down and up, measured by what each message rests on; the age of
+    commands when the lowest level reads them, and of its statuses when they are read; the response
+    to an operator's hold, from giving it to the end of the cycle that acts on it; missed cycles
+    next to those of `cyclictest` at that rate on those cores; how long plans take; accesses to the
+    bus, and processor time.
 
-    Of a run in lockstep in which every process is killed once: the ticks until the Rack and a neighbour detect it.
+    Of a run in lockstep in which every process is killed once: the ticks until the Rack and a
+    neighbour detect it.
 
-    Of three runs in lockstep of the same motion, if the rack has a config for it (three-poses.toml next to it, or
-    NAME-three-poses.toml): the tracking error, its time, and the time from an operator's hold of the highest level that
-    takes one, and from an emergency stop, until the arm rests.
+    Of three runs in lockstep of the same motion, if the rack has a config for it (three-poses.toml
+    next to it, or NAME-three-poses.toml): the tracking error, its time, and the time from an
+    operator's hold of the highest level that takes one, and from an emergency stop, until the arm
+    rests.
 
     Exit status: 0 all racks ran; 1 a run failed; 2 a bad config.
 
@@ -307,7 +370,11 @@ def systems(
     from rack.tools.lab.benches.systems.bench import measure
     from rack.tools.lab.benches.systems.bench import systems as bundled
 
-    found = show(lambda progress: measure(configs or bundled(), Runs(seconds, 1, share), progress), plot, as_json)
+    found = show(
+        lambda progress: measure(configs or bundled(), Runs(seconds, 1, share), progress),
+        plot,
+        as_json,
+    )
     raise typer.Exit(0 if found.worked else 1)
 
 
@@ -320,12 +387,14 @@ def hand(
 ) -> None:
     """Compare table-driven buffers with interrupt-driven messages, on the same hand.
 
-    The racks hic and condor grasp a can, keep it while it is pulled, and release it, by turns. In real time, then in
-    lockstep, where everything is exact: what the workstation of condor sent in real time enters again.
+    The racks hic and condor grasp a can, keep it while it is pulled, and release it, by turns. In
+    real time, then in lockstep, where everything is exact: what the workstation of condor sent in
+    real time enters again.
 
-    The output shows how far the pulls move the can, the processor time of messages, cycles missed or skipped; and of
-    every link, under the type of its messages: the jitter of arrival, the age of messages when they are read, and how
-    many were lost. Exit status 1 if a rack did not do its task.
+    The output shows how far the pulls move the can, the processor time of messages, cycles missed
+    or skipped; and of every link, under the type of its messages: the jitter of arrival, the age of
+    messages when they are read, and how many were lost. Exit status 1 if a rack did not do its
+    task.
     """
     from rack.tools.lab.benches.hand import measure
 
@@ -335,24 +404,32 @@ def hand(
 
 @bench.command()
 def lan(
-    racks: Annotated[list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; several times")] = None,
+    racks: Annotated[
+        list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; several times")
+    ] = None,
     rate: Rates = None,
     seconds: Seconds = 3.0,
     rounds: Rounds = 1,
-    loss: Annotated[float, typer.Option(metavar="SHARE", min=0, max=0.2, help="share of packets lost")] = 0.0,
+    loss: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=0.2, help="share of packets lost")
+    ] = 0.0,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Measure racks that exchange messages over a network.
 
-    A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: a network namespace
-    (root only). By turns with a rack's network link, with TLS and without: bare UDP, and the DDS `cyclonedds`.
+    A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: a
+    network namespace (root only). By turns with a rack's network link, with TLS and without: bare
+    UDP, and the DDS `cyclonedds`.
 
-    The output shows round trips, ages of messages when a cycle takes them, bytes a second on the coordinator's cable,
-    processor time, and the time to see a cable pulled, plugged in, or a process killed; also messages that never came,
-    and false deaths. All machines share the cores of this one: with many racks these are the limit, not the network.
+    The output shows round trips, ages of messages when a cycle takes them, bytes a second on the
+    coordinator's cable, processor time, and the time to see a cable pulled, plugged in, or a
+    process killed; also messages that never came, and false deaths. All machines share the cores of
+    this one: with many racks these are the limit, not the network.
     """
     from rack.tools.lab.benches.lan import COUNTS, RATES_HZ, LanRuns, measure
 
-    runs = LanRuns(sorted(set(racks or COUNTS)), sorted(set(rate or RATES_HZ)), seconds, rounds, loss)
+    runs = LanRuns(
+        sorted(set(racks or COUNTS)), sorted(set(rate or RATES_HZ)), seconds, rounds, loss
+    )
     show(lambda progress: measure(runs, progress), plot, as_json)

@@ -1,4 +1,5 @@
-"""`rack campaign`: inject random faults of all kinds, and report detection, reaction and recovery."""
+"""`rack campaign`: inject random faults of all kinds, and report detection, reaction and
+recovery."""
 
 from __future__ import annotations
 
@@ -24,12 +25,26 @@ NO_TIME = "no time for the report: 'rack campaign' with --out {} goes on from he
 MOST = 100_000
 """Faults of a kind, kills or sizes of one campaign."""
 
-Injections = Annotated[int, typer.Option("--injections", metavar="N", min=0, max=MOST, help="strikes of each kind")]
-Seed = Annotated[int, typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans")]
-Kinds = Annotated[str | None, typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have")]
-Kills = Annotated[int | None, typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside")]
-LockstepOnly = Annotated[bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")]
-RealtimeOnly = Annotated[bool, typer.Option("--realtime", help="trials in real time only; default: both")]
+Injections = Annotated[
+    int, typer.Option("--injections", metavar="N", min=0, max=MOST, help="strikes of each kind")
+]
+Seed = Annotated[
+    int, typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans")
+]
+Kinds = Annotated[
+    str | None,
+    typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have"),
+]
+Kills = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside"),
+]
+LockstepOnly = Annotated[
+    bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")
+]
+RealtimeOnly = Annotated[
+    bool, typer.Option("--realtime", help="trials in real time only; default: both")
+]
 Faultless = Annotated[
     float | None,
     typer.Option(
@@ -39,18 +54,33 @@ Faultless = Annotated[
         help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
     ),
 ]
-Load = Annotated[bool, typer.Option("--load", help="without faults: only under load, by stress-ng where installed")]
+Load = Annotated[
+    bool,
+    typer.Option("--load", help="without faults: only under load, by stress-ng where installed"),
+]
 Sizes = Annotated[
     int | None,
-    typer.Option(metavar="N", min=0, max=MOST, help=f"sizes on each curve of size against delay; default {SIZES}"),
+    typer.Option(
+        metavar="N",
+        min=0,
+        max=MOST,
+        help=f"sizes on each curve of size against delay; default {SIZES}",
+    ),
 ]
 Seconds = Annotated[
     float | None,
-    typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of a run, for a rack that no task ends"),
+    typer.Option(
+        metavar="S",
+        min=1.0,
+        max=1e9,
+        help="simulated seconds of a run, for a rack that no task ends",
+    ),
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="folder, also to continue a campaign in; default: runs/campaign-<time>"),
+    typer.Option(
+        metavar="DIR", help="folder, also to continue a campaign in; default: runs/campaign-<time>"
+    ),
 ]
 
 
@@ -72,12 +102,13 @@ def campaign(
 ) -> None:
     """Inject random faults of all kinds into runs of a rack, and judge each of them.
 
-    Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one after the other. There
-    are also runs without faults, in real time, alone and under load. The same --out continues an interrupted campaign.
+    Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one
+    after the other. There are also runs without faults, in real time, alone and under load. The
+    same --out continues an interrupted campaign.
 
-    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not found, reacted to and recovered from in
-    time; a limit was violated; something was left behind; a task was neither done nor safely stopped; or a detection
-    had no fault; 2 usage or config error.
+    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not found, reacted to and
+    recovered from in time; a limit was violated; something was left behind; a task was neither done
+    nor safely stopped; or a detection had no fault; 2 usage or config error.
 
     \b
     Examples:
@@ -92,12 +123,20 @@ def campaign(
     from rack.tools.live.folder import folder_of
 
     if lockstep and realtime:
-        raise Failure("--lockstep and --realtime: they exclude each other; give one, or neither for both", 2)
+        raise Failure(
+            "--lockstep and --realtime: they exclude each other; give one, or neither for both", 2
+        )
     if kills is not None and kinds is not None:
-        raise Failure(f"--kills {kills} and --kinds {kinds}: kills from outside are a kind of their own; give one", 2)
+        raise Failure(
+            f"--kills {kills} and --kinds {kinds}: kills from outside are a kind of their own;"
+            " give one",
+            2,
+        )
     found = load_config(config, settings)
     if seconds is None and not any(board.ends_run for board in found.board.values()):
-        raise Failure(f"{config}: no board ends the run: give --seconds, the simulated time of a run", 2)
+        raise Failure(
+            f"{config}: no board ends the run: give --seconds, the simulated time of a run", 2
+        )
     # No faultless time in real time where only lockstep, or only kills, were ordered.
     default_s = 0.0 if lockstep or kills is not None else FAULTLESS_S
     order = Order(
@@ -126,7 +165,8 @@ def campaign(
 
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
-    """Write campaign.json, campaign.md and, unless interrupted, campaign.png; return the first two."""
+    """Write campaign.json, campaign.md and, unless interrupted, campaign.png; return the first
+    two."""
     from rack.tools.faults.campaigns.report import document, markdown
 
     work.folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,5 @@
-"""`rack check`: validate a config, show its inventory, and predict whether its levels meet their cycles."""
+"""`rack check`: validate a config, show its inventory, and predict whether its levels meet their
+cycles."""
 
 from __future__ import annotations
 
@@ -25,7 +26,10 @@ from rack.tools.timing.repair import Repair, repair
 from rack.tools.timing.tables import forecast_lines
 
 From = Annotated[
-    Path | None, typer.Option("--from", metavar="RUN", help="use the budgets measured in this run, not the config's")
+    Path | None,
+    typer.Option(
+        "--from", metavar="RUN", help="use the budgets measured in this run, not the config's"
+    ),
 ]
 Percentile = Annotated[
     float,
@@ -36,12 +40,18 @@ Percentile = Annotated[
         help="with --from: the longest of P in 100 cycles, to leave out cycles stalled by the host",
     ),
 ]
-Fix = Annotated[bool, typer.Option("--fix", help="print only the config, with the cheapest changes that make it fit")]
+Fix = Annotated[
+    bool,
+    typer.Option("--fix", help="print only the config, with the cheapest changes that make it fit"),
+]
 
-Verbose = Annotated[bool, typer.Option("--verbose", help="add what the arm does while it waits for a new torque")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", help="add what the arm does while it waits for a new torque")
+]
 PATIENCE = (
-    "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted: {permitted_ms} ms). "
-    "Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors at full torque put in {energy_j} J"
+    "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
+    " {permitted_ms} ms). Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors"
+    " at full torque put in {energy_j} J"
 )
 
 
@@ -57,22 +67,25 @@ def check(
 ) -> None:
     """Validate a config, show its inventory, and predict its timing.
 
-    It prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per line. On a terminal
-    the tables show as many columns as fit; --json has all.
+    It prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per
+    line. On a terminal the tables show as many columns as fit; --json has all.
 
-    The timing rests on budgets: the longest processor time of each part of a level's cycle. They are in the config, in
-    [board.<name>.budget], or measured, with --from RUN. [timing] has the context switch, the clock's own time, the
-    limit of eq. 3.10, and a goal for the system's response. `rack schema board.budget` and `rack schema timing` show
-    the keys.
+    The timing rests on budgets: the longest processor time of each part of a level's cycle. They
+    are in the config, in [board.<name>.budget], or measured, with --from RUN. [timing] has the
+    context switch, the clock's own time, the limit of eq. 3.10, and a goal for the system's
+    response. `rack schema board.budget` and `rack schema timing` show the keys.
 
-    Equations 3.1 to 3.10 of the paper are applied to every level with a budget: both sides, the margin, and ok or
-    FAILS. Beyond the paper, it computes the worst-case response time of every task, and the load of every core.
+    Equations 3.1 to 3.10 of the paper are applied to every level with a budget: both sides, the
+    margin, and ok or FAILS. Beyond the paper, it computes the worst-case response time of every
+    task, and the load of every core.
 
-    If something fails, it lists changes that help, cheapest first, each tried on the whole rack: another priority or
-    core, a board for the planner, older plans, or a longer cycle, of that board or of one that shares its core. Changes
-    that need a core that this machine lacks come last. --fix prints the config with the first of them.
+    If something fails, it lists changes that help, cheapest first, each tried on the whole rack:
+    another priority or core, a board for the planner, older plans, or a longer cycle, of that board
+    or of one that shares its core. Changes that need a core that this machine lacks come last.
+    --fix prints the config with the first of them.
 
-    Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change helps; 2 a bad config.
+    Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change
+    helps; 2 a bad config.
 
     \b
     Examples:
@@ -98,13 +111,20 @@ def check(
     else:
         width = terminal_width()
         patience = [PATIENCE.format(**found) for found in stock["patience"]] if verbose else []
-        lines = [*inventory_lines(stock, width), *patience, *forecast_lines(forecast, width), "", *fitting.lines()]
+        lines = [
+            *inventory_lines(stock, width),
+            *patience,
+            *forecast_lines(forecast, width),
+            "",
+            *fitting.lines(),
+        ]
         print_wrapped("\n".join(lines))
     sys.exit(0 if forecast.holds else 1)
 
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
-    """Return a config with the budgets measured in a run. Raises `Failure` for a run of another rack."""
+    """Return a config with the budgets measured in a run. Raises `Failure` for a run of another
+    rack."""
     # Only --from needs them, and they take long to load.
     from rack.tools.recording.cycles import measured_budgets
     from rack.tools.recording.recording import Recording
@@ -113,7 +133,11 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     ran = sorted({task.board for task in recording.layout.tasks})
     asked = sorted(config.board)
     if ran != asked:
-        raise Failure(f"{run}: a run of other boards: {', '.join(ran)}; '{config.name}' has {', '.join(asked)}", 2)
+        raise Failure(
+            f"{run}: a run of other boards: {', '.join(ran)}; '{config.name}' has"
+            f" {', '.join(asked)}",
+            2,
+        )
     ran_as = rack_timing(recording.rack_config, recording.layout)
     return with_budgets(config, without_interrupts(ran_as, measured_budgets(recording, percentile)))
 
@@ -132,9 +156,9 @@ def _print_fixed(fitting: Repair, as_json: bool) -> None:
 def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:
     """Return the inventory of a config as plain data; addresses and sizes in bytes.
 
-    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox `delay_ms` the same;
-    `depth` is the number of a mailbox's slots, `size` the bytes of one message, `capacity` the most unread ones in a
-    queue (0: no queue).
+    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox
+    `delay_ms` the same; `depth` is the number of a mailbox's slots, `size` the bytes of one
+    message, `capacity` the most unread ones in a queue (0: no queue).
     """
     places = AddressMap(layout)
     tick_ms = layout.clock_ns * 1e-6
@@ -185,7 +209,8 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
 
 
 def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
-    """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile, joint by joint."""
+    """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile,
+    joint by joint."""
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
         assert config.robot is not None, "it drives one"
         cell = built_cell(config.robot, config.scene, config.clock_ns)
@@ -247,14 +272,21 @@ def _network_lines(network: dict[str, Any] | None, width: int | None) -> Iterato
     rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
     yield from ("", f"network: {'; '.join([*ends, f'works with {peers}', rule])}")
     rows = [
-        [e["entry"], e["way"], e["mailbox"], f"{e['rate_hz']:g}", f"{e['max_age_ms']:g}" if "max_age_ms" in e else ""]
+        [
+            e["entry"],
+            e["way"],
+            e["mailbox"],
+            f"{e['rate_hz']:g}",
+            f"{e['max_age_ms']:g}" if "max_age_ms" in e else "",
+        ]
         for e in network["entries"]
     ]
     yield from table(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows, width)
 
 
 def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
-    """Yield the boards of the host side: they have no rate, and the timing model leaves them out."""
+    """Yield the boards of the host side: they have no rate, and the timing model leaves them
+    out."""
     if hosts:
         rows = [
             [
@@ -287,17 +319,35 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     ]
     head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", *phase, "slice, ms", "trace at"]
     yield ""
-    yield from table(head, [[*clock, *[""] * (len(head) - len(clock))], *rows], width, ("trace at", "slice, ms"))
+    yield from table(
+        head, [[*clock, *[""] * (len(head) - len(clock))], *rows], width, ("trace at", "slice, ms")
+    )
     rows = [
         [
-            *(_hex(m["address"]), m["mailbox"], m["message"], str(m["size"]), str(m["depth"]), _protocol(m)),
+            *(
+                _hex(m["address"]),
+                m["mailbox"],
+                m["message"],
+                str(m["size"]),
+                str(m["depth"]),
+                _protocol(m),
+            ),
             *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
         ]
         for m in found["mailboxes"]
     ]
     yield from _host_lines(found["hosts"], width)
     yield from _network_lines(found["network"], width)
-    head = ["bus address", "mailbox", "message", "bytes", "slots", "protocol", "delay, ms", "written by > read by"]
+    head = [
+        "bus address",
+        "mailbox",
+        "message",
+        "bytes",
+        "slots",
+        "protocol",
+        "delay, ms",
+        "written by > read by",
+    ]
     yield ""
     yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
     yield ""
@@ -307,7 +357,11 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
 
 def _protocol(mailbox: dict[str, Any]) -> str:
     """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
-    return f"{mailbox['protocol']} of {mailbox['capacity']}" if mailbox["capacity"] else str(mailbox["protocol"])
+    return (
+        f"{mailbox['protocol']} of {mailbox['capacity']}"
+        if mailbox["capacity"]
+        else str(mailbox["protocol"])
+    )
 
 
 def _hex(address: int) -> str:

@@ -10,28 +10,52 @@ import typer
 from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json, Timeout, check_timeout
+from rack.tools.console.parameters import (
+    AnyRackName,
+    AskAs,
+    Certificates,
+    Json,
+    Timeout,
+    check_timeout,
+)
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 DONE_AT_ONCE = ("resume", "modify", "table")
 """Commands that leave none in force."""
 
 Level = Annotated[
-    str | None, typer.Argument(metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own")
+    str | None,
+    typer.Argument(
+        metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own"
+    ),
 ]
-What = Annotated[str | None, typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, modify, table or do")]
+What = Annotated[
+    str | None,
+    typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, modify, table or do"),
+]
 Goals = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="GOAL",
-        help="home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify: NAME on|off; for "
-        "table: NAME; for do: the level's command",
+        help=(
+            "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify:"
+            " NAME on|off; for table: NAME; for do: the level's command"
+        ),
     ),
 ]
-Tick = Annotated[int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")]
-At = Annotated[float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")]
-Wait = Annotated[bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")]
-List = Annotated[bool, typer.Option("--list", help="list the levels, the commands each takes, and the one in force")]
+Tick = Annotated[
+    int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")
+]
+At = Annotated[
+    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")
+]
+Wait = Annotated[
+    bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")
+]
+List = Annotated[
+    bool,
+    typer.Option("--list", help="list the levels, the commands each takes, and the one in force"),
+]
 
 
 def command(
@@ -61,11 +85,11 @@ def command(
     table     decide by another state table from now on
     do        do one of the level's own commands, in place of the level above
 
-    All but `modify` and `table` stay in force until `resume`. They survive a restart of the level's board. An emergency
-    stop takes precedence.
+    All but `modify` and `table` stay in force until `resume`. They survive a restart of the level's
+    board. An emergency stop takes precedence.
 
-    Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did not answer in time;
-    2 usage.
+    Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
+    not answer in time; 2 usage.
 
     \b
     Examples:
@@ -93,7 +117,9 @@ def command(
             print_answer(desk.levels(), desk.text(terminal_width()), as_json)
             return
         if level is None or what is None:
-            raise Failure(f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2)
+            raise Failure(
+                f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2
+            )
         given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
         reply = desk.give(given, wait, timeout)
     print_answer(reply.document(), reply.line, as_json)
@@ -110,7 +136,9 @@ def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
     """
     if what == "modify":
         if len(words) != 2 or words[1] not in ("on", "off"):
-            raise Failure(f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2)
+            raise Failure(
+                f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2
+            )
         return {"name": words[0], "on": words[1] == "on"}
     if what in ("table", "do"):
         return {"name": " ".join(words)}
@@ -133,5 +161,8 @@ def _number(text: str, word: str) -> float:
     try:
         return float(text)
     except ValueError:
-        why = f"'{text}' is not a number; permitted: numbers separated by commas, as in joints=0,0.5,1"
+        why = (
+            f"'{text}' is not a number; permitted: numbers separated by commas, as in"
+            " joints=0,0.5,1"
+        )
         raise Failure(f"'{word}': {why}", 2) from None

@@ -14,7 +14,9 @@ from rack.tools.console.address import AT_THE_RACK, OPERATOR, Asker, RackAddress
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json
 
-Reset = Annotated[bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")]
+Reset = Annotated[
+    bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")
+]
 
 OBEY_S = 2.0
 """Longest wait for the clock, which reads the latch every tick."""
@@ -29,10 +31,12 @@ def estop(
 ) -> None:
     """Engage the brakes of the arm at once, and keep them engaged until --reset.
 
-    The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or ACFAIL is asserted.
-    On another machine's rack, HOST/RACK, it may be set by who has the right there, and never reset.
+    The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
+    ACFAIL is asserted. On another machine's rack, HOST/RACK, it may be set by who has the right
+    there, and never reset.
 
-    Exit status: 0 the latch is set, or with --reset clear; 1 the reset was refused, or there is no such rack.
+    Exit status: 0 the latch is set, or with --reset clear; 1 the reset was refused, or there is no
+    such rack.
 
     \b
     Examples:
@@ -47,13 +51,18 @@ def estop(
         tick = _latch(rack, reset)
         own = rack
     where = ", on its own machine" if own != rack else ""
-    state = f"reset at tick {tick}" if reset else f"latched at tick {tick}; to release{where}: rack estop {own} --reset"
+    state = (
+        f"reset at tick {tick}"
+        if reset
+        else f"latched at tick {tick}; to release{where}: rack estop {own} --reset"
+    )
     document = {"rack": own, "emergency_stop": not reset, "tick": tick}
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 
 def _stop_from_afar(address: RackAddress, reset: bool, asker: Asker) -> int:
-    """Set the latch of a rack on another machine; return the tick at which it was set. Raises `Failure`."""
+    """Set the latch of a rack on another machine; return the tick at which it was set. Raises
+    `Failure`."""
     if reset:
         raise Failure(f"rack '{address.rack}' {AT_THE_RACK.format(address.rack)}")
     with needing_zenoh():
@@ -62,7 +71,8 @@ def _stop_from_afar(address: RackAddress, reset: bool, asker: Asker) -> int:
 
 
 def _latch(rack: str, reset: bool) -> int:
-    """Set or clear the latch of a rack on this machine, and wait until the clock has seen it; return its tick."""
+    """Set or clear the latch of a rack on this machine, and wait until the clock has seen it;
+    return its tick."""
     segment = Segment.attach(rack)
     words = segment.words
     lines = UtilityLines(segment)
@@ -76,6 +86,9 @@ def _latch(rack: str, reset: bool) -> int:
     # The demand on the arm follows at the next tick; a lost board may cause a demand, too.
     while (words[System.DEMAND] == Demand.BRAKE) == reset and words[System.STATE] == Run.RUNNING:
         if time.monotonic() > deadline:
-            raise Failure(f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but no tick has followed")
+            raise Failure(
+                f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but no tick has"
+                " followed"
+            )
         time.sleep(0.001)
     return words[System.TICK]

@@ -21,26 +21,43 @@ MANY_SPANS = 10_000
 
 SubjectName = Annotated[
     str,
-    typer.Argument(metavar="CONFIG|RUN", help="config by name or path, or the folder of a run, as in runs/fig2-..."),
+    typer.Argument(
+        metavar="CONFIG|RUN",
+        help="config by name or path, or the folder of a run, as in runs/fig2-...",
+    ),
 ]
-From = Annotated[float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="start of the window, ms")]
-To = Annotated[float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms")]
+From = Annotated[
+    float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="start of the window, ms")
+]
+To = Annotated[
+    float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms")
+]
 Cycles = Annotated[
-    str | None, typer.Option(metavar="A-B", help="instead: the cycles to show, counted from 0, as in 10-12")
+    str | None,
+    typer.Option(metavar="A-B", help="instead: the cycles to show, counted from 0, as in 10-12"),
 ]
 Level = Annotated[
     str | None,
-    typer.Option(metavar="LEVEL", help="level whose cycles count; default: the slowest with a tight planner"),
+    typer.Option(
+        metavar="LEVEL", help="level whose cycles count; default: the slowest with a tight planner"
+    ),
 ]
 Process = Annotated[
     list[str],
-    typer.Option(metavar="LEVEL=MS,MS", help="times of X in the schedule of a level, one a cycle, in turn; repeatable"),
+    typer.Option(
+        metavar="LEVEL=MS,MS",
+        help="times of X in the schedule of a level, one a cycle, in turn; repeatable",
+    ),
 ]
 Figure = Annotated[
-    int | None, typer.Option(metavar="5", help="instead: the paper's figure 5 with the levels of this rack")
+    int | None,
+    typer.Option(metavar="5", help="instead: the paper's figure 5 with the levels of this rack"),
 ]
 Out = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="folder for the pictures; default: the run's, or runs/<rack>-gantt")
+    Path | None,
+    typer.Option(
+        metavar="DIR", help="folder for the pictures; default: the run's, or runs/<rack>-gantt"
+    ),
 ]
 
 
@@ -56,11 +73,13 @@ def gantt(
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a run.
+    """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a
+    run.
 
-    The letters are unit functions: C reads the plan, R reads command and status, X executes, W writes, P plans, U
-    updates the plan. "-" is an idle core, "." a core that another board has. A run is drawn above the schedule of its
-    config. The chart is printed as text, and drawn as PNG and SVG.
+    The letters are unit functions: C reads the plan, R reads command and status, X executes, W
+    writes, P plans, U updates the plan. "-" is an idle core, "." a core that another board has. A
+    run is drawn above the schedule of its config. The chart is printed as text, and drawn as PNG
+    and SVG.
 
     Figures 2 to 4 of the paper are racks of that name.
 
@@ -83,7 +102,9 @@ def gantt(
 
 def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
     if figure != 5:
-        raise Failure(f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2)
+        raise Failure(
+            f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2
+        )
     paths = figure5.save(found.config, _made(found.folder) / "figure5")
     _answer("\n".join(figure5.lines(found.config)), figure5.document(found.config), paths, as_json)
 
@@ -99,4 +120,6 @@ def _made(folder: Path) -> Path:
 
 def _answer(text: str, document: dict[str, Any], pictures: list[Path], as_json: bool) -> None:
     paths = [str(path) for path in pictures]
-    print_answer({**document, "pictures": paths}, f"{text}\n\npictures: {', '.join(paths)}", as_json)
+    print_answer(
+        {**document, "pictures": paths}, f"{text}\n\npictures: {', '.join(paths)}", as_json
+    )

@@ -13,35 +13,55 @@ from rack.tools.console.parameters import Json, Timeout, check_timeout, named
 from rack.tools.console.tables import table, terminal_width
 
 Rack = Annotated[
-    str | None, typer.Argument(metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named)
+    str | None,
+    typer.Argument(
+        metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named
+    ),
 ]
 BoardName = Annotated[
-    str | None, typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock")
+    str | None,
+    typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock"),
 ]
-KindName = Annotated[str | None, typer.Argument(metavar="KIND", help="kind of fault; the kinds are listed below")]
+KindName = Annotated[
+    str | None, typer.Argument(metavar="KIND", help="kind of fault; the kinds are listed below")
+]
 Parameters = Annotated[
-    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05")
+    list[str] | None,
+    typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05"),
 ]
 For = Annotated[
-    str | None, typer.Option("--for", metavar="TIME", help="duration in simulated time, as in 0.5s or 20ms")
+    str | None,
+    typer.Option("--for", metavar="TIME", help="duration in simulated time, as in 0.5s or 20ms"),
 ]
 Cycles = Annotated[str | None, typer.Option(metavar="N", help="duration in cycles of the task")]
 Mailbox = Annotated[
-    str | None, typer.Option(metavar="NAME", help="mailbox to strike; default: all that the task writes")
+    str | None,
+    typer.Option(metavar="NAME", help="mailbox to strike; default: all that the task writes"),
 ]
-Tick = Annotated[str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")]
+Tick = Annotated[
+    str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")
+]
 When = Annotated[
-    str | None, typer.Option(metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"')
+    str | None,
+    typer.Option(
+        metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"'
+    ),
 ]
 Phase = Annotated[
-    str | None, typer.Option(metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1")
+    str | None,
+    typer.Option(
+        metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1"
+    ),
 ]
 Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of its random choices")]
 Wait = Annotated[bool, typer.Option("--wait", help="wait until the fault, or the run, is over")]
 Withdraw = Annotated[
-    int | None, typer.Option(metavar="NO", help="withdraw a fault that still waits; --list shows its number")
+    int | None,
+    typer.Option(metavar="NO", help="withdraw a fault that still waits; --list shows its number"),
 ]
-List = Annotated[bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")]
+List = Annotated[
+    bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")
+]
 
 
 def inject(
@@ -64,11 +84,12 @@ def inject(
 ) -> None:
     """Inject a fault into a running rack.
 
-    It begins at the next tick and lasts to the end of the run, unless --tick, --when, --for or --cycles say otherwise.
-    With --tick or --when the command arms the fault and returns at once; with --wait it returns when the fault is over.
+    It begins at the next tick and lasts to the end of the run, unless --tick, --when, --for or
+    --cycles say otherwise. With --tick or --when the command arms the fault and returns at once;
+    with --wait it returns when the fault is over.
 
-    Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or --timeout has passed;
-    2 usage.
+    Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or
+    --timeout has passed; 2 usage.
 
     \b
     Examples:
@@ -84,7 +105,9 @@ def inject(
         return
     needs_fault = not is_list and withdraw is None
     if rack is None or (needs_fault and (board is None or kind is None)):
-        raise Failure("RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2)
+        raise Failure(
+            "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2
+        )
     check_timeout(timeout, wait)
     from rack.tools.faults.live import LiveRack
 
@@ -95,7 +118,13 @@ def inject(
     if withdraw is not None:
         answer = live.withdraw(withdraw)
     else:
-        given: dict[str, Any] = {"board": board, "kind": kind, "for": lasts, "cycles": cycles, "mailbox": mailbox}
+        given: dict[str, Any] = {
+            "board": board,
+            "kind": kind,
+            "for": lasts,
+            "cycles": cycles,
+            "mailbox": mailbox,
+        }
         given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
         answer = live.inject({**given, **_values(parameters or [])}, wait, timeout)
     print_answer(answer, answer["message"], as_json)
@@ -106,11 +135,14 @@ def _values(parameters: list[str]) -> dict[str, str]:
     for text in parameters:
         if not text.partition("=")[0] or not text.partition("=")[2]:
             raise Failure(f"'{text}': a parameter must be key=value, as in size=0.05", 2)
-    return {key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)}
+    return {
+        key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)
+    }
 
 
 class KindsCommand(TyperCommand):
-    """A command whose help ends with the kinds of faults, which are imported only when it is asked for."""
+    """A command whose help ends with the kinds of faults, which are imported only when it is asked
+    for."""
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
@@ -118,12 +150,18 @@ class KindsCommand(TyperCommand):
 
 
 def kinds_text(width: int | None = None) -> Iterator[str]:
-    """Yield the kinds as a table, and their parameters as another; with a width they fit into it."""
+    """Yield the kinds as a table, and their parameters as another; with a width they fit into
+    it."""
     from rack.boards.faults import KINDS
 
     remarks = {"real time only": "realtime", "strikes once": "once"}
     rows = [
-        [kind.name, kind.means, str(kind.bound), ", ".join(text for text, key in remarks.items() if getattr(kind, key))]
+        [
+            kind.name,
+            kind.means,
+            str(kind.bound),
+            ", ".join(text for text, key in remarks.items() if getattr(kind, key)),
+        ]
         for kind in KINDS
     ]
     yield from table(["kind", "effect", "found within", ""], rows, width)
@@ -153,7 +191,10 @@ def kinds_document() -> list[dict[str, Any]]:
             "seen_as": list(kind.codes),
             "bound": str(kind.bound),
             "parameters": [{key: getattr(p, key) for key in numbers} for p in kind.parameters],
-            **{key: getattr(kind, key) for key in ("realtime", "once", "recoverable", "takes_mailbox")},
+            **{
+                key: getattr(kind, key)
+                for key in ("realtime", "once", "recoverable", "takes_mailbox")
+            },
         }
         for kind in KINDS
     ]

@@ -13,9 +13,15 @@ from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import AskAs, Certificates, Json
 
 Hosts = Annotated[
-    list[str] | None, typer.Argument(metavar="[HOST[:PORT]]...", help="with --lan: where to look; default port: 7447")
+    list[str] | None,
+    typer.Argument(
+        metavar="[HOST[:PORT]]...", help="with --lan: where to look; default port: 7447"
+    ),
 ]
-Lan = Annotated[bool, typer.Option("--lan", help="list the racks at these hosts, and those that racks here know")]
+Lan = Annotated[
+    bool,
+    typer.Option("--lan", help="list the racks at these hosts, and those that racks here know"),
+]
 
 
 def list_racks(
@@ -25,14 +31,15 @@ def list_racks(
     name: AskAs = OPERATOR,
     as_json: Json = False,
 ) -> None:
-    """List the racks on this machine, running or left behind by a killed launcher; with --lan those at other hosts.
+    """List the racks on this machine, running or left behind by a killed launcher; with --lan those
+    at other hosts.
 
-    The states are starting, running and stopped; dead, if the launcher is gone; and foreign, if the shared memory is of
-    another version or user. `rack clean` removes dead racks.
+    The states are starting, running and stopped; dead, if the launcher is gone; and foreign, if the
+    shared memory is of another version or user. `rack clean` removes dead racks.
 
-    With --lan the hosts given are asked, and the endpoints in `listen` and `connect` of the racks on this machine. A
-    rack is shown with its age, and where the racks are that it works with: there, lost, or awaited. It is closed if it
-    does not permit NAME to watch.
+    With --lan the hosts given are asked, and the endpoints in `listen` and `connect` of the racks
+    on this machine. A rack is shown with its age, and where the racks are that it works with:
+    there, lost, or awaited. It is closed if it does not permit NAME to watch.
 
     \b
     Examples:

@@ -24,21 +24,27 @@ from rack.tools.console.interrupt import INTERRUPT, SIGNALS
 from rack.tools.console.parameters import RackName
 
 HostName = Annotated[
-    str | None, typer.Argument(metavar="BOARD", help="external host board; not needed when the rack has one")
+    str | None,
+    typer.Argument(metavar="BOARD", help="external host board; not needed when the rack has one"),
 ]
 Script = Annotated[
-    Path | None, typer.Argument(metavar="SCRIPT", help="Python script to run, in place of a prompt", dir_okay=False)
+    Path | None,
+    typer.Argument(
+        metavar="SCRIPT", help="Python script to run, in place of a prompt", dir_okay=False
+    ),
 ]
 
 
 def prompt(rack: RackName, board: HostName = None, script: Script = None) -> None:
     """Open a Python prompt on the host side of a running rack, or run a script there.
 
-    It takes the place of the program of a host board with `external = true`, one process at a time. `bus` sends and
-    reads messages, `program` is the board's program, which may offer more names. Whatever happens here, the real-time
-    side is not delayed. The prompt can be left and opened again while the rack runs.
+    It takes the place of the program of a host board with `external = true`, one process at a time.
+    `bus` sends and reads messages, `program` is the board's program, which may offer more names.
+    Whatever happens here, the real-time side is not delayed. The prompt can be left and opened
+    again while the rack runs.
 
-    Exit status: 0 prompt closed; 1 there is no such rack, the board is in use, or the script failed; 2 usage.
+    Exit status: 0 prompt closed; 1 there is no such rack, the board is in use, or the script
+    failed; 2 usage.
 
     \b
     Examples:
@@ -63,13 +69,17 @@ def prompt(rack: RackName, board: HostName = None, script: Script = None) -> Non
 
 
 def _wiring(segment: Segment, board: str | None) -> HostWiring:
-    """Return the wiring of the external board. Raises `Failure` if there is none, or a choice of several."""
+    """Return the wiring of the external board. Raises `Failure` if there is none, or a choice of
+    several."""
     found = {host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external}
     names = ", ".join(found) or "none"
     if board is None and len(found) != 1:
         raise Failure(f"BOARD is missing; external host boards of '{segment.rack}': {names}", 2)
     if board is not None and board not in found:
-        raise Failure(f"BOARD = {board}: not an external host board of '{segment.rack}'; permitted: {names}", 2)
+        raise Failure(
+            f"BOARD = {board}: not an external host board of '{segment.rack}'; permitted: {names}",
+            2,
+        )
     return found[board or next(iter(found))]
 
 

@@ -23,13 +23,19 @@ from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 from rack.tools.viewer.sink import FILE, ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>")]
+Out = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
+]
 With = Annotated[
     list[str],
     typer.Option(
         "--with",
         metavar="RACK",
-        help="record this rack as well, on this machine or, by HOST[:PORT]/RACK, on another one; repeatable",
+        help=(
+            "record this rack as well, on this machine or, by HOST[:PORT]/RACK, on another one;"
+            " repeatable"
+        ),
     ),
 ]
 
@@ -45,11 +51,13 @@ def record(
 ) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.
 
-    The recording begins with the two seconds that the rack's rings still hold. `rack report`, `rack analyze` and `rack
-    replay` read it. Recording costs the rack no deadline, and ending it does not end the run.
+    The recording begins with the two seconds that the rack's rings still hold. `rack report`, `rack
+    analyze` and `rack replay` read it. Recording costs the rack no deadline, and ending it does not
+    end the run.
 
-    With others that it works with, each is recorded into its own folder DIR/<rack>. When the runs of all are over,
-    DIR/run.rrd shows them on one time line, that of the first. A rack on another machine has to permit `watch`.
+    With others that it works with, each is recorded into its own folder DIR/<rack>. When the runs
+    of all are over, DIR/run.rrd shows them on one time line, that of the first. A rack on another
+    machine has to permit `watch`.
 
     \b
     Examples:
@@ -59,7 +67,9 @@ def record(
     """
     racks = [rack, *others]
     if others and view:
-        raise Failure("--view, --with: give one of them: the racks have a common time line only in the end", 2)
+        raise Failure(
+            "--view, --with: give one of them: the racks have a common time line only in the end", 2
+        )
     asker = Asker.of(name, certificates)
     with ExitStack() as stack:
         found = [stack.enter_context(watched(each, asker)) for each in racks]
@@ -67,7 +77,9 @@ def record(
         notes = _record_together(found, folder) if others else _record(found[0], folder, view)
     for text in notes:
         print(text, file=sys.stderr)
-    print_answer({"rack": rack, "folder": str(folder), "notes": notes}, f"recorded into {folder}", as_json)
+    print_answer(
+        {"rack": rack, "folder": str(folder), "notes": notes}, f"recorded into {folder}", as_json
+    )
 
 
 def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None = None) -> Recorder:
@@ -84,7 +96,11 @@ def _record(rack: WatchedRack, folder: Path, view: bool) -> list[str]:
     notes: list[str] = []
     port = free_port() if view else None
     # Ctrl-C ends the recording, not the run; leaving the context finishes the files.
-    with INTERRUPT.orderly(), _begin(rack, folder, notes, port) as recorder, INTERRUPT.orderly(recorder.stop):
+    with (
+        INTERRUPT.orderly(),
+        _begin(rack, folder, notes, port) as recorder,
+        INTERRUPT.orderly(recorder.stop),
+    ):
         if port is not None:
             ViewerWindow(url(port))
         recorder.follow()
@@ -92,7 +108,8 @@ def _record(rack: WatchedRack, folder: Path, view: bool) -> list[str]:
 
 
 def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:
-    """Record each rack into its folder, then all of them into one file; return messages for the user."""
+    """Record each rack into its folder, then all of them into one file; return messages for the
+    user."""
     notes: list[str] = []
     names = [rack.segment.layout.rack for rack in racks]
     if twice := [name for at, name in enumerate(names) if name in names[:at]]:
@@ -109,7 +126,9 @@ def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:
         try:
             return [*notes, *merge(folders, folder / FILE)]
         except Failure as failure:
-            raise Failure(f"recorded into {', '.join(map(str, folders))}; not on one time line: {failure}") from None
+            raise Failure(
+                f"recorded into {', '.join(map(str, folders))}; not on one time line: {failure}"
+            ) from None
 
 
 def _follow(recorders: Sequence[Recorder], unfinished: str) -> None:

@@ -20,21 +20,29 @@ from rack.tools.viewer.window import ViewerWindow, has_screen
 
 Runs = Annotated[
     list[Path],
-    typer.Argument(metavar="RUN...", help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack"),
+    typer.Argument(
+        metavar="RUN...",
+        help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack",
+    ),
 ]
 Out = Annotated[
-    Path | None, typer.Option(metavar="FILE.rrd", help="make the viewer's file from what is recorded, and open nothing")
+    Path | None,
+    typer.Option(
+        metavar="FILE.rrd", help="make the viewer's file from what is recorded, and open nothing"
+    ),
 ]
 
 
 def replay(runs: Runs, out: Out = None) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 
-    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a run.rrd.
+    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a
+    run.rrd.
 
-    Of several racks that ran together, give the folder of each: they are shown at once, each under its name, on the
-    time line of the first. Their clocks are compared by what the racks recorded of each other; how uncertain that is
-    stands in the log. Recordings that did not run together are refused.
+    Of several racks that ran together, give the folder of each: they are shown at once, each under
+    its name, on the time line of the first. Their clocks are compared by what the racks recorded of
+    each other; how uncertain that is stands in the log. Recordings that did not run together are
+    refused.
 
     \b
     Examples:
@@ -55,7 +63,9 @@ def replay(runs: Runs, out: Out = None) -> None:
             _make(parts, Path(folder, "run.rrd"))
             _show(Path(folder, "run.rrd"))
     else:
-        raise Failure("no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd saves it for one")
+        raise Failure(
+            "no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd saves it for one"
+        )
 
 
 def _own(run: Path) -> list[Path]:
@@ -66,7 +76,9 @@ def _own(run: Path) -> list[Path]:
 
 def _parts(run: Path) -> list[Path]:
     """Return the runs in a folder that `rack record --with` has made; of any other, itself."""
-    parts = [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
+    parts = (
+        [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
+    )
     return parts or [run]
 
 
@@ -77,7 +89,9 @@ def _show(*recordings: Path) -> None:
 
 def _make(runs: Sequence[Path], out: Path) -> None:
     if out.suffix != ".rrd":
-        raise Failure(f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2)
+        raise Failure(
+            f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2
+        )
     if out.exists():
         raise Failure(f"--out {out}: exists already", 2)
     for note in merge(runs, out):
@@ -85,13 +99,17 @@ def _make(runs: Sequence[Path], out: Path) -> None:
 
 
 def merge(runs: Sequence[Path], out: Path) -> list[str]:
-    """Write the viewer's file of runs that were recorded together; return what a user should know of their times.
+    """Write the viewer's file of runs that were recorded together; return what a user should know
+    of their times.
 
     Raises `Failure` if they cannot be read, or did not run together.
     """
     for run in runs:
         if not run.is_dir():
-            raise Failure(f"{run}: no such folder" if not run.exists() else f"{run}: not the folder of a run", 2)
+            raise Failure(
+                f"{run}: no such folder" if not run.exists() else f"{run}: not the folder of a run",
+                2,
+            )
     placed = on_one_time_line([Recording(run) for run in runs])
     notes = [place.note for place in placed[1:]]
     # It takes half a second to import.

@@ -1,4 +1,5 @@
-"""`rack reproduce`: the paper, section by section, next to predictions and measurements of this machine."""
+"""`rack reproduce`: the paper, section by section, next to predictions and measurements of this
+machine."""
 
 from __future__ import annotations
 
@@ -14,18 +15,30 @@ from rack.tools.console.parameters import Json
 from rack.tools.live.folder import RUNS
 
 PAGE = RUNS / "paper"
-"""Where the page is made unless a folder is given: always the same one, so that the command continues."""
+"""Where the page is made unless a folder is given: always the same one, so that the command
+continues."""
 STAYS = "{}: what is finished is kept; the same command goes on from there"
 
-Out = Annotated[Path, typer.Option(metavar="DIR", help="folder of the page; one that exists is continued")]
+Out = Annotated[
+    Path, typer.Option(metavar="DIR", help="folder of the page; one that exists is continued")
+]
 Only = Annotated[
-    list[str], typer.Option("--only", metavar="SECTION", help='only this section, as in 3.4 or "abstract"; repeatable')
+    list[str],
+    typer.Option(
+        "--only", metavar="SECTION", help='only this section, as in 3.4 or "abstract"; repeatable'
+    ),
 ]
 Again = Annotated[
-    bool, typer.Option("--again", help="repeat finished experiments: of the sections of --only, or of all")
+    bool,
+    typer.Option(
+        "--again", help="repeat finished experiments: of the sections of --only, or of all"
+    ),
 ]
 Share = Annotated[
-    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: figures suffer")
+    bool,
+    typer.Option(
+        "--share", help="run even on cores held by another rack's real-time boards: figures suffer"
+    ),
 ]
 
 
@@ -38,16 +51,18 @@ def reproduce(
 ) -> None:
     """Reproduce the paper on this machine, and write a page that goes through it claim by claim.
 
-    The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is given in its words, with the prediction of
-    the timing model, a measurement on real processes with its picture, and a ruling: it holds; it holds here, within
-    bounds; the paper contradicts itself; it is not testable here; or it does not hold here.
+    The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is given in its words, with
+    the prediction of the timing model, a measurement on real processes with its picture, and a
+    ruling: it holds; it holds here, within bounds; the paper contradicts itself; it is not testable
+    here; or it does not hold here.
 
-    The page is DIR/index.html, self-contained, and DIR/README.md with its pictures next to it. DIR/paper.json has
-    everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and `rack analyze` read them.
+    The page is DIR/index.html, self-contained, and DIR/README.md with its pictures next to it.
+    DIR/paper.json has everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and
+    `rack analyze` read them.
 
-    It takes about six minutes on two cores. Do not use the machine meanwhile: real-time figures suffer. What is
-    finished is kept, also if the command is interrupted or killed: given again, it continues. A change of configs,
-    program or machine makes the experiments anew that depend on it.
+    It takes about six minutes on two cores. Do not use the machine meanwhile: real-time figures
+    suffer. What is finished is kept, also if the command is interrupted or killed: given again, it
+    continues. A change of configs, program or machine makes the experiments anew that depend on it.
 
     Exit status: 0 every experiment was made, and no claim failed; 1 otherwise; 2 usage error.
 
@@ -67,8 +82,13 @@ def reproduce(
         raise Failure(f"--out {out}: exists, and is not a folder", 2)
     if again:
         reproduction.forget(wanted, out)
-    with INTERRUPT.orderly(INTERRUPT.end, unfinished=STAYS.format(out)), progress_for(as_json) as progress:
+    with (
+        INTERRUPT.orderly(INTERRUPT.end, unfinished=STAYS.format(out)),
+        progress_for(as_json) as progress,
+    ):
         page = reproduction.reproduce(wanted, Workshop(out, share), progress)
     is_good = reproduction.worked(page, wanted)
-    print_answer(reproduction.document(page, out, is_good), reproduction.summary(page, out), as_json)
+    print_answer(
+        reproduction.document(page, out, is_good), reproduction.summary(page, out), as_json
+    )
     sys.exit(0 if is_good else 1)

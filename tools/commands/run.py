@@ -21,30 +21,52 @@ if TYPE_CHECKING:
     from rack.tools.live.launch import RunResult
 
 Lockstep = Annotated[
-    bool, typer.Option("--lockstep", help="start a tick only when every due task has finished: exact and repeatable")
+    bool,
+    typer.Option(
+        "--lockstep",
+        help="start a tick only when every due task has finished: exact and repeatable",
+    ),
 ]
 Seconds = Annotated[
     float | None,
-    typer.Option(metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"),
+    typer.Option(
+        metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"
+    ),
 ]
-Speed = Annotated[float | None, typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5")]
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")]
+Speed = Annotated[
+    float | None, typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5")
+]
+Out = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")
+]
 Share = Annotated[
-    bool, typer.Option("--share", help="run even on cores held by another rack's real-time boards: both will be late")
+    bool,
+    typer.Option(
+        "--share",
+        help="run even on cores held by another rack's real-time boards: both will be late",
+    ),
 ]
 Step = Annotated[
-    bool, typer.Option("--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on")
+    bool,
+    typer.Option(
+        "--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on"
+    ),
 ]
 FromRun = Annotated[
     Path | None,
     typer.Option(
         "--entries",
         metavar="RUN",
-        help="start no host boards: what they sent in this recorded run enters again, at the same ticks; for runs in "
-        "real time, or with a prompt: other runs repeat in lockstep by themselves",
+        help=(
+            "start no host boards: what they sent in this recorded run enters again, at the same"
+            " ticks; for runs in real time, or with a prompt: other runs repeat in lockstep by"
+            " themselves"
+        ),
     ),
 ]
-NoRecord = Annotated[bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")]
+NoRecord = Annotated[
+    bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")
+]
 
 
 def run(
@@ -65,13 +87,14 @@ def run(
 ) -> None:
     """Run a rack until its task ends, and report on the run.
 
-    On a terminal a live table shows every task and what holds the rack; elsewhere one line a second is printed. --json
-    prints the report as one document. With --no-record it has the same keys; those that need a recording are null.
+    On a terminal a live table shows every task and what holds the rack; elsewhere one line a second
+    is printed. --json prints the report as one document. With --no-record it has the same keys;
+    those that need a recording are null.
 
-    Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no fault is latched,
-    and the recording is complete. 1 otherwise, also if brakes or a level held the rack for over 5 s, or brakes for half
-    of the run, without a cause in sight. 2 usage or config error. A full disk ends the run. Ctrl-C ends it in order,
-    with a report and exit status 130.
+    Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
+    fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
+    rack for over 5 s, or brakes for half of the run, without a cause in sight. 2 usage or config
+    error. A full disk ends the run. Ctrl-C ends it in order, with a report and exit status 130.
 
     \b
     Examples:
@@ -83,7 +106,9 @@ def run(
       rack run ibm --lockstep --entries runs/ibm-20250101-120000
     """
     if view and no_record:
-        raise Failure("--view and --no-record: the viewer shows what the recorder takes; leave one out", 2)
+        raise Failure(
+            "--view and --no-record: the viewer shows what the recorder takes; leave one out", 2
+        )
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
@@ -101,12 +126,21 @@ def run(
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
-    # From the start of the run to the end of its report; during the launch a signal ends the command at once.
+    # From the start of the run to the end of its report; during the launch a signal ends the
+    # command at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
         with display_for(silent=as_json) as display:
             again = None if entries is None else recorded_entries(found, entries)
             result = run_rack(
-                found, seconds, folder, display, view=view, share=share, crate=crate, step=step, entries=again
+                found,
+                seconds,
+                folder,
+                display,
+                view=view,
+                share=share,
+                crate=crate,
+                step=step,
+                entries=again,
             )
         _report(found, folder, result, as_json)
     if not result.worked:
@@ -116,10 +150,15 @@ def run(
 
 
 def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
-    """Let the crate load the levels that a config names, while this process imports what checks the config."""
+    """Let the crate load the levels that a config names, while this process imports what checks the
+    config."""
     if crate is not None:
         own = tables.get("python_path")
-        crate.send(Preload(named_classes(tables), (*sys.path, *map(str, own if isinstance(own, list) else []))))
+        crate.send(
+            Preload(
+                named_classes(tables), (*sys.path, *map(str, own if isinstance(own, list) else []))
+            )
+        )
     return crate
 
 

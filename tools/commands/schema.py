@@ -19,12 +19,18 @@ DROPPED = ("default", "permitted", "type")
 """Columns that a narrow terminal leaves out, in this order."""
 
 TableName = Annotated[
-    str | None, typer.Argument(metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params")
+    str | None,
+    typer.Argument(
+        metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params"
+    ),
 ]
 Of = Annotated[
     str,
     typer.Option(
-        "--config", metavar="CONFIG", help="config whose levels declare [task] and params", autocompletion=config_names
+        "--config",
+        metavar="CONFIG",
+        help="config whose levels declare [task] and params",
+        autocompletion=config_names,
     ),
 ]
 
@@ -32,8 +38,8 @@ Of = Annotated[
 def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False) -> None:
     """Show the keys of a config: type, unit, permitted values, default and meaning.
 
-    Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are those of the boards
-    in CONFIG. A part of a name shows all tables that begin with it.
+    Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are
+    those of the boards in CONFIG. A part of a name shows all tables that begin with it.
 
     \b
     Examples:
@@ -50,7 +56,9 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
         found = key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    print_answer([asdict(entry) for entry in found], _names(found) if name is None else _keys(found), as_json)
+    print_answer(
+        [asdict(entry) for entry in found], _names(found) if name is None else _keys(found), as_json
+    )
 
 
 def _names(found: list[KeyTable]) -> Iterator[str]:

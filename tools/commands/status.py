@@ -14,7 +14,10 @@ OnlyRack = Annotated[
     str | None,
     typer.Argument(
         metavar="RACK",
-        help="running rack by name; not needed when only one is running; on another machine: HOST[:PORT]/RACK",
+        help=(
+            "running rack by name; not needed when only one is running; on another machine:"
+            " HOST[:PORT]/RACK"
+        ),
         autocompletion=rack_names,
         callback=named,
     ),
@@ -22,14 +25,18 @@ OnlyRack = Annotated[
 
 
 def status(
-    rack: OnlyRack = None, certificates: Certificates = "", name: AskAs = OPERATOR, as_json: Json = False
+    rack: OnlyRack = None,
+    certificates: Certificates = "",
+    name: AskAs = OPERATOR,
+    as_json: Json = False,
 ) -> None:
     """Show a running rack once: every task, its faults, what holds it, and its progress.
 
-    Each task has a line with its cycles, misses, longest times and state. A hold is shown with its time, its reason,
-    and the command that releases it.
+    Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
+    time, its reason, and the command that releases it.
 
-    Exit status: 0 it was shown; 1 there is no such rack; 2 RACK is missing and several racks are running.
+    Exit status: 0 it was shown; 1 there is no such rack; 2 RACK is missing and several racks are
+    running.
 
     \b
     Examples:

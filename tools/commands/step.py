@@ -1,4 +1,5 @@
-"""`rack step`: let a rack in lockstep go on by single ticks or cycles, and show what its levels did."""
+"""`rack step`: let a rack in lockstep go on by single ticks or cycles, and show what its levels
+did."""
 
 from __future__ import annotations
 
@@ -17,10 +18,18 @@ from rack.tools.console.parameters import Json, RackName
 LOOK_S = 0.001
 
 Cycles = Annotated[
-    int | None, typer.Option(metavar="N", min=1, max=1_000_000, help="cycles of the slowest level, or of --until")
+    int | None,
+    typer.Option(
+        metavar="N", min=1, max=1_000_000, help="cycles of the slowest level, or of --until"
+    ),
 ]
-Ticks = Annotated[int | None, typer.Option(metavar="N", min=1, max=10**9, help="ticks of the clock, instead of cycles")]
-Until = Annotated[str | None, typer.Option(metavar="LEVEL", help="hold after the next cycle of this level")]
+Ticks = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=10**9, help="ticks of the clock, instead of cycles"),
+]
+Until = Annotated[
+    str | None, typer.Option(metavar="LEVEL", help="hold after the next cycle of this level")
+]
 LetGo = Annotated[bool, typer.Option("--run", help="let the rack run on without steps")]
 
 
@@ -32,12 +41,15 @@ def step(
     run: LetGo = False,
     as_json: Json = False,
 ) -> None:
-    """Let a rack in lockstep go on by single cycles, and show each level's state, and the row of its state table.
+    """Let a rack in lockstep go on by single cycles, and show each level's state, and the row of
+    its state table.
 
-    Start the rack with 'rack run CONFIG --lockstep --step': it holds before tick 0. A rack that runs in lockstep is
-    held by its first step. Without options it goes on until every level has done one more cycle.
+    Start the rack with 'rack run CONFIG --lockstep --step': it holds before tick 0. A rack that
+    runs in lockstep is held by its first step. Without options it goes on until every level has
+    done one more cycle.
 
-    Exit status: 0 the steps are done; 1 there is no such rack, it is not in lockstep, or its run ended; 2 usage.
+    Exit status: 0 the steps are done; 1 there is no such rack, it is not in lockstep, or its run
+    ended; 2 usage.
 
     \b
     Examples:
@@ -48,7 +60,9 @@ def step(
       rack step nist-state-table --run
     """
     if ticks is not None and (cycles is not None or until is not None):
-        raise Failure("--ticks counts ticks, --cycles and --until count cycles; give one of them", 2)
+        raise Failure(
+            "--ticks counts ticks, --cycles and --until count cycles; give one of them", 2
+        )
     if run and any(given is not None for given in (cycles, ticks, until)):
         raise Failure("--run lets the rack run on; leave out the steps", 2)
     stepper = Stepper(rack)
@@ -73,7 +87,12 @@ class Stepped:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return {"rack": self.rack, "tick": self.tick, "time_s": self.time_s, "levels": list(self.levels)}
+        return {
+            "rack": self.rack,
+            "tick": self.tick,
+            "time_s": self.time_s,
+            "levels": list(self.levels),
+        }
 
     def text(self) -> str:
         """Return the same as readable text."""
@@ -81,11 +100,14 @@ class Stepped:
 
         rows = [list(level.values()) for level in self.levels]
         lines = table(["level", "state", "row", "reason"], rows, terminal_width())
-        return "\n".join([f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s", *lines])
+        return "\n".join(
+            [f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s", *lines]
+        )
 
 
 class Stepper:
-    """Steps one rack. Raises `SegmentError` when there is no such rack, `Failure` when it is not in lockstep."""
+    """Steps one rack. Raises `SegmentError` when there is no such rack, `Failure` when it is not in
+    lockstep."""
 
     def __init__(self, rack: str) -> None:
         self._segment = Segment.attach(rack)
@@ -110,14 +132,19 @@ class Stepper:
         self._await_hold(tick)
 
     def after_cycles(self, at: int, cycles: int, level: str | None) -> int:
-        """Return the tick after the release of the last of `cycles` of a level, or of the slowest level.
+        """Return the tick after the release of the last of `cycles` of a level, or of the slowest
+        level.
 
         Raises `Failure` for an unknown level.
         """
         executors = {task.name: task for task in self._executors()}
         if level is not None and level not in executors:
             raise Failure(f"--until {level}: no such level; levels: {', '.join(executors)}", 2)
-        task = executors[level] if level is not None else max(executors.values(), key=lambda task: task.every)
+        task = (
+            executors[level]
+            if level is not None
+            else max(executors.values(), key=lambda task: task.every)
+        )
         return task.grid.since(at) + (cycles - 1) * task.every + 1
 
     def look(self) -> Stepped:
@@ -127,7 +154,10 @@ class Stepper:
         found = RackMonitor(self._segment).look()
         executors = {task.name for task in self._executors()}
         rows = [row for row in found.tasks if row.task in executors]
-        levels = [{"level": row.task, "state": row.state, "row": row.row, "reason": row.reason} for row in rows]
+        levels = [
+            {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
+            for row in rows
+        ]
         tick = self._words[System.HELD] - 1
         return Stepped(found.rack, tick, tick * self._segment.layout.clock_ns * 1e-9, tuple(levels))
 
@@ -138,6 +168,8 @@ class Stepper:
         """Wait until the rack holds before `tick` or a later one; return which."""
         while (held := self._words[System.HELD] - 1) < tick:
             if self._segment.run_is_over:
-                raise Failure(f"rack '{self._segment.rack}': its run ended at tick {self._words[System.TICK]}")
+                raise Failure(
+                    f"rack '{self._segment.rack}': its run ended at tick {self._words[System.TICK]}"
+                )
             time.sleep(LOOK_S)
         return held

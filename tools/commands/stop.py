@@ -13,7 +13,9 @@ from rack.backplane.words import Head, System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 
-Wait = Annotated[float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")]
+Wait = Annotated[
+    float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")
+]
 
 
 def stop(rack: RackName, wait: Wait = 10.0, as_json: Json = False) -> None:
@@ -29,12 +31,15 @@ def stop(rack: RackName, wait: Wait = 10.0, as_json: Json = False) -> None:
       rack stop nasrem --wait 30
     """
     if not stop_rack(rack, wait):
-        raise Failure(f"rack '{rack}' has not ended within {wait:g} s; its launcher is still running")
+        raise Failure(
+            f"rack '{rack}' has not ended within {wait:g} s; its launcher is still running"
+        )
     print_answer({"rack": rack, "stopped": True}, f"rack '{rack}' has ended", as_json)
 
 
 def stop_rack(rack: str, timeout_s: float) -> bool:
-    """Request a rack's end and wait for its launcher to end; return False if it still runs after `timeout_s`.
+    """Request a rack's end and wait for its launcher to end; return False if it still runs after
+    `timeout_s`.
 
     Raises `SegmentError` when there is no such rack.
     """

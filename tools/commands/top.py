@@ -15,8 +15,8 @@ LOOK_S = 0.2
 def top(rack: AnyRackName, certificates: Certificates = "", name: AskAs = OPERATOR) -> None:
     """Watch a running rack until its run is over, or until Ctrl-C.
 
-    On a terminal the table of `rack status` changes in place; elsewhere one line a second is printed. Watching costs
-    the rack no deadline, and ending it does not end the run.
+    On a terminal the table of `rack status` changes in place; elsewhere one line a second is
+    printed. Watching costs the rack no deadline, and ending it does not end the run.
 
     \b
     Examples:

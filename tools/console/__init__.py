@@ -1,1 +1,2 @@
-"""Shared by all commands: arguments, answers, tables, progress, signals. Nothing here knows of runs."""
+"""Shared by all commands: arguments, answers, tables, progress, signals. Nothing here knows of
+runs."""

@@ -23,7 +23,8 @@ _HOST = r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?"
 
 
 class Asker(NamedTuple):
-    """Who asks: a name as in `[adapter.lan.permit]`, and the folder with its certificates; empty: none."""
+    """Who asks: a name as in `[adapter.lan.permit]`, and the folder with its certificates; empty:
+    none."""
 
     name: str = OPERATOR
     certificates: str = ""
@@ -37,7 +38,11 @@ class Asker(NamedTuple):
     def of(cls, name: str, certificates: str) -> Asker:
         """Return who asks by the options of a command. Raises `Failure`."""
         if re.fullmatch(_NAME, name) is None:
-            raise Failure(f'--as = "{name}": not a name; permitted: small letters, digits, "-" and "_", at most 40', 2)
+            raise Failure(
+                f'--as = "{name}": not a name; permitted: small letters, digits, "-" and "_", at'
+                " most 40",
+                2,
+            )
         if certificates and not Path(certificates).is_dir():
             raise Failure(f"--certificates = {certificates}: not a folder", 2)
         return cls(name, certificates)
@@ -54,12 +59,17 @@ class HostAddress(NamedTuple):
         """Return the address in a text. Raises `Failure`."""
         found = re.fullmatch(_HOST, text)
         if found is None or not 0 < int(found[2] or PORT) < 1 << 16:
-            raise Failure(f'HOST = "{text}": not a host; permitted: a name or address, as in 10.0.0.5 or cell:7447', 2)
+            raise Failure(
+                f'HOST = "{text}": not a host; permitted: a name or address, as in 10.0.0.5 or'
+                " cell:7447",
+                2,
+            )
         return cls(found[1], int(found[2] or PORT))
 
     @classmethod
     def of_endpoint(cls, endpoint: str) -> HostAddress:
-        """Return the address of an endpoint of a config; of one that stands for all addresses, this machine's."""
+        """Return the address of an endpoint of a config; of one that stands for all addresses, this
+        machine's."""
         host, _, port = endpoint.partition("/")[2].rpartition(":")
         return cls(EVERYWHERE.get(host, host), int(port))
 
@@ -78,7 +88,10 @@ class RackAddress(NamedTuple):
         """Return the address in HOST[:PORT]/RACK. Raises `Failure`."""
         host, _, rack = text.partition("/")
         if re.fullmatch(_NAME, rack) is None:
-            raise Failure(f'RACK = "{text}": not a rack; permitted: RACK, or HOST/RACK, as in 10.0.0.5/cell', 2)
+            raise Failure(
+                f'RACK = "{text}": not a rack; permitted: RACK, or HOST/RACK, as in 10.0.0.5/cell',
+                2,
+            )
         return cls(HostAddress.of(host), rack)
 
     def __str__(self) -> str:
@@ -93,4 +106,6 @@ def needing_zenoh() -> Iterator[None]:
     except ImportError as error:
         if error.name != "zenoh":
             raise
-        raise Failure("racks on other machines need eclipse-zenoh: pip install nasrem-rack[lan]") from None
+        raise Failure(
+            "racks on other machines need eclipse-zenoh: pip install nasrem-rack[lan]"
+        ) from None

@@ -14,7 +14,8 @@ MAX_LINE = 1300
 
 
 class Failure(Exception):
-    """A command that did not work. The message is one line for the user, `status` the exit status."""
+    """A command that did not work. The message is one line for the user, `status` the exit
+    status."""
 
     def __init__(self, reason: str, status: int = 1) -> None:
         super().__init__(reason)
@@ -32,7 +33,8 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
 
 
 def fail(reason: str, status: int) -> NoReturn:
-    """End the command: print the reason on stderr and, with --json, as a JSON document on stdout."""
+    """End the command: print the reason on stderr and, with --json, as a JSON document on
+    stdout."""
     lines = [
         line if line.isprintable() and len(line) <= MAX_LINE else one_line(line, MAX_LINE)
         for line in reason.splitlines()

@@ -1,8 +1,10 @@
-"""SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal, and nothing left behind.
+"""SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal, and nothing
+left behind.
 
-A command with nothing to finish ends inside the signal handler. Python's own way, an exception raised there, was
-rejected: it may strike after a segment is created and before its owner is recorded, and libraries turn it into errors
-of their own while they are being imported. A command with something to finish uses `orderly`, and gets BOUND_S.
+A command with nothing to finish ends inside the signal handler. Python's own way, an exception
+raised there, was rejected: it may strike after a segment is created and before its owner is
+recorded, and libraries turn it into errors of their own while they are being imported. A command
+with something to finish uses `orderly`, and gets BOUND_S.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ class Interrupt:
         return signal.Signals(self.number).name if self.number else ""
 
     def catch(self) -> None:
-        """Handle the signals. Until then they kill the process, with the same exit status for a shell."""
+        """Handle the signals. Until then they kill the process, with the same exit status for a
+        shell."""
         for number in SIGNALS:
             # Under nohup a command outlives its terminal.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
@@ -60,11 +63,16 @@ class Interrupt:
 
     @contextmanager
     def orderly(
-        self, stop: Callable[[], object] = lambda: None, unfinished: str = "", bound_s: float = BOUND_S
+        self,
+        stop: Callable[[], object] = lambda: None,
+        unfinished: str = "",
+        bound_s: float = BOUND_S,
     ) -> Iterator[None]:
-        """In this context the first signal calls `stop`, in its handler; the command then ends by itself.
+        """In this context the first signal calls `stop`, in its handler; the command then ends by
+        itself.
 
-        It has `bound_s` for that; otherwise `unfinished` is printed, which says what the user can do.
+        It has `bound_s` for that; otherwise `unfinished` is printed, which says what the user can
+        do.
         """
         self._ways.append(_Way(stop, unfinished, bound_s))
         try:
@@ -79,11 +87,13 @@ class Interrupt:
         return self.orderly(self.end)
 
     def raising(self) -> AbstractContextManager[None]:
-        """In this context the first signal raises `Interrupted`: for waits, and where contexts clean up files."""
+        """In this context the first signal raises `Interrupted`: for waits, and where contexts
+        clean up files."""
         return self.orderly(_interrupted)
 
     def settle(self) -> None:
-        """End the process with the signal's exit status, if one was received. Call it when the command has finished."""
+        """End the process with the signal's exit status, if one was received. Call it when the
+        command has finished."""
         if self.number:
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):
@@ -138,7 +148,8 @@ def _leave_terminal() -> None:
 
 
 def _kill(family: list[int]) -> None:
-    """Kill every descendant in this session and wait for it; a viewer window has its own session and stays."""
+    """Kill every descendant in this session and wait for it; a viewer window has its own session
+    and stays."""
     ends = select.poll()
     left = 0
     for pid in family:
@@ -154,7 +165,8 @@ def _kill(family: list[int]) -> None:
 
 
 def descendants(pid: int, session: int | None = None) -> Iterator[int]:
-    """Yield the processes that descend from one, the youngest generation first; with a `session`, only those in it."""
+    """Yield the processes that descend from one, the youngest generation first; with a `session`,
+    only those in it."""
     # A process that ends meanwhile leaves nothing to read.
     children: list[int] = []
     with suppress(OSError):
@@ -168,7 +180,8 @@ def descendants(pid: int, session: int | None = None) -> Iterator[int]:
 
 
 def _remove_racks(killed: list[int]) -> None:
-    # Looked up, not imported: in a handler a module may be half imported. Not loaded, it has made no racks.
+    # Looked up, not imported: in a handler a module may be half imported. Not loaded, it has made
+    # no racks.
     remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own", None)
     if remove_own is not None:
         remove_own(killed=killed)

@@ -1,7 +1,7 @@
 """Arguments and options that several commands have.
 
-They are apart from the answers of commands because typer takes as long to import as numpy: what needs no parser does
-without it.
+They are apart from the answers of commands because typer takes as long to import as numpy: what
+needs no parser does without it.
 """
 
 from __future__ import annotations
@@ -38,21 +38,33 @@ def check_timeout(timeout: float | None, wait: bool) -> None:
 def named(rack: str | None) -> str | None:
     """Return the name of a rack, or HOST/RACK. Raises `Failure` when it is empty."""
     if rack == "":
-        raise Failure('RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2)
+        raise Failure(
+            'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2
+        )
     return rack
 
 
 def named_here(rack: str | None) -> str | None:
-    """Return the name of a rack on this machine. Raises `Failure` for one on another, where this command is needed."""
+    """Return the name of a rack on this machine. Raises `Failure` for one on another, where this
+    command is needed."""
     if rack is not None and "/" in rack:
         from_afar = "permitted from afar: list --lan, status, top, command, estop"
-        raise Failure(f"RACK = {rack}: this command works on the rack's own machine alone; {from_afar}", 2)
+        raise Failure(
+            f"RACK = {rack}: this command works on the rack's own machine alone; {from_afar}", 2
+        )
     return named(rack)
 
 
-Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")]
+Json = Annotated[
+    bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")
+]
 ConfigName = Annotated[
-    str, typer.Argument(metavar="CONFIG", help="config by name, or path to a .toml file", autocompletion=config_names)
+    str,
+    typer.Argument(
+        metavar="CONFIG",
+        help="config by name, or path to a .toml file",
+        autocompletion=config_names,
+    ),
 ]
 RackName = Annotated[
     str,
@@ -85,18 +97,33 @@ Certificates = Annotated[
 AskAs = Annotated[
     str,
     typer.Option(
-        "--as", metavar="NAME", help="for HOST/RACK: name under which to ask, as in adapter.lan.permit of that rack"
+        "--as",
+        metavar="NAME",
+        help="for HOST/RACK: name under which to ask, as in adapter.lan.permit of that rack",
     ),
 ]
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")]
+RunFolder = Annotated[
+    Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")
+]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 Timeout = Annotated[
     float | None,
-    typer.Option(metavar="S", min=0.0, max=1e9, help="with --wait: give up after S seconds of wall-clock time"),
+    typer.Option(
+        metavar="S",
+        min=0.0,
+        max=1e9,
+        help="with --wait: give up after S seconds of wall-clock time",
+    ),
 ]
 Settings = Annotated[
-    list[str], typer.Option("--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable")
+    list[str],
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="override one value, as in clock.speed=2; repeatable"
+    ),
 ]
 Faults = Annotated[
-    str | None, typer.Option(metavar="FILE", help="fault script, by name or path; added to the config's own faults")
+    str | None,
+    typer.Option(
+        metavar="FILE", help="fault script, by name or path; added to the config's own faults"
+    ),
 ]

@@ -1,4 +1,5 @@
-"""Pictures by matplotlib, as PNG and SVG. It takes a second to import: only what draws may import it."""
+"""Pictures by matplotlib, as PNG and SVG. It takes a second to import: only what draws may import
+it."""
 
 from __future__ import annotations
 
@@ -15,8 +16,11 @@ DPI = 150
 
 
 @contextmanager
-def picture(paths: Sequence[Path], width_in: float, height_in: float, **settings: Any) -> Iterator[Figure]:
-    """Give an empty figure to draw on, and save it when the context ends; equal figures make equal files."""
+def picture(
+    paths: Sequence[Path], width_in: float, height_in: float, **settings: Any
+) -> Iterator[Figure]:
+    """Give an empty figure to draw on, and save it when the context ends; equal figures make equal
+    files."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -24,7 +28,9 @@ def picture(paths: Sequence[Path], width_in: float, height_in: float, **settings
         figure = Figure(figsize=(width_in, height_in), **settings)
         yield figure
         for path in paths:
-            figure.savefig(path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
+            figure.savefig(
+                path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None
+            )
 
 
 def paths_of(stem: Path) -> list[Path]:

@@ -38,7 +38,8 @@ class Progress:
         self._print(text)
 
     def end(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
-        """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its shortfalls."""
+        """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its
+        shortfalls."""
         self._bar.update(self._task, advance=seconds)
         for line in () if self._bar.disable else shortfalls:
             self._bar.console.print(line, style="red", highlight=False, markup=False)
@@ -57,13 +58,19 @@ def progress_for(silent: bool) -> Iterator[Progress]:
     if silent or not terminal.is_terminal:
         yield Progress(prints_lines=not silent)
         return
-    columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    columns = (
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )
     with RichProgress(*columns, console=terminal) as bar:
         yield Progress(bar)
 
 
 def reading_progress(silent: bool, what: str = "reading the run") -> Callable[[float], None]:
-    """Return a function that takes the part of the work that is done, 0 to 1, and prints it on stderr now and then."""
+    """Return a function that takes the part of the work that is done, 0 to 1, and prints it on
+    stderr now and then."""
     shown = time.monotonic()
 
     def show(part: float) -> None:

@@ -1,4 +1,5 @@
-"""Tables and their cells as text: they fit the terminal; in a pipe, and as Markdown, nothing is cut or coloured."""
+"""Tables and their cells as text: they fit the terminal; in a pipe, and as Markdown, nothing is cut
+or coloured."""
 
 from __future__ import annotations
 
@@ -36,7 +37,10 @@ def print_wrapped(text: str) -> None:
 
 
 def table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None, dropped: Sequence[str] = ()
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    width: int | None = None,
+    dropped: Sequence[str] = (),
 ) -> Iterator[str]:
     """Yield the lines of a table, as plain text; columns of numbers are right-aligned.
 
@@ -55,7 +59,8 @@ def grid(
     dropped: Sequence[str] = (),
     style: Callable[[str, str], str] = lambda column, text: "",
 ) -> Table:
-    """Return the same table for rich to draw; `style` gives the style of a cell by its column and text."""
+    """Return the same table for rich to draw; `style` gives the style of a cell by its column and
+    text."""
     columns = list(zip(head, *rows, strict=True))
     for name in dropped:
         if sum(max(map(len, column)) for column in columns) + GAP * (len(columns) - 1) <= width:
@@ -66,7 +71,12 @@ def grid(
         is_right = bool(cells) and all(map(is_number, cells))
         drawn.add_column(Text(name), justify="right" if is_right else "left", overflow="fold")
     for row in zip(*(cells for _, *cells in columns), strict=True):
-        drawn.add_row(*(Text(text, style=style(column[0], text)) for column, text in zip(columns, row, strict=True)))
+        drawn.add_row(
+            *(
+                Text(text, style=style(column[0], text))
+                for column, text in zip(columns, row, strict=True)
+            )
+        )
     return drawn
 
 
@@ -79,7 +89,9 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterat
     """Yield the lines of a table in Markdown, each column as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for number, row in enumerate((head, *rows)):
-        yield f"| {' | '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))} |"
+        yield (
+            f"| {' | '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))} |"
+        )
         if number == 0:
             yield f"|{'|'.join('-' * (width + 2) for width in widths)}|"
 

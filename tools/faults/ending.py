@@ -1,4 +1,5 @@
-"""The state of a rack at its end, before its memory is released: its faults, its levels, its arm."""
+"""The state of a rack at its end, before its memory is released: its faults, its levels, its
+arm."""
 
 from __future__ import annotations
 
@@ -41,10 +42,11 @@ class Killed:
 class Strike:
     """A fault as the fault table holds it at the end of the run.
 
-    `began` is its tick, -1: it did not begin; `ends` that of its end, in the run or planned, or `NEVER`. `tick` and
-    `time_ns` (CLOCK_MONOTONIC) are those at which it first acted, however little (-1: it did not). `count` is how often
-    it acted so much that it must be found, and `hidden` the ticks from `tick` to the first time. `mailboxes` are those
-    concerned; `joint` is a name, or "" for none or all.
+    `began` is its tick, -1: it did not begin; `ends` that of its end, in the run or planned, or
+    `NEVER`. `tick` and `time_ns` (CLOCK_MONOTONIC) are those at which it first acted, however
+    little (-1: it did not). `count` is how often it acted so much that it must be found, and
+    `hidden` the ticks from `tick` to the first time. `mailboxes` are those concerned; `joint` is a
+    name, or "" for none or all.
     """
 
     fault: int
@@ -69,7 +71,8 @@ class Strike:
 
 @dataclass(frozen=True)
 class ArmEnd:
-    """An arm at the end of a run: limits violated and touches, counted at every substep; whether it is at rest."""
+    """An arm at the end of a run: limits violated and touches, counted at every substep; whether it
+    is at rest."""
 
     violations: int = 0
     touches: int = 0
@@ -77,14 +80,18 @@ class ArmEnd:
 
 
 def strikes(segment: Segment, joints: Sequence[str], kills: Sequence[Killed]) -> tuple[Strike, ...]:
-    """Return everything injected into a rack, in the order of the fault table, kills from outside last."""
+    """Return everything injected into a rack, in the order of the fault table, kills from outside
+    last."""
     table = FaultTable(segment)
-    found = [_strike(segment, e.index, joints, table) for e in table.entries if e.stage != Stage.FREE]
+    found = [
+        _strike(segment, e.index, joints, table) for e in table.entries if e.stage != Stage.FREE
+    ]
     return (*found, *(_killed(segment, kill) for kill in kills))
 
 
 def arm_of(segment: Segment) -> ArmEnd:
-    """Return the arm of a rack as its levels last reported it; a rack without one violates no limit."""
+    """Return the arm of a rack as its levels last reported it; a rack without one violates no
+    limit."""
     seen = [status for _, status in statuses(segment, "violations")]
     return ArmEnd(
         violations=max((int(arm.violations) for arm in seen), default=0),
@@ -105,7 +112,9 @@ def levels_of(segment: Segment) -> str:
 
 def is_late(segment: Segment) -> bool:
     """Return whether a level gave up because it cannot meet a time."""
-    return any(s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error"))
+    return any(
+        s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error")
+    )
 
 
 def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTable) -> Strike:

@@ -1,4 +1,5 @@
-"""Events as evidence of faults: which event can be the detection of which fault, and the reactions to it."""
+"""Events as evidence of faults: which event can be the detection of which fault, and the reactions
+to it."""
 
 from __future__ import annotations
 
@@ -25,9 +26,11 @@ CLOCK_ALARMS = _codes(alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <
 TASK_ALARMS = _codes((Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
 BRAKES = "brakes_closed"
 LATCHED = "latched"
-"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task ends."""
+"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task
+ends."""
 COLLISION = Alarm.COLLISION.name.lower()
-"""Code of the detection to which brakes in the same tick are a reaction; they are none to a fault then."""
+"""Code of the detection to which brakes in the same tick are a reaction; they are none to a fault
+then."""
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Reactions, and the recovery that undoes each."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
@@ -36,11 +39,12 @@ TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
 
 @dataclass(frozen=True)
 class Detection:
-    """An event that reports a fault: how long after it struck, and the time permitted (None: no bound).
+    """An event that reports a fault: how long after it struck, and the time permitted (None: no
+    bound).
 
-    `delay` and `bound` are ticks; ticks that the clock itself skipped did not happen and are not counted. `delay_ms` is
-    wall-clock time, None in lockstep, where it means nothing. `bound_ms` is the bound of a death in real time, and then
-    the only one.
+    `delay` and `bound` are ticks; ticks that the clock itself skipped did not happen and are not
+    counted. `delay_ms` is wall-clock time, None in lockstep, where it means nothing. `bound_ms` is
+    the bound of a death in real time, and then the only one.
     """
 
     event: Event
@@ -58,22 +62,30 @@ class Detection:
 
     @property
     def order(self) -> tuple[bool, int, float]:
-        """Key by which the best of several detections comes first: one within its bound, then the earliest."""
+        """Key by which the best of several detections comes first: one within its bound, then the
+        earliest."""
         return not self.is_within, self.delay, self.delay_ms or 0.0
 
 
 def fits(event: Event, strike: Strike) -> bool:
-    """Return whether an event can be the detection of a fault: of its kind, about the same thing, and not before it.
+    """Return whether an event can be the detection of a fault: of its kind, about the same thing,
+    and not before it.
 
-    A fault may strike a moment before its tick is given out; a process that reads the tick then sees the one before.
+    A fault may strike a moment before its tick is given out; a process that reads the tick then
+    sees the one before.
     """
-    if event.kind not in FOUND or strike.tick < 0 or event.tick < strike.tick - (event.kind == DIED):
+    if (
+        event.kind not in FOUND
+        or strike.tick < 0
+        or event.tick < strike.tick - (event.kind == DIED)
+    ):
         return False
     return event.code in strike.record.codes and is_about(event, strike)
 
 
 def explains(strike: Strike, event: Event) -> bool:
-    """Return whether an event in a fault's time can come of it: as its detection, or as a consequence of its kind."""
+    """Return whether an event in a fault's time can come of it: as its detection, or as a
+    consequence of its kind."""
     follows = strike.record.consequence
     if event.kind == "miss":
         # A fault that takes one task's cycles may take those of any task on its core.
@@ -86,7 +98,8 @@ def explains(strike: Strike, event: Event) -> bool:
 
 
 def is_about(event: Event, strike: Strike) -> bool:
-    """Return whether an event is about the target of a fault: its mailboxes, its task, its joint."""
+    """Return whether an event is about the target of a fault: its mailboxes, its task, its
+    joint."""
     if event.code == DIED:
         return event.board == strike.board
     if event.code in MAILBOX_ALARMS:
@@ -110,17 +123,22 @@ class SkippedTicks:
                 self._skips.setdefault(event.board, []).append((event.tick, int(event.value)))
 
     def between(self, first: int, last: int) -> int:
-        """Return how many ticks after `first`, up to `last`, did not happen: as many as any one task has missed."""
-        sums = (sum(count for tick, count in skips if first < tick <= last) for skips in self._skips.values())
+        """Return how many ticks after `first`, up to `last`, did not happen: as many as any one
+        task has missed."""
+        sums = (
+            sum(count for tick, count in skips if first < tick <= last)
+            for skips in self._skips.values()
+        )
         return min(max(sums, default=0), max(0, last - first))
 
 
 class Aftermath(NamedTuple):
-    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last undone.
+    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last
+    undone.
 
-    Lost messages are undone when a good one, made after the fault, was seen in each mailbox that owes one.
-    `lacking`: codes of reactions that must follow a fault of this kind, and did not; brakes that were engaged when it
-    struck cannot be engaged again.
+    Lost messages are undone when a good one, made after the fault, was seen in each mailbox that
+    owes one. `lacking`: codes of reactions that must follow a fault of this kind, and did not;
+    brakes that were engaged when it struck cannot be engaged again.
     """
 
     reactions: tuple[str, ...] = ()
@@ -129,8 +147,11 @@ class Aftermath(NamedTuple):
     lacking: tuple[str, ...] = ()
 
 
-def aftermath(strike: Strike, events: Sequence[Event], horizon: int, owed: Sequence[str]) -> Aftermath:
-    """Return the reactions to a fault and their end; reactions from tick `horizon` on are not to it.
+def aftermath(
+    strike: Strike, events: Sequence[Event], horizon: int, owed: Sequence[str]
+) -> Aftermath:
+    """Return the reactions to a fault and their end; reactions from tick `horizon` on are not to
+    it.
 
     `owed`: mailboxes that must have a new message after it.
     """
@@ -138,21 +159,32 @@ def aftermath(strike: Strike, events: Sequence[Event], horizon: int, owed: Seque
         return Aftermath()
     after = [event for event in events if event.tick >= strike.tick]
     struck = {e.tick for e in after if e.code == COLLISION}
-    to_fault = (e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck))
+    to_fault = (
+        e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck)
+    )
     reactions = [e for e in to_fault if e.tick < horizon and _can_react(strike, e)]
     undone = [_undone(reaction, after) for reaction in reactions]
-    flows = {e.subject: e.tick for e in reversed(after) if e.code == "flows" and e.tick >= strike.ends}
+    flows = {
+        e.subject: e.tick for e in reversed(after) if e.code == "flows" and e.tick >= strike.ends
+    }
     undone += [flows.get(mailbox) for mailbox in owed]
     names = tuple(dict.fromkeys(event.code for event in reactions))
     required = strike.record.consequence.reactions
-    lacking = tuple(c for c in required if c not in names and not (c == BRAKES and _are_engaged(strike.tick, events)))
+    lacking = tuple(
+        c
+        for c in required
+        if c not in names and not (c == BRAKES and _are_engaged(strike.tick, events))
+    )
     is_undone = None not in undone
     last = max(filter(None, undone), default=strike.tick)
-    return Aftermath(names, is_undone, last - strike.tick if is_undone and undone else None, lacking)
+    return Aftermath(
+        names, is_undone, last - strike.tick if is_undone and undone else None, lacking
+    )
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Return whether a reaction can be to a fault: brakes that engage for missed cycles are to one that takes cycles.
+    """Return whether a reaction can be to a fault: brakes that engage for missed cycles are to one
+    that takes cycles.
 
     A latch is a reaction to a kind that may be latched.
     """
@@ -163,7 +195,8 @@ def _can_react(strike: Strike, reaction: Event) -> bool:
 
 
 def takes_cycles(strike: Strike) -> bool:
-    """Return whether a fault keeps tasks from their cycles, so that these are missed because of it."""
+    """Return whether a fault keeps tasks from their cycles, so that these are missed because of
+    it."""
     return strike.record.where in TAKE_CYCLES
 
 
@@ -177,9 +210,12 @@ def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
 def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
     """Return the tick at which a reaction was undone; None when it was not."""
     if reaction.code == BRAKES and reaction.value > 0:
-        # They were engaged for the cycles without torque; the event comes when there is torque again.
+        # They were engaged for the cycles without torque; the event comes when there is torque
+        # again.
         return reaction.tick
     code = UNDONE_BY.get(reaction.code)
     board = reaction.board if reaction.code == "restart" else None
-    later = (e for e in after if e.kind == "recovery" and e.code == code and e.tick >= reaction.tick)
+    later = (
+        e for e in after if e.kind == "recovery" and e.code == code and e.tick >= reaction.tick
+    )
     return min((event.tick for event in later if board in (None, event.board)), default=None)

@@ -1,4 +1,5 @@
-"""The judge of faults: did each strike, was it found within its bound, reacted to, and recovered from?"""
+"""The judge of faults: did each strike, was it found within its bound, reacted to, and recovered
+from?"""
 
 from __future__ import annotations
 
@@ -35,12 +36,14 @@ SETTLE_S = 0.25
 
 @dataclass(frozen=True)
 class Judgement:
-    """The judgement of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the task's cycle.
+    """The judgement of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the
+    task's cycle.
 
-    `is_judged`: False for a size below the one from which its kind must be found. `recovery` is the time from the
-    strike until every reaction is undone and struck messages flow again; None: there was nothing to recover from, or it
-    was not seen. `bound` and `recovery_bound` are counted from the strike too. `lacking` are required reactions that
-    did not follow. `is_latched`: the kind may end the task, and it did.
+    `is_judged`: False for a size below the one from which its kind must be found. `recovery` is the
+    time from the strike until every reaction is undone and struck messages flow again; None: there
+    was nothing to recover from, or it was not seen. `bound` and `recovery_bound` are counted from
+    the strike too. `lacking` are required reactions that did not follow. `is_latched`: the kind may
+    end the task, and it did.
     """
 
     kind: str
@@ -81,9 +84,9 @@ class FaultVerdict:
 class Circumstances:
     """The run whose faults are judged.
 
-    `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a restart may take.
-    `has_failed`: the task ended with an error, as some kinds permit. `moving`: obstacles that move, and may run into an
-    arm that a fault has stopped in their way.
+    `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a
+    restart may take. `has_failed`: the task ended with an error, as some kinds permit. `moving`:
+    obstacles that move, and may run into an arm that a fault has stopped in their way.
     """
 
     layout: Layout
@@ -97,15 +100,17 @@ class Circumstances:
 def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> FaultVerdict:
     """Judge the faults of a run by its events.
 
-    One event is the detection of one fault: of two that it fits, of the one that struck first and is not found yet. A
-    fault of the arm that is over before its bound, and is not found, has not struck; nor has one whose run ends before
-    the bound of its recovery.
+    One event is the detection of one fault: of two that it fits, of the one that struck first and
+    is not found yet. A fault of the arm that is over before its bound, and is not found, has not
+    struck; nor has one whose run ends before the bound of its recovery.
     """
     return _Judge(strikes, events, run).verdict()
 
 
 class _Judge:
-    def __init__(self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> None:
+    def __init__(
+        self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
+    ) -> None:
         self._events = events
         self._run = run
         self._layout = run.layout
@@ -122,7 +127,9 @@ class _Judge:
         windows = [self._window(strike) for strike in self._strikes]
         for place, strike in enumerate(self._strikes):
             found = self._detections(strike, windows[place][1], used)
-            best = min((d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None)
+            best = min(
+                (d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None
+            )
             if best:
                 used.add(id(best.event))
             elif self._is_brief(strike):
@@ -131,15 +138,19 @@ class _Judge:
             judgement = self._judgement(strike, best, horizon)
             is_too_early = self._last < strike.tick + (judgement.recovery_bound or 0)
             if not judgement.is_recovered and is_too_early and strike.ends < NEVER:
-                # The run ended too early to decide: a campaign draws it again. A fault without an end has no recovery.
+                # The run ended too early to decide: a campaign draws it again. A fault without an
+                # end has no recovery.
                 judgement = self._judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]
         detections = tuple(event for event in stray if event.kind != "miss")
-        return FaultVerdict(tuple(judged), detections, tuple(event for event in stray if event.kind == "miss"))
+        return FaultVerdict(
+            tuple(judged), detections, tuple(event for event in stray if event.kind == "miss")
+        )
 
     def _bound(self, strike: Strike, reader: str | None) -> int | None:
-        """Return the ticks from its strike within which a fault must be found, by a reader or, None, by any process.
+        """Return the ticks from its strike within which a fault must be found, by a reader or,
+        None, by any process.
 
         One that never shows need not be found.
         """
@@ -158,7 +169,9 @@ class _Judge:
             # The plan's writer itself may find the fault, when it makes the next plan.
             return first - 1, self._last
         over = max(self._ends(strike), first + (self._bound(strike, None) or 0))
-        return first - 1, over + self._recovery(strike) + last_read(strike.mailboxes, self._layout) + self._settle
+        return first - 1, over + self._recovery(strike) + last_read(
+            strike.mailboxes, self._layout
+        ) + self._settle
 
     def _ends(self, strike: Strike) -> int:
         # A task that hangs is killed as soon as that is found, however long it was to hang.
@@ -170,26 +183,38 @@ class _Judge:
         if not strike.count:
             # It need not be found: whatever is found after its end is of something else.
             until = min(until, strike.ends)
-        fitting = (e for e in self._events if e.tick <= until and fits(e, strike) and id(e) not in used)
+        fitting = (
+            e for e in self._events if e.tick <= until and fits(e, strike) and id(e) not in used
+        )
         return [self._detection(event, strike) for event in fitting]
 
     def _owed(self, strike: Strike) -> tuple[str, ...]:
-        """Return the mailboxes that must have a new message after a fault: those that are periodic, or else all."""
+        """Return the mailboxes that must have a new message after a fault: those that are periodic,
+        or else all."""
         struck = strike.mailboxes if strike.record.takes_mailbox else ()
         return tuple(filter(self._is_periodic, struck)) or struck
 
     def _is_periodic(self, mailbox: str) -> bool:
-        """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a host board's."""
+        """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a
+        host board's."""
         box = self._layout.mailbox(mailbox)
-        return self._layout.task(box.writer).role == "executor" and box.protocol != "queue" and not box.max_age
+        return (
+            self._layout.task(box.writer).role == "executor"
+            and box.protocol != "queue"
+            and not box.max_age
+        )
 
     def _is_of(self, late: Detection, place: int) -> bool:
-        """Return whether a detection, too late for one fault, is in time for one that struck after it."""
+        """Return whether a detection, too late for one fault, is in time for one that struck after
+        it."""
         after = (strike for strike in self._strikes[place + 1 :] if fits(late.event, strike))
-        return not late.is_within and any(self._detection(late.event, strike).is_within for strike in after)
+        return not late.is_within and any(
+            self._detection(late.event, strike).is_within for strike in after
+        )
 
     def _is_brief(self, strike: Strike) -> bool:
-        """Return whether a fault of the arm never showed, or in fewer cycles than it may take to be found."""
+        """Return whether a fault of the arm never showed, or in fewer cycles than it may take to be
+        found."""
         if strike.record.where != "arm":
             return False
         until = strike.hidden + strike.count * self._cycles[strike.board]
@@ -201,11 +226,14 @@ class _Judge:
         if event.code != "clock_skipped":
             delay -= self._skipped.between(strike.tick, event.tick)
         if event.kind == DIED:
-            # Lockstep waits for the end of a process that its own clock has killed. It knows nothing of any other, and
-            # runs as fast as it can: neither ticks nor time are a measure.
+            # Lockstep waits for the end of a process that its own clock has killed. It knows
+            # nothing of any other, and runs as fast as it can: neither ticks nor time are a
+            # measure.
             unbounded = self._run.is_lockstep and strike.kind == EXTERNAL
             bound_ms = None if self._run.is_lockstep else (RACK_NS + MEMORY_NS) * 1e-6
-            return Detection(event, delay, None if unbounded else self._bound(strike, None), delay_ms, bound_ms)
+            return Detection(
+                event, delay, None if unbounded else self._bound(strike, None), delay_ms, bound_ms
+            )
         reader = event.board if event.code in MAILBOX_ALARMS else None
         return Detection(event, delay, self._bound(strike, reader), delay_ms)
 
@@ -216,7 +244,8 @@ class _Judge:
         return max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
 
     def _horizon(self, place: int, last: int) -> int:
-        """Return the tick up to which reactions are of this fault: the next one strikes then, or it is long over."""
+        """Return the tick up to which reactions are of this fault: the next one strikes then, or it
+        is long over."""
         later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
         return min([*later, last + 1])
 
@@ -228,7 +257,9 @@ class _Judge:
         # Ticks from the strike within which every reaction must be undone.
         bound = max(self._ends(strike), found) - strike.tick + self._recovery(strike)
         # Some kinds may end the task with an error.
-        is_latched = record.consequence.latches and self._run.has_failed and LATCHED in after.reactions
+        is_latched = (
+            record.consequence.latches and self._run.has_failed and LATCHED in after.reactions
+        )
         if not all(map(self._is_periodic, owed)):
             # Nothing says when its writer has something to write.
             bound = self._last + 1 - strike.tick
@@ -236,7 +267,9 @@ class _Judge:
         judgement = Judgement(
             kind=strike.kind,
             board=strike.board,
-            mailbox=strike.mailboxes[0] if record.takes_mailbox and len(strike.mailboxes) == 1 else "",
+            mailbox=strike.mailboxes[0]
+            if record.takes_mailbox and len(strike.mailboxes) == 1
+            else "",
             joint=strike.joint,
             size=strike.size,
             began=strike.began,
@@ -270,31 +303,48 @@ class _Judge:
         """Return whether no fault explains a detection, a death or a miss."""
         if event.kind not in ("detection", DIED, "miss") or self._is_met(event):
             return False
-        # An event of a task has the tick of its release, and may come of anything until the end of its cycle.
+        # An event of a task has the tick of its release, and may come of anything until the end of
+        # its cycle.
         until = event.tick + self._cycles.get(event.board, 1) - 1
         windowed = zip(self._strikes, windows, strict=True)
-        around = [strike for strike, (first, last) in windowed if first <= until and event.tick <= last]
+        around = [
+            strike for strike, (first, last) in windowed if first <= until and event.tick <= last
+        ]
         return not any(explains(strike, event) for strike in around if strike.tick >= 0)
 
     def _is_met(self, event: Event) -> bool:
-        """Return whether an obstacle has hit an arm that a fault has stopped, or that waits for another path since."""
-        is_moving = event.code == COLLISION and any(f"'{name}'" in event.text for name in self._run.moving)
+        """Return whether an obstacle has hit an arm that a fault has stopped, or that waits for
+        another path since."""
+        is_moving = event.code == COLLISION and any(
+            f"'{name}'" in event.text for name in self._run.moving
+        )
         return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
 
 def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
-    """Return every fault injected into a run, detections that none explains, and restarts by task, by its events."""
+    """Return every fault injected into a run, detections that none explains, and restarts by task,
+    by its events."""
     events = [Event(**event) for event in recorded if "tick" in event]
     ended: Mapping[str, Any] = next((event for event in recorded if event["kind"] == "outcome"), {})
     strikes = TypeAdapter(tuple[Strike, ...]).validate_python(ended.get("faults", ()))
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
-    verdict = judge(strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep))
+    verdict = judge(
+        strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep)
+    )
     restarts = Counter(event.board for event in events if event.code == "restart")
     return {
         # Faults that never struck come last.
-        "faults": [_row(found, layout) for found in sorted(verdict.faults, key=lambda f: (f.struck < 0, f.struck))],
+        "faults": [
+            _row(found, layout)
+            for found in sorted(verdict.faults, key=lambda f: (f.struck < 0, f.struck))
+        ],
         "unexplained": [
-            {"tick": event.tick, "board": event.board, "code": event.code or event.kind, "text": event.text}
+            {
+                "tick": event.tick,
+                "board": event.board,
+                "code": event.code or event.kind,
+                "text": event.text,
+            }
             for event in verdict.unexplained
         ],
         "restarts": dict(restarts),

@@ -32,7 +32,8 @@ SEEDS = 2**31
 
 
 class LiveRack:
-    """A rack by name, with its config and its fault table. Raises `SegmentError` when there is none."""
+    """A rack by name, with its config and its fault table. Raises `SegmentError` when there is
+    none."""
 
     def __init__(self, rack: str) -> None:
         self._segment = Segment.attach(rack)
@@ -40,11 +41,14 @@ class LiveRack:
         self._table = FaultTable(self._segment)
         self._joints = self._config.robot.joints if self._config.robot is not None else ()
 
-    def inject(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> dict[str, Any]:
-        """Inject a fault; return it as plain data when it has begun, or, with a tick or a condition, when it is armed.
+    def inject(
+        self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
+    ) -> dict[str, Any]:
+        """Inject a fault; return it as plain data when it has begun, or, with a tick or a
+        condition, when it is armed.
 
-        With `wait`, return when it is over. Raises `ConfigError` with every mistake, and `Failure` when it does not
-        begin, or is not over within `timeout_s` of wall-clock time.
+        With `wait`, return when it is over. Raises `ConfigError` with every mistake, and `Failure`
+        when it does not begin, or is not over within `timeout_s` of wall-clock time.
         """
         if self._is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
@@ -64,7 +68,8 @@ class LiveRack:
         return {**self._document(entry), "message": self._state(entry)}
 
     def withdraw(self, number: int) -> dict[str, Any]:
-        """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises `Failure`."""
+        """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises
+        `Failure`."""
         waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
         if number not in waiting:
             known = ", ".join(map(str, waiting)) or "none"
@@ -90,12 +95,19 @@ class LiveRack:
         rows = [
             [
                 *(str(fault["fault"]), fault["text"], fault["stage"]),
-                *("-" if fault[key] is None or fault[key] < 0 else str(fault[key]) for key in numbers),
+                *(
+                    "-" if fault[key] is None or fault[key] < 0 else str(fault[key])
+                    for key in numbers
+                ),
                 fault["waits_for"],
             ]
             for fault in self.faults()
         ]
-        yield from table(["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"], rows, width)
+        yield from table(
+            ["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"],
+            rows,
+            width,
+        )
 
     def _fault(self, given: dict[str, Any]) -> FaultConfig:
         """Return a fault as in a config. Raises `ConfigError`."""
@@ -108,20 +120,35 @@ class LiveRack:
             raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
 
     def _check(self, fault: FaultConfig) -> None:
-        """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`, `Failure`."""
+        """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`,
+        `Failure`."""
         tick = self._segment.words[System.TICK]
         where = KINDS[fault.kind].where
         if where == "start":
-            why = "a running rack has passed its self-tests; give it in the config or with 'rack run --faults'"
+            why = (
+                "a running rack has passed its self-tests; give it in the config or with 'rack run"
+                " --faults'"
+            )
             raise ConfigError([Mistake("kind", fault.kind, why)])
         if fault.tick is not None and fault.tick <= tick:
-            raise ConfigError([Mistake("tick", fault.tick, f"has passed; the rack is at tick {tick}")])
+            raise ConfigError(
+                [Mistake("tick", fault.tick, f"has passed; the rack is at tick {tick}")]
+            )
         if where != "core":
             return
         if fault.lasts is None and fault.cycles is None:
-            raise ConfigError([Mistake("for", None, f"missing; a {fault.kind} must have an end: --for or --cycles")])
+            raise ConfigError(
+                [
+                    Mistake(
+                        "for", None, f"missing; a {fault.kind} must have an end: --for or --cycles"
+                    )
+                ]
+            )
         if not set_priority(1):
-            raise Failure(f"{fault.kind}: SCHED_FIFO is refused to this user; no core can be taken from a board")
+            raise Failure(
+                f"{fault.kind}: SCHED_FIFO is refused to this user; no core can be taken from a"
+                " board"
+            )
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
@@ -135,11 +162,14 @@ class LiveRack:
 
     def _await_begin(self, entry: FaultEntry) -> None:
         if not self._wait_until(lambda: entry.stage != Stage.WAITING, BEGIN_S):
-            raise Failure(f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s")
+            raise Failure(
+                f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s"
+            )
         self._check_begun(entry)
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
-        """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it never began."""
+        """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it
+        never began."""
         if entry.stage == Stage.WAITING:
             print(self._state(entry), file=sys.stderr, flush=True)
         if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
@@ -166,7 +196,11 @@ class LiveRack:
         """Return the tick or the condition that a fault waits for."""
         if entry[Entry.WHEN_BOX] < 0:
             now = self._segment.words[System.TICK]
-            return f"tick {entry[Entry.FROM]}; the rack is at tick {now}" if entry[Entry.FROM] > 0 else "the next tick"
+            return (
+                f"tick {entry[Entry.FROM]}; the rack is at tick {now}"
+                if entry[Entry.FROM] > 0
+                else "the next tick"
+            )
         when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])
         return condition_text(when, self._segment.layout)
 

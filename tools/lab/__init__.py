@@ -1,1 +1,2 @@
-"""What measures this project and reproduces the paper. Nothing outside the lab imports it, but for its commands."""
+"""What measures this project and reproduces the paper. Nothing outside the lab imports it, but for
+its commands."""

@@ -1,4 +1,5 @@
-"""The operator's desk of a running rack, from the host side: gives a command to a level and waits for its reply."""
+"""The operator's desk of a running rack, from the host side: gives a command to a level and waits
+for its reply."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ from rack.tools.live.holds import resume_command
 from rack.tools.live.watched import WatchedRack
 
 REPLY_CYCLES = 4
-"""Cycles of a level within which it replies: one to read, one to become visible, and two that may be missed."""
+"""Cycles of a level within which it replies: one to read, one to become visible, and two that may
+be missed."""
 SILENT_S = 5.0
 """Time without a tick after which a wait is given up."""
 NOTE_S = 1.5
@@ -43,7 +45,8 @@ class Reply:
     """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
 
     The fate "waiting" is that of a command to a rack held for single steps; it has no serial yet.
-    The fate stays "given" where the level's status does not answer operators. `objection` is why it was refused.
+    The fate stays "given" where the level's status does not answer operators. `objection` is why it
+    was refused.
     """
 
     serial: int
@@ -73,7 +76,10 @@ class Reply:
     def line(self) -> str:
         """All of it as one line."""
         if self.fate == "waiting":
-            return f"command to '{self.level}', {self.text}: waits for the next step of the rack, which is held"
+            return (
+                f"command to '{self.level}', {self.text}: waits for the next step of the rack,"
+                " which is held"
+            )
         ends = {
             "given": "; the status of this level does not answer operators",
             "taken": f", taken up at tick {self.taken_up}",
@@ -81,7 +87,10 @@ class Reply:
             "refused": f", refused at tick {self.taken_up}: {self.objection}",
             "superseded": ", superseded by a newer command",
         }
-        return f"command {self.serial} to '{self.level}', {self.text}: given at tick {self.given}{ends[self.fate]}"
+        return (
+            f"command {self.serial} to '{self.level}', {self.text}: given at tick"
+            f" {self.given}{ends[self.fate]}"
+        )
 
 
 class LiveDesk:
@@ -96,20 +105,27 @@ class LiveDesk:
         """Return the commands that each level takes, and the one in force, as plain data."""
         known = commandable(self._config)
         return [
-            {"level": name, "in_force": self._in_force(name), "takes": takes(self._config, name, commands)}
+            {
+                "level": name,
+                "in_force": self._in_force(name),
+                "takes": takes(self._config, name, commands),
+            }
             for name, commands in known.items()
         ]
 
     def text(self, width: int | None = None) -> Iterator[str]:
         """Yield the same as a table that fits `width`."""
-        yield from table(["level", "in force", "takes"], [list(row.values()) for row in self.levels()], width)
+        yield from table(
+            ["level", "in force", "takes"], [list(row.values()) for row in self.levels()], width
+        )
 
     def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Reply:
         """Give a command and wait until its level takes it up; with `wait`, until it is done.
 
         `timeout_s` of wall-clock time bounds that wait; None: until the end of the run.
 
-        Raises `ConfigError` with every mistake, and `Failure` when it is not given or not answered in time.
+        Raises `ConfigError` with every mistake, and `Failure` when it is not given or not answered
+        in time.
         """
         segment = self._segment
         tick = self._segment.words[System.TICK]
@@ -123,7 +139,9 @@ class LiveDesk:
         if segment.words[System.HELD]:
             # Without a client: the user steps the rack afterwards.
             entry = OperatorTable(segment).add(wanted)
-            return Reply(0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting")
+            return Reply(
+                0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting"
+            )
         if (answering := _answering(segment, command.level)) is not None:
             self._rack.follow(answering.name)
         # However the wait ends, leaving the claim withdraws a request that has not been given.
@@ -135,7 +153,9 @@ class LiveDesk:
 
     def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Reply:
         about = f"'{level}', {text}"
-        patience = _Patience(self._rack, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}")
+        patience = _Patience(
+            self._rack, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}"
+        )
         while entry[RequestWord.TICKET] == ticket:
             if entry.stage == RequestStage.GIVEN:
                 return Reply(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
@@ -153,7 +173,9 @@ class LiveDesk:
         replies = Replies(self._segment, status, reply)
         last = reply.given + REPLY_CYCLES * status.every
         about = f"command {reply.serial}: "
-        patience = _Patience(self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks")
+        patience = _Patience(
+            self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks"
+        )
         while True:
             # Before the look: a reply written just before the run ended still counts.
             in_vain = patience.is_in_vain
@@ -164,7 +186,9 @@ class LiveDesk:
             if in_vain:
                 raise Failure(f"{reply.line}; the run ended")
             if reply.fate == "given" and tick > last:
-                raise Failure(f"{about}'{reply.level}' has not answered in {REPLY_CYCLES} of its cycles")
+                raise Failure(
+                    f"{about}'{reply.level}' has not answered in {REPLY_CYCLES} of its cycles"
+                )
             if time.monotonic() > deadline:
                 still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
                 raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
@@ -183,7 +207,10 @@ class LiveDesk:
 def _answering(segment: Segment, level: str) -> MailboxSpec | None:
     """Return the status mailbox of a level; None where its status does not answer operators."""
     boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
-    return next((box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}), None)
+    return next(
+        (box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}),
+        None,
+    )
 
 
 class Replies:
@@ -203,7 +230,9 @@ class Replies:
             self._take_up(rows[int(np.argmax(mine))])
         done = mine & (answers == Answer.DONE)
         if self.reply.fate == "taken" and done.any():
-            self.reply = replace(self.reply, fate="done", done=int(rows["tick"][int(np.argmax(done))]))
+            self.reply = replace(
+                self.reply, fate="done", done=int(rows["tick"][int(np.argmax(done))])
+            )
         if self.reply.fate == "taken" and (late := mine & (answers == Answer.REFUSED)).any():
             self._refuse(rows[int(np.argmax(late))])
         if self.reply.fate in ("given", "taken") and (orders > self.reply.serial).any():

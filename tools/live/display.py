@@ -1,6 +1,8 @@
-"""A rack on the terminal: a live table while it runs; a line a second where there is no terminal; nothing with --json.
+"""A rack on the terminal: a live table while it runs; a line a second where there is no terminal;
+nothing with --json.
 
-The table has a line a task; below it are the active faults, what holds the rack, and the progress of its task.
+The table has a line a task; below it are the active faults, what holds the rack, and the progress
+of its task.
 """
 
 from __future__ import annotations
@@ -43,12 +45,32 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "state": lambda row: row.state,
 }
 """Columns by heading; `exec` and `late` are the longest since the last look."""
-DROPPED = ("tick", "sched", "slot", "cycles", "Hz", "restarts", "core", "exec ms", "late ms", "skipped")
+DROPPED = (
+    "tick",
+    "sched",
+    "slot",
+    "cycles",
+    "Hz",
+    "restarts",
+    "core",
+    "exec ms",
+    "late ms",
+    "skipped",
+)
 """Columns that a narrow terminal leaves out, in this order."""
-STATES = {"error": "red", "failed": "red", LOST: "bold red", "done": "green", "holding": "yellow", "awaited": "yellow"}
+STATES = {
+    "error": "red",
+    "failed": "red",
+    LOST: "bold red",
+    "done": "green",
+    "holding": "yellow",
+    "awaited": "yellow",
+}
 COUNTED = {
     **dict.fromkeys(("missed", "skipped"), "red"),
-    **dict.fromkeys(("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses"), "yellow"),
+    **dict.fromkeys(
+        ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses"), "yellow"
+    ),
 }
 """Colours of counts above 0."""
 HELD = "bold yellow"
@@ -93,7 +115,9 @@ class LiveDisplay(Display):
         if _is_shown(event):
             style = EVENTS.get(event.kind, OTHER_EVENTS)
             # The terminal wraps it, not rich: a command in it can still be copied.
-            self._live.console.print(_line(event), style=style, highlight=False, markup=False, soft_wrap=True)
+            self._live.console.print(
+                _line(event), style=style, highlight=False, markup=False, soft_wrap=True
+            )
 
 
 class PlainDisplay(Display):
@@ -134,11 +158,14 @@ def display_for(silent: bool) -> Iterator[Display]:
 
 @dataclass(frozen=True)
 class RackView:
-    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults, holds, progress."""
+    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults,
+    holds, progress."""
 
     snapshot: Snapshot
 
-    def __rich_console__(self, terminal: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+    def __rich_console__(
+        self, terminal: Console, options: ConsoleOptions
+    ) -> Iterator[RenderableType]:
         """Yield what rich draws, as wide as the terminal permits."""
         snapshot = self.snapshot
         width = options.max_width
@@ -146,7 +173,13 @@ class RackView:
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
-        for rows in (snapshot.hosts, snapshot.entries, snapshot.peers, snapshot.imports, snapshot.exports):
+        for rows in (
+            snapshot.hosts,
+            snapshot.entries,
+            snapshot.peers,
+            snapshot.imports,
+            snapshot.exports,
+        ):
             yield from _rows(rows, width)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
@@ -155,13 +188,18 @@ class RackView:
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             why, *release = hold.parts
-            yield Text(hold.line if len(hold.line) <= width else "\n  ".join([why, *release]), style=HELD)
+            yield Text(
+                hold.line if len(hold.line) <= width else "\n  ".join([why, *release]), style=HELD
+            )
         if snapshot.progress is not None:
             yield _bar(snapshot.progress, width if terminal.is_terminal else 0)
 
 
-def _rows(rows: Sequence[HostRow | EntryRow | PeerRow | ImportRow | ExportRow], width: int) -> Iterator[RenderableType]:
-    """Yield the table of host boards, other racks, or what passes to and from them, if there are any."""
+def _rows(
+    rows: Sequence[HostRow | EntryRow | PeerRow | ImportRow | ExportRow], width: int
+) -> Iterator[RenderableType]:
+    """Yield the table of host boards, other racks, or what passes to and from them, if there are
+    any."""
     if rows:
         found = [asdict(row) for row in rows]
         cells = [[_cell(name, value) for name, value in row.items()] for row in found]
@@ -178,19 +216,29 @@ def line_of(snapshot: Snapshot) -> str:
     """Return the rack as one plain line, for where there is no terminal."""
     missed = sum(row.missed for row in snapshot.tasks)
     skipped = sum(row.skipped for row in snapshot.tasks)
-    line = f"{snapshot.rack} {snapshot.time_s:8.2f} s  tick {snapshot.tick}  missed {missed}  skipped {skipped}"
+    line = (
+        f"{snapshot.rack} {snapshot.time_s:8.2f} s  tick {snapshot.tick}  missed {missed}  skipped"
+        f" {skipped}"
+    )
     if snapshot.run in (DEAD, GONE):
         line += f"  {snapshot.run}"
     at = snapshot.progress
     if at is not None:
-        line += f"  task {at.state}, action {at.actions_done}/{at.actions}, move {at.moves_done}/{at.moves}"
+        line += (
+            f"  task {at.state}, action {at.actions_done}/{at.actions}, move"
+            f" {at.moves_done}/{at.moves}"
+        )
     lost = [f"{row.task} {LOST}" for row in snapshot.tasks if row.state == LOST]
     holds = [hold.line for hold in snapshot.holds]
-    return "  ".join([line, *snapshot.lines, *_demanded(snapshot), *lost, *_reasons(snapshot), *holds])
+    return "  ".join(
+        [line, *snapshot.lines, *_demanded(snapshot), *lost, *_reasons(snapshot), *holds]
+    )
 
 
 def _head(snapshot: Snapshot) -> Text:
-    line = Text(f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}")
+    line = Text(
+        f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}"
+    )
     if snapshot.run == DEAD:
         line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
     if snapshot.run == GONE:
@@ -210,14 +258,21 @@ def _demanded(snapshot: Snapshot) -> list[str]:
 def _reasons(snapshot: Snapshot) -> list[str]:
     """Return the reasons that tasks give, except those that a hold already shows."""
     held = {hold.level for hold in snapshot.holds}
-    rows = [row for row in snapshot.tasks if row.reason and not (row.state == "holding" and row.task in held)]
+    rows = [
+        row
+        for row in snapshot.tasks
+        if row.reason and not (row.state == "holding" and row.task in held)
+    ]
     shown = [hold.why for hold in snapshot.holds]
     return [f"{row.task}: {row.reason}" for row in rows if is_news(row.reason, shown)]
 
 
 def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
     """Return the ages of a board's messages, as one line."""
-    shown = [f"{port} {found.age} ticks old, taken at tick {found.taken}" for port, found in ports.items()]
+    shown = [
+        f"{port} {found.age} ticks old, taken at tick {found.taken}"
+        for port, found in ports.items()
+    ]
     return f"exchange of {board}: {'; '.join(shown) or 'no message yet'}"
 
 
@@ -229,9 +284,14 @@ def _style(column: str, text: str) -> str:
 
 def _bar(progress: TaskProgress, width: int) -> RenderableType:
     """Return the progress as a bar and text; without a width, as text alone."""
-    done = f"action {progress.actions_done}/{progress.actions}, move {progress.moves_done}/{progress.moves}"
+    done = (
+        f"action {progress.actions_done}/{progress.actions}, move"
+        f" {progress.moves_done}/{progress.moves}"
+    )
     left = width - len(f"task  {done} {progress.state}") - 1
-    bar = ProgressBar(total=max(progress.moves, 1), completed=progress.moves_done, width=max(4, min(BAR, left)))
+    bar = ProgressBar(
+        total=max(progress.moves, 1), completed=progress.moves_done, width=max(4, min(BAR, left))
+    )
     row = Table.grid(padding=(0, 1))
     row.add_row("task", *([bar] if width else []), done, progress.state)
     return row

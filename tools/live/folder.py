@@ -1,4 +1,5 @@
-"""A run's folder, and the event log in it: events.jsonl, one JSON object a line, the outcome last."""
+"""A run's folder, and the event log in it: events.jsonl, one JSON object a line, the outcome
+last."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ RUNS = Path("runs")
 
 
 def folder_of(wanted: Path | None, rack: str) -> Path:
-    """Return the folder for a run that is about to start: `wanted`, or runs/<rack>-<time>. It is created later.
+    """Return the folder for a run that is about to start: `wanted`, or runs/<rack>-<time>. It is
+    created later.
 
     Raises `Failure` when `wanted` holds files already.
     """
@@ -31,7 +33,8 @@ def folder_of(wanted: Path | None, rack: str) -> Path:
 
 
 class EventLog:
-    """Shows every event and writes it to events.jsonl, which is opened only once the rack is launched.
+    """Shows every event and writes it to events.jsonl, which is opened only once the rack is
+    launched.
 
     A write that fails, on a full disk, is reported once and does not end the run.
     """

@@ -1,4 +1,5 @@
-"""Holds: which level of a rack is kept from its work, since when, why, and the command that releases it."""
+"""Holds: which level of a rack is kept from its work, since when, why, and the command that
+releases it."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ OPERATED = frozenset({"standing", "order", "answer"})
 
 @dataclass(frozen=True)
 class Hold:
-    """One level, or the arm, kept from its own work. The command `release` ends it; empty: it ends by itself."""
+    """One level, or the arm, kept from its own work. The command `release` ends it; empty: it ends
+    by itself."""
 
     level: str
     since_tick: int
@@ -56,7 +58,8 @@ def resume_command(rack: str, level: str) -> str:
 
 
 def is_news(reason: str, shown: list[str]) -> bool:
-    """Return whether a reason is not yet among those `shown`, and add it: levels repeat reasons of the level below."""
+    """Return whether a reason is not yet among those `shown`, and add it: levels repeat reasons of
+    the level below."""
     origin = PASSED_ON.split(reason)[-1][:SAME]
     if any(origin in other for other in shown):
         return False
@@ -71,12 +74,22 @@ class Holds:
         self._segment = segment
         self._lines = UtilityLines(segment)
         tasks = {task.name for task in segment.layout.tasks}
-        boxes = [box for box in segment.layout.mailboxes if box.name.endswith(".status") and box.writer in tasks]
-        self._statuses = {box.writer: open_observer(segment, box.name) for box in boxes if "state" in _fields(box)}
+        boxes = [
+            box
+            for box in segment.layout.mailboxes
+            if box.name.endswith(".status") and box.writer in tasks
+        ]
+        self._statuses = {
+            box.writer: open_observer(segment, box.name) for box in boxes if "state" in _fields(box)
+        }
         self._operated = {box.writer for box in boxes if _fields(box) >= OPERATED}
         driving = next((box for box in boxes if "demand" in _fields(box)), None)
         self._arm = None if driving is None else driving.writer
-        self._stop = ("arm", "braked") if driving is None or "braked" in _fields(driving) else ("hand", "valves closed")
+        self._stop = (
+            ("arm", "braked")
+            if driving is None or "braked" in _fields(driving)
+            else ("hand", "valves closed")
+        )
 
     def look(self) -> tuple[Hold, ...]:
         """Return the holds now, the arm's first; none once the run is over."""
@@ -89,7 +102,9 @@ class Holds:
 
     def _stopped(self) -> Iterator[Hold]:
         if self._lines.emergency_stop:
-            since = self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
+            since = (
+                self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
+            )
             where = ", on its own machine" if self._segment.is_mirror else ""
             release = f"rack estop {self._segment.layout.rack} --reset{where}"
             what, how = self._stop
@@ -119,12 +134,16 @@ class Holds:
         rows = MailboxRing(self._segment, f"{level}.operator").drain().rows
         # A newer command that was refused has left it in force.
         mine = [
-            row for row in rows if row["message"]["what"] == status.standing and row["message"]["id"] <= status.order
+            row
+            for row in rows
+            if row["message"]["what"] == status.standing and row["message"]["id"] <= status.order
         ]
         if status.answer == Answer.REFUSED and len(mine) > 1:
             mine = [row for row in mine if row["message"]["id"] != status.order]
         if not mine:
-            return self._segment.block(level)[Block.LEVEL_SINCE], Operation(status.standing).name.lower()
+            return self._segment.block(level)[Block.LEVEL_SINCE], Operation(
+                status.standing
+            ).name.lower()
         message = Message(rows["message"].dtype)
         message.raw[:] = mine[-1]["message"].tobytes()
         return int(mine[-1]["tick"]), describe(message)
@@ -134,7 +153,8 @@ class Holds:
 
 
 class Standstill:
-    """Reports, once, a hold under which nothing has moved for a while: the run will not continue by itself."""
+    """Reports, once, a hold under which nothing has moved for a while: the run will not continue by
+    itself."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -143,7 +163,8 @@ class Standstill:
         self._reported: set[tuple[str, int]] = set()
 
     def look(self) -> Iterator[Event]:
-        """Yield an event for each hold that somebody must end and that has not been reported yet."""
+        """Yield an event for each hold that somebody must end and that has not been reported
+        yet."""
         # Here, not above: it needs the kinds of faults, for which `rack status` should not wait.
         from rack.tools.faults.ending import arm_of
 
@@ -161,7 +182,9 @@ class Standstill:
                 text = f"nothing has moved for {still_s:.0f} s: {hold.line}"
                 code = "standstill"
                 since = hold.since_tick
-                yield Event(time.time_ns(), tick, "held", "", text, code, subject=hold.level, since=since)
+                yield Event(
+                    time.time_ns(), tick, "held", "", text, code, subject=hold.level, since=since
+                )
 
 
 def _fields(box: MailboxSpec) -> set[str]:

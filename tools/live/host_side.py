@@ -31,7 +31,8 @@ class HostRow:
 
 @dataclass(frozen=True)
 class EntryRow:
-    """One entry of a bus adapter: its counts, and the age of its newest message, simulated ms; None: none yet."""
+    """One entry of a bus adapter: its counts, and the age of its newest message, simulated ms;
+    None: none yet."""
 
     entry: str
     source: str
@@ -53,7 +54,11 @@ def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
     # The process that runs a host board locks this word, and the kernel unlocks it.
     runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
     state = TaskState(block[Block.STATE])
-    heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == host.name]
+    heads = [
+        segment.map.mailboxes[m.name] // 8
+        for m in segment.layout.mailboxes
+        if m.writer == host.name
+    ]
     return HostRow(
         board=host.name,
         pid=block[Block.PID] if runs else 0,
@@ -76,7 +81,10 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
                 EntryRow(
                     entry=f"{mailbox.partition('.')[0]}.{entry}",
                     source=source,
-                    **{name: int(counts[name]) for name in ("passed", "refused", "superseded", "full", "waiting")},
+                    **{
+                        name: int(counts[name])
+                        for name in ("passed", "refused", "superseded", "full", "waiting")
+                    },
                     age_ms=None if age < 0 else age * tick_ms,
                 )
             )
@@ -84,7 +92,8 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
 
 
 def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
-    """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is TOML text."""
+    """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is
+    TOML text."""
     boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
     boards = tomllib.loads(config)["board"] if boxes else {}
     for box in boxes:

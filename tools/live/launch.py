@@ -41,11 +41,12 @@ News = Callable[[], list[str]]
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: its outcome, the counts of every task's control block, and the faults injected into it.
+    """A finished run: its outcome, the counts of every task's control block, and the faults
+    injected into it.
 
-    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events. `refused`: messages
-    that full queues refused, by queue. `recording` is "complete", "none" (not wanted), or what is missing; `rows_lost`
-    are the rows missing, by task and by mailbox.
+    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
+    `refused`: messages that full queues refused, by queue. `recording` is "complete", "none" (not
+    wanted), or what is missing; `rows_lost` are the rows missing, by task and by mailbox.
     """
 
     rack: str
@@ -69,7 +70,10 @@ class RunResult:
         end = self.outcome
         if end.worked:
             return f"{self.rack}: {end.cause}, but not all is recorded: {self.recording}"
-        return f"{self.rack}: {end.cause}: {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
+        return (
+            f"{self.rack}: {end.cause}:"
+            f" {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
+        )
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -78,7 +82,10 @@ class RunResult:
     def text(self) -> str:
         """Return the outcome as readable text."""
         end = self.outcome
-        lines = [f"{self.rack}: {end.cause} after {end.ticks} ticks{': ' + end.reason if end.reason else ''}"]
+        lines = [
+            f"{self.rack}: {end.cause} after {end.ticks}"
+            f" ticks{': ' + end.reason if end.reason else ''}"
+        ]
         lines += [f"fault: {fault}" for fault in end.faults]
         lines += [braked_text(end.brakings)] if end.brakings else []
         return "\n".join([*lines, f"digest {end.digest}"])
@@ -96,13 +103,15 @@ def run_rack(
     step: bool = False,
     entries: Mapping[str, Entries] | None = None,
 ) -> RunResult:
-    """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder` unless that is None.
+    """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`
+    unless that is None.
 
-    With `view`, open a viewer on what the recorder serves; it may be closed at any time. With `step`, in lockstep, hold
-    before tick 0 until the rack is stepped. `share`, `crate` and `entries` are as in `Rack`.
+    With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
+    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate` and
+    `entries` are as in `Rack`.
 
-    Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that dies does not end the
-    run, but files that cannot be written do: raises `Failure`.
+    Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
+    dies does not end the run, but files that cannot be written do: raises `Failure`.
     """
     log = EventLog(display)
     news: list[News] = []
@@ -149,7 +158,10 @@ def run_rack(
             outcome=outcome,
             wall_s=wall_s,
             clock_skipped=segment.words[System.CLOCK_SKIPPED],
-            tasks={task: {name.lower(): block[Block[name]] for name in COUNTED} for task, block in blocks.items()},
+            tasks={
+                task: {name.lower(): block[Block[name]] for name in COUNTED}
+                for task, block in blocks.items()
+            },
             recording=recording,
             rows_lost=rows_lost,
             faults=strikes(segment, config.robot.joints if config.robot is not None else (), ()),
@@ -161,7 +173,8 @@ def run_rack(
 
 
 def _viewer(port: int) -> News:
-    """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs all the same."""
+    """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs
+    all the same."""
     try:
         return ViewerWindow(url(port)).news
     except Failure as failure:
@@ -169,7 +182,9 @@ def _viewer(port: int) -> News:
         return lambda: [news.pop()] if news else []
 
 
-def _watch(rack: Rack, seconds: float | None, display: Display, log: EventLog, news: list[News]) -> Outcome:
+def _watch(
+    rack: Rack, seconds: float | None, display: Display, log: EventLog, news: list[News]
+) -> Outcome:
     """Run the rack to its end; show it, and log what only the host side can see."""
     rack.start(seconds)
     monitor = RackMonitor(rack.segment)
@@ -205,7 +220,9 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     text = f"{most.rows:,} of {most.written:,} rows of {name} are missing"
     if len(missing) > 1:
         text += f" (and rows of {len(missing) - 1} more tasks and mailboxes)"
-    return "; ".join((text, *map(str, gaps), why)), {name: found.rows for name, found in missing.items()}
+    return "; ".join((text, *map(str, gaps), why)), {
+        name: found.rows for name, found in missing.items()
+    }
 
 
 def _log_news(news: list[News], segment: Segment, log: EventLog) -> None:

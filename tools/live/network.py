@@ -12,13 +12,23 @@ from rack.levels.peer import Presence, peer_port
 
 BOARD = "lan"
 STATUS = f"{BOARD}.status"
-COUNTS = ("taken", "missing", "disordered", "repeated", "late", "refused", "unknown_launch", "superseded")
+COUNTS = (
+    "taken",
+    "missing",
+    "disordered",
+    "repeated",
+    "late",
+    "refused",
+    "unknown_launch",
+    "superseded",
+)
 """What is counted of an import: see `rack.boards.lan.messages.IMPORT`."""
 
 
 @dataclass(frozen=True)
 class PeerRow:
-    """Another rack now. `clock_ms` is its clock less ours, within `within_ms`, ms; None: not known, or in lockstep."""
+    """Another rack now. `clock_ms` is its clock less ours, within `within_ms`, ms; None: not known,
+    or in lockstep."""
 
     peer: str
     state: str
@@ -31,7 +41,8 @@ class PeerRow:
 
 @dataclass(frozen=True)
 class ImportRow:
-    """One import now: its counts, and the age of its information in ticks here and in s of simulated time."""
+    """One import now: its counts, and the age of its information in ticks here and in s of
+    simulated time."""
 
     entry: str
     source: str
@@ -57,7 +68,8 @@ class ExportRow:
 
 
 class Entries(NamedTuple):
-    """What a rack exchanges: the source of each export and import by port, and the racks with which it works."""
+    """What a rack exchanges: the source of each export and import by port, and the racks with which
+    it works."""
 
     exports: dict[str, str]
     imports: dict[str, str]
@@ -70,7 +82,8 @@ def exchanged(config: str) -> Entries | None:
     if table is None:
         return None
     exports, imports = (
-        {port: entry["from"] for port, entry in table.get(key, {}).items()} for key in ("export", "import")
+        {port: entry["from"] for port, entry in table.get(key, {}).items()}
+        for key in ("export", "import")
     )
     racks = [*(source.partition("/")[0] for source in imports.values()), *table.get("peers", ())]
     return Entries(exports, imports, tuple(dict.fromkeys(racks)))
@@ -81,10 +94,17 @@ class Network:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        entries = exchanged(segment.config) if any(task.name == BOARD for task in segment.layout.tasks) else None
+        entries = (
+            exchanged(segment.config)
+            if any(task.name == BOARD for task in segment.layout.tasks)
+            else None
+        )
         self._entries = entries or Entries({}, {}, ())
         self._status = None if entries is None else open_observer(segment, STATUS)
-        self._peers = {rack: open_observer(segment, f"{BOARD}.{peer_port(rack)}") for rack in self._entries.peers}
+        self._peers = {
+            rack: open_observer(segment, f"{BOARD}.{peer_port(rack)}")
+            for rack in self._entries.peers
+        }
 
     def peers(self) -> tuple[PeerRow, ...]:
         """Return the other racks."""
@@ -99,7 +119,13 @@ class Network:
             numbers = {name: int(counts[name]) for name in COUNTS}
             ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
             found.append(
-                ImportRow(f"{BOARD}.{port}", self._entries.imports[port], **numbers, age_ticks=ages[0], age_s=ages[1])
+                ImportRow(
+                    f"{BOARD}.{port}",
+                    self._entries.imports[port],
+                    **numbers,
+                    age_ticks=ages[0],
+                    age_s=ages[1],
+                )
             )
         return tuple(found)
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class QueueFill:
-    """A queue now: `unread` messages, of at most `capacity`, and how many were refused so far because it was full."""
+    """A queue now: `unread` messages, of at most `capacity`, and how many were refused so far
+    because it was full."""
 
     mailbox: str
     unread: int
@@ -37,7 +38,10 @@ class Queues:
 
     def __init__(self, segment: Segment) -> None:
         names = [box.name for box in queues_of(segment.layout)]
-        self._ends = [(open_observer(segment, name), open_observer(segment, taken_name(name))) for name in names]
+        self._ends = [
+            (open_observer(segment, name), open_observer(segment, taken_name(name)))
+            for name in names
+        ]
 
     def look(self) -> tuple[QueueFill, ...]:
         """Return every queue as it is now."""
@@ -47,19 +51,24 @@ class Queues:
             taken = int(position.peek().value.taken)
             words = queue.slots.box
             spec = queue.spec
-            found.append(QueueFill(spec.name, words[Box.SENT] - taken, spec.capacity, words[Box.REFUSED]))
+            found.append(
+                QueueFill(spec.name, words[Box.SENT] - taken, spec.capacity, words[Box.REFUSED])
+            )
         return tuple(found)
 
 
 def queues(recording: Recording) -> list[dict[str, Any]]:
-    """Return what went through every queue: messages `sent`, `refused` (None: not recorded), most that ever waited.
+    """Return what went through every queue: messages `sent`, `refused` (None: not recorded), most
+    that ever waited.
 
     `waiting` counts the messages that a read could see, before it took any.
     """
     refused = recording.ended.get("refused", {})
     found = []
     for box in queues_of(recording.layout):
-        taken, unread = (recording.signal(taken_name(box.name), field) for field in ("taken", "unread"))
+        taken, unread = (
+            recording.signal(taken_name(box.name), field) for field in ("taken", "unread")
+        )
         before = np.concatenate(([0], taken[:-1]))
         sent = recording.signal(box.name, "serial")
         found.append(

@@ -1,4 +1,5 @@
-"""A snapshot of a running rack, from the host side: one row a task, what holds the rack, the progress of its task."""
+"""A snapshot of a running rack, from the host side: one row a task, what holds the rack, the
+progress of its task."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ TASK_STATUS = "task_status"
 class TaskRow:
     """One task now. Times are the longest of the newest cycles, in ms; None before the first.
 
-    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `row` is what fired of a state table.
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `row` is what fired
+    of a state table.
     """
 
     task: str
@@ -75,11 +77,12 @@ class TaskProgress:
 class Snapshot:
     """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
 
-    `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds` are the levels, or
-    the arm, that are kept from their work; `hosts` the boards of the host side, `entries` what passes to and from them;
-    `queues` are all of them, empty ones too; `inboxes` those of boards that messages interrupt; `exchanges` the
-    messages in use of boards with an exchange, by port; `peers` other racks on the network, `imports` and `exports`
-    what passes to and from them.
+    `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds`
+    are the levels, or the arm, that are kept from their work; `hosts` the boards of the host side,
+    `entries` what passes to and from them; `queues` are all of them, empty ones too; `inboxes`
+    those of boards that messages interrupt; `exchanges` the messages in use of boards with an
+    exchange, by port; `peers` other racks on the network, `imports` and `exports` what passes to
+    and from them.
     """
 
     rack: str
@@ -116,7 +119,9 @@ class RackMonitor:
         self._network = Network(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
-        self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(self._traces, (None, None))
+        self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(
+            self._traces, (None, None)
+        )
         written = {m.name: m.message for m in segment.layout.mailboxes}
         self._statuses = {
             task.name: open_observer(segment, f"{task.name}.status")
@@ -124,7 +129,9 @@ class RackMonitor:
             if f"{task.name}.status" in written
         }
         self._exchanges = {
-            box.writer: open_observer(segment, box.name) for box in segment.layout.mailboxes if box.message == EXCHANGE
+            box.writer: open_observer(segment, box.name)
+            for box in segment.layout.mailboxes
+            if box.message == EXCHANGE
         }
         whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
         self._whole = open_observer(segment, whole) if whole else None
@@ -144,7 +151,9 @@ class RackMonitor:
             lines=tuple(self._asserted()),
             demand=Demand(words[System.DEMAND]).name.lower(),
             faults=tuple(self._active_faults()),
-            tasks=tuple(self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))),
+            tasks=tuple(
+                self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
+            ),
             progress=self._progress(),
             holds=self._holds.look(),
             hosts=host_rows(self._segment),
@@ -171,14 +180,29 @@ class RackMonitor:
     def _asserted(self) -> list[str]:
         lines = self._lines
         held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
-        single = {"ACFAIL": lines.acfail, "SYSRESET": lines.sysreset, "EMERGENCY STOP": lines.emergency_stop}
+        single = {
+            "ACFAIL": lines.acfail,
+            "SYSRESET": lines.sysreset,
+            "EMERGENCY STOP": lines.emergency_stop,
+        }
         stepped = [HELD.format(self._segment.rack)] if self._segment.words[System.HELD] else []
-        return held + [name for name, asserted in single.items() if asserted] + self._without_priority() + stepped
+        return (
+            held
+            + [name for name, asserted in single.items() if asserted]
+            + self._without_priority()
+            + stepped
+        )
 
     def _without_priority(self) -> list[str]:
         """Return a warning when tasks were refused their real-time priority."""
-        blocks = {task.name: self._segment.block(task.name) for task in self._segment.layout.tasks if task.priority}
-        refused = [name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]]
+        blocks = {
+            task.name: self._segment.block(task.name)
+            for task in self._segment.layout.tasks
+            if task.priority
+        }
+        refused = [
+            name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]
+        ]
         words = self._segment.words
         is_up = words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]
         return [f"NO REAL-TIME PRIORITY: {', '.join(refused)}"] if refused and is_up else []
@@ -215,27 +239,37 @@ class RackMonitor:
         )
 
     def _restarts(self, task: str) -> int:
-        """Return how often a new process took over the task's mailboxes: each writes in a new epoch."""
+        """Return how often a new process took over the task's mailboxes: each writes in a new
+        epoch."""
         segment = self._segment
-        heads = [segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == task]
+        heads = [
+            segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == task
+        ]
         return max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)])
 
     def _times_ms(self, task: str) -> tuple[float | None, float | None]:
-        """Return the longest execution and lateness of the cycles since the last look that saw any."""
+        """Return the longest execution and lateness of the cycles since the last look that saw
+        any."""
         cycles = self._traces[task].drain().rows
         if len(cycles):
-            self._times[task] = float(execution_ns(cycles).max()) * 1e-6, float(lateness_ns(cycles).max()) * 1e-6
+            self._times[task] = (
+                float(execution_ns(cycles).max()) * 1e-6,
+                float(lateness_ns(cycles).max()) * 1e-6,
+            )
         return self._times[task]
 
     def _progress(self) -> TaskProgress | None:
         if self._whole is None or not (status := self._whole.peek()).is_there:
             return None
         at = status.value
-        return TaskProgress(at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason)
+        return TaskProgress(
+            at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason
+        )
 
 
 def fired(status: Message) -> str:
-    """Return what fired of a state table in a level's newest cycle, as text; empty for a level without one."""
+    """Return what fired of a state table in a level's newest cycle, as text; empty for a level
+    without one."""
     if "fired" not in (status.record.dtype.names or ()):
         return ""
     what = f"row {status.row} '{status.fired}'" if status.row else "no row"
@@ -243,5 +277,6 @@ def fired(status: Message) -> str:
 
 
 def joint_names(config: str) -> tuple[str, ...]:
-    """Return the joints of the arm in a resolved config, from base to tool; empty without an arm."""
+    """Return the joints of the arm in a resolved config, from base to tool; empty without an
+    arm."""
     return tuple(tomllib.loads(config).get("robot", {}).get("joints", ()))

@@ -17,7 +17,8 @@ LOOK_S = 0.001
 
 
 class WatchedRack(Protocol):
-    """A rack in a context, with its segment as of the last `refresh`; on this machine that is always up to date."""
+    """A rack in a context, with its segment as of the last `refresh`; on this machine that is
+    always up to date."""
 
     @property
     def segment(self) -> Segment:
@@ -27,7 +28,11 @@ class WatchedRack(Protocol):
         """Return it."""
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None, /
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+        /,
     ) -> None:
         """Leave it."""
 
@@ -38,7 +43,8 @@ class WatchedRack(Protocol):
         """Let no message of a mailbox be missing from now on, as far as its slots reach back."""
 
     def claim(self, request: Request) -> AbstractContextManager[RequestEntry]:
-        """Add a request, and withdraw it at the end of the `with` block unless it has been issued."""
+        """Add a request, and withdraw it at the end of the `with` block unless it has been
+        issued."""
 
 
 class LocalRack:
@@ -50,7 +56,12 @@ class LocalRack:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self.segment.close()
 
     def refresh(self) -> bool:

@@ -1,7 +1,8 @@
-"""Making of credentials: an authority, a certificate and key for each rack, and the secret of the seals.
+"""Making of credentials: an authority, a certificate and key for each rack, and the secret of the
+seals.
 
-The keys are on the curve P-256, which every TLS library knows. A certificate serves both sides of a connection: racks
-listen and connect.
+The keys are on the curve P-256, which every TLS library knows. A certificate serves both sides of a
+connection: racks listen and connect.
 """
 
 from __future__ import annotations
@@ -49,9 +50,11 @@ class _Authority(NamedTuple):
 
 
 def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int) -> Made:
-    """Write a certificate and key for each name with its addresses; a new authority and secret, if there are none.
+    """Write a certificate and key for each name with its addresses; a new authority and secret, if
+    there are none.
 
-    Raises `Failure`: a file is there already, the set there is not whole, or its authority has expired.
+    Raises `Failure`: a file is there already, the set there is not whole, or its authority has
+    expired.
     """
     now = datetime.now(UTC)
     wanted = [path.name for name in names for path in _pair(folder, name)]
@@ -62,7 +65,9 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     if there and len(there) < len(own):
         lost = ", ".join(name for name in own if name not in there)
         raise Failure(
-            f"{folder}: {lost} missing; a set is added to where its authority, with its key, and secret are", 2
+            f"{folder}: {lost} missing; a set is added to where its authority, with its key, and"
+            " secret are",
+            2,
         )
     files: dict[str, bytes] = {}
     if there:
@@ -75,7 +80,9 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     for name, addresses in names.items():
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = _signed(_for_rack(name, addresses, key, authority), authority, now, expires)
-        for path, content in zip(_pair(folder, name), (_pem(certificate), _key_pem(key)), strict=True):
+        for path, content in zip(
+            _pair(folder, name), (_pem(certificate), _key_pem(key)), strict=True
+        ):
             files[path.name] = content
     _write(folder, files)
     return Made(files, expires)
@@ -89,11 +96,17 @@ def _pair(folder: Path, name: str) -> tuple[Path, Path]:
 def _made(now: datetime, days: int) -> _Authority:
     key = ec.generate_private_key(ec.SECP256R1())
     name = _named(AUTHORITY_NAME)
-    builder = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+    builder = (
+        x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+    )
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
-    builder = builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-    return _Authority(_dated(builder, now, now + timedelta(days=days)).sign(key, hashes.SHA256()), key)
+    builder = builder.add_extension(
+        x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False
+    )
+    return _Authority(
+        _dated(builder, now, now + timedelta(days=days)).sign(key, hashes.SHA256()), key
+    )
 
 
 def _found(folder: Path, now: datetime) -> _Authority:
@@ -102,11 +115,20 @@ def _found(folder: Path, now: datetime) -> _Authority:
         certificate = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes())
         key = load_pem_private_key((folder / AUTHORITY_KEY).read_bytes(), None)
     except (ValueError, TypeError):
-        raise Failure(f"{folder}: {AUTHORITY} or {AUTHORITY_KEY} is not in PEM form, or has a password", 2) from None
-    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise Failure(
+            f"{folder}: {AUTHORITY} or {AUTHORITY_KEY} is not in PEM form, or has a password", 2
+        ) from None
+    if (
+        not isinstance(key, ec.EllipticCurvePrivateKey)
+        or key.public_key() != certificate.public_key()
+    ):
         raise Failure(f"{folder}: {AUTHORITY_KEY} is not the key of {AUTHORITY}", 2)
     if certificate.not_valid_after_utc <= now:
-        raise Failure(f"{folder}: {AUTHORITY} expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make a new set", 2)
+        raise Failure(
+            f"{folder}: {AUTHORITY} expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make a"
+            " new set",
+            2,
+        )
     return _Authority(certificate, key)
 
 
@@ -114,14 +136,18 @@ def _for_rack(
     name: str, addresses: Sequence[str], key: ec.EllipticCurvePrivateKey, authority: _Authority
 ) -> x509.CertificateBuilder:
     builder = x509.CertificateBuilder().subject_name(_named(name)).public_key(key.public_key())
-    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(
+        x509.BasicConstraints(ca=False, path_length=None), critical=True
+    )
     builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
     both = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
     builder = builder.add_extension(both, critical=False)
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
     builder = builder.add_extension(issuer, critical=False)
     if addresses:
-        builder = builder.add_extension(x509.SubjectAlternativeName(map(_address, addresses)), critical=False)
+        builder = builder.add_extension(
+            x509.SubjectAlternativeName(map(_address, addresses)), critical=False
+        )
     return builder
 
 
@@ -132,7 +158,9 @@ def _signed(
     return issued.sign(authority.key, hashes.SHA256())
 
 
-def _dated(builder: x509.CertificateBuilder, now: datetime, expires: datetime) -> x509.CertificateBuilder:
+def _dated(
+    builder: x509.CertificateBuilder, now: datetime, expires: datetime
+) -> x509.CertificateBuilder:
     numbered = builder.serial_number(x509.random_serial_number())
     return numbered.not_valid_before(now - EARLIER).not_valid_after(expires)
 
@@ -174,13 +202,16 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
         # Its owner's from the first moment on, and never through a link that somebody left.
-        fd = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY)
+        fd = os.open(
+            folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY
+        )
         with os.fdopen(fd, "wb") as file:
             file.write(content)
 
 
 def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
-    """Return the addresses by name from texts as in cell=10.0.0.1,cell.local or operator. Raises `Failure`."""
+    """Return the addresses by name from texts as in cell=10.0.0.1,cell.local or operator. Raises
+    `Failure`."""
     from pydantic import TypeAdapter, ValidationError
 
     from rack.boards.lan.config import PeerName
@@ -196,10 +227,14 @@ def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
             for address in addresses:
                 Endpoint.of(f"tls/[{address}]:1" if ":" in address else f"tls/{address}:1")
         except ValidationError:
-            raise Failure(f'--for = "{entry}": permitted names: a-z, 0-9, _ and -, at most 40', 2) from None
+            raise Failure(
+                f'--for = "{entry}": permitted names: a-z, 0-9, _ and -, at most 40', 2
+            ) from None
         except ValueError:
             raise Failure(
-                f'--for = "{entry}": permitted: NAME, or NAME=ADDRESS,... with host names or addresses', 2
+                f'--for = "{entry}": permitted: NAME, or NAME=ADDRESS,... with host names or'
+                " addresses",
+                2,
             ) from None
         if name in found:
             raise Failure(f'--for = "{entry}": {name} is named twice', 2)

@@ -13,13 +13,18 @@ from rack.tools.console.parameters import Json
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 YEAR = 365
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="folder of the set; made if it does not exist")]
+Folder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="folder of the set; made if it does not exist")
+]
 For = Annotated[
     list[str],
     typer.Option(
         "--for",
         metavar="NAME[=ADDRESS,...]",
-        help="rack, or person, that gets a certificate, with the addresses at which others reach it; repeatable",
+        help=(
+            "rack, or person, that gets a certificate, with the addresses at which others reach it;"
+            " repeatable"
+        ),
     ),
 ]
 Days = Annotated[int, typer.Option(metavar="N", min=1, max=3650, help="validity, days")]
@@ -34,19 +39,21 @@ def lan() -> None:
 def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = False) -> None:
     """Make a set of certificates for tests: an authority, a pair for each name, and a secret.
 
-    Racks know each other by name: the common name of a certificate is the name of the rack, and what a rack may send,
-    read or command depends on it. Give a rack that listens the addresses or host names that stand in the others'
-    `connect`: they check them. One that only connects, or a person who uses `rack status HOST/RACK` and the like, needs
-    none.
+    Racks know each other by name: the common name of a certificate is the name of the rack, and
+    what a rack may send, read or command depends on it. Give a rack that listens the addresses or
+    host names that stand in the others' `connect`: they check them. One that only connects, or a
+    person who uses `rack status HOST/RACK` and the like, needs none.
 
-    In DIR it writes authority.pem and authority-key.pem, NAME.pem and NAME-key.pem for each name, and secret, the key
-    of the seals on all messages. In a folder that holds a set already, it adds names to it. It never overwrites.
+    In DIR it writes authority.pem and authority-key.pem, NAME.pem and NAME-key.pem for each name,
+    and secret, the key of the seals on all messages. In a folder that holds a set already, it adds
+    names to it. It never overwrites.
 
-    A config names the folder in [adapter.lan]: certificates = "DIR", relative to the config. Each machine needs only
-    authority.pem, secret, and its own pair. Keys and secret must be readable by their owner alone.
+    A config names the folder in [adapter.lan]: certificates = "DIR", relative to the config. Each
+    machine needs only authority.pem, secret, and its own pair. Keys and secret must be readable by
+    their owner alone.
 
-    It is a set for tests: one folder holds the keys of all. Where it matters, have your own authority sign certificates
-    with the same names, from keys that never leave their machines.
+    It is a set for tests: one folder holds the keys of all. Where it matters, have your own
+    authority sign certificates with the same names, from keys that never leave their machines.
 
     Exit status: 0 made, 2 nothing was made.
 
@@ -58,7 +65,9 @@ def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = 
     try:
         from rack.tools.network.certificates import make_credentials, named_addresses
     except ImportError:
-        raise Failure("certificates are made with 'cryptography', which is missing: install nasrem-rack[lan]") from None
+        raise Failure(
+            "certificates are made with 'cryptography', which is missing: install nasrem-rack[lan]"
+        ) from None
     by_name = named_addresses(names)
     made = make_credentials(folder, by_name, days)
     answer = {
@@ -72,6 +81,9 @@ def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = 
         f"made in {folder}: {', '.join(made.files)}",
         f"valid until {made.expires:%Y-%m-%d}",
         "A set for tests: whoever has this folder can pass for any of these racks.",
-        f"Each machine needs only authority.pem, secret, and its own pair, as in {first}.pem and {first}-key.pem.",
+        (
+            f"Each machine needs only authority.pem, secret, and its own pair, as in {first}.pem"
+            f" and {first}-key.pem."
+        ),
     ]
     print_answer(answer, lines, as_json)

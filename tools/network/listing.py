@@ -25,8 +25,8 @@ AT_ONCE = 8
 class FoundRack:
     """A rack at a host, or why there is none to show: then `rack` is empty.
 
-    `age_s` is the time since its launch, by its own machine's clock; None where it does not say. `peers` are the racks
-    that it works with, and where each is.
+    `age_s` is the time since its launch, by its own machine's clock; None where it does not say.
+    `peers` are the racks that it works with, and where each is.
     """
 
     host: str
@@ -40,7 +40,11 @@ class FoundRack:
 def racks_at(hosts: Sequence[HostAddress], asker: Asker) -> list[FoundRack]:
     """Return the racks at these hosts, in their order."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        return [found for at_host in pool.map(lambda host: list(_at(host, asker)), hosts) for found in at_host]
+        return [
+            found
+            for at_host in pool.map(lambda host: list(_at(host, asker)), hosts)
+            for found in at_host
+        ]
 
 
 def known_hosts() -> list[HostAddress]:
@@ -88,7 +92,11 @@ def _described(host: str, rack: RemoteRack) -> FoundRack:
 
 def _peers(segment: Segment) -> Iterator[tuple[str, str]]:
     """Yield the racks that this one works with, and where each is."""
-    ports = {box.name.partition(".")[2]: box.name for box in segment.layout.mailboxes if box.message == PEER.name}
+    ports = {
+        box.name.partition(".")[2]: box.name
+        for box in segment.layout.mailboxes
+        if box.message == PEER.name
+    }
     lan = tomllib.loads(segment.config)["adapter"]["lan"]
     others = [entry["from"].partition("/")[0] for entry in lan.get("import", {}).values()]
     for name in dict.fromkeys([*others, *lan.get("peers", ())]):

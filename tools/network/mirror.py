@@ -1,10 +1,13 @@
-"""A mirror of a rack's segment in this process: a window of another machine's memory, mapped into one's own.
+"""A mirror of a rack's segment in this process: a window of another machine's memory, mapped into
+one's own.
 
-What reads a segment reads a mirror too, unchanged. `refresh` fetches what has changed: the words of the clock, control
-blocks and heads first, then the records that the heads count. The newest record of a mailbox is fetched again each
-time: if a forged message was there, its writer has put its own in that place.
+What reads a segment reads a mirror too, unchanged. `refresh` fetches what has changed: the words of
+the clock, control blocks and heads first, then the records that the heads count. The newest record
+of a mailbox is fetched again each time: if a forged message was there, its writer has put its own
+in that place.
 
-Nothing in it is a fact about this machine: process ids are those of the other one, and so is CLOCK_MONOTONIC.
+Nothing in it is a fact about this machine: process ids are those of the other one, and so is
+CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -40,17 +43,21 @@ WORDS = Stretch(0, 8 * 96)
 MOST_SIZE = 1 << 30
 """Bytes of the largest segment that is mirrored."""
 NEWEST = 2
-"""Messages of a mailbox that are kept up to date: the newest, and the one before in case that is damaged."""
+"""Messages of a mailbox that are kept up to date: the newest, and the one before in case that is
+damaged."""
 
 Fetch = Callable[[Sequence[Stretch]], tuple[list[bytes], DeskAnswer]]
-"""Returns the content of stretches of the other segment, each of at most `MOST_CONTENT` bytes, and the last answer."""
+"""Returns the content of stretches of the other segment, each of at most `MOST_CONTENT` bytes, and
+the last answer."""
 
 
 @dataclass
 class MirroredRing:
-    """A ring of records: the bus addresses of its head word and its records; `taken` records were fetched so far.
+    """A ring of records: the bus addresses of its head word and its records; `taken` records were
+    fetched so far.
 
-    `most` of the newest are fetched; `oldest` is the number of the oldest that is here with all after it.
+    `most` of the newest are fetched; `oldest` is the number of the oldest that is here with all
+    after it.
     """
 
     head: int
@@ -84,26 +91,36 @@ class MirroredRing:
 
 
 class Mirror(Segment):
-    """A mirror; `is_there` says whether the rack answered last time. Its `rack` is the name by which users know it."""
+    """A mirror; `is_there` says whether the rack answered last time. Its `rack` is the name by
+    which users know it."""
 
     is_mirror = True
 
     def __init__(self, rack: str, fetch: Fetch) -> None:
-        """Fetch layout and config. Raises `SegmentError` when the other program has another version."""
+        """Fetch layout and config. Raises `SegmentError` when the other program has another
+        version."""
         self._fetch = fetch
         (head,), answer = fetch([WORDS])
         words = memoryview(head).cast("q")
         is_known = words[Head.MAGIC] == MAGIC and words[Head.VERSION] == VERSION
         if not is_known or not len(head) < words[Head.SIZE] <= MOST_SIZE:
-            raise SegmentError(f"rack '{rack}': another version; this program mirrors layouts of version {VERSION}")
+            raise SegmentError(
+                f"rack '{rack}': another version; this program mirrors layouts of version {VERSION}"
+            )
         super().__init__(rack, mmap.mmap(-1, words[Head.SIZE]))
         self.is_there = True
         self._note(answer)
-        texts = [_cut(words[at], words[at + 1], len(self.bytes)) for at in (Head.LAYOUT_AT, Head.CONFIG_AT)]
+        texts = [
+            _cut(words[at], words[at + 1], len(self.bytes))
+            for at in (Head.LAYOUT_AT, Head.CONFIG_AT)
+        ]
         self._fill([WORDS, *texts[0], *texts[1]])
         self.read_head()
         self._rings = {ring.head: ring for ring in _rings(self)}
-        self._watched = [WORDS, *_merged([*_heads(self), *(Stretch(head, 8) for head in self._rings)])]
+        self._watched = [
+            WORDS,
+            *_merged([*_heads(self), *(Stretch(head, 8) for head in self._rings)]),
+        ]
         self._requests = OperatorTable(self).entries
 
     def follow(self, mailbox: str) -> None:
@@ -168,7 +185,8 @@ class Mirror(Segment):
         return bool(self._hosts >> hosts.index(address) & 1)
 
     def oldest(self, ring: int) -> int:
-        """Return the number of the oldest record here of the ring whose head word is at a bus address."""
+        """Return the number of the oldest record here of the ring whose head word is at a bus
+        address."""
         return self._rings[ring].oldest
 
     @property
@@ -178,10 +196,14 @@ class Mirror(Segment):
 
 
 def _cut(address: int, size: int, end: int) -> list[Stretch]:
-    """Return a stretch in pieces that fit an answer. Raises `SegmentError` when it is not in the segment."""
+    """Return a stretch in pieces that fit an answer. Raises `SegmentError` when it is not in the
+    segment."""
     if not 0 <= address <= address + size <= end:
         raise SegmentError(f"{size} bytes at {address}: outside the segment, which has {end} bytes")
-    return [Stretch(at, min(MOST_CONTENT, address + size - at)) for at in range(address, address + size, MOST_CONTENT)]
+    return [
+        Stretch(at, min(MOST_CONTENT, address + size - at))
+        for at in range(address, address + size, MOST_CONTENT)
+    ]
 
 
 def _heads(segment: Segment) -> Iterator[Stretch]:
@@ -197,12 +219,16 @@ def _rings(segment: Segment) -> Iterator[MirroredRing]:
         first = segment.map.traces[task.name]
         yield MirroredRing(head, first, TRACE_RECORD_SIZE, task.depth, task.depth, is_mailbox=False)
     for address in segment.map.alarms.values():
-        yield MirroredRing(address, address + LINE, ALARM_RECORD_SIZE, ALARM_DEPTH, ALARM_DEPTH, is_mailbox=False)
+        yield MirroredRing(
+            address, address + LINE, ALARM_RECORD_SIZE, ALARM_DEPTH, ALARM_DEPTH, is_mailbox=False
+        )
     for box in layout.mailboxes:
         address = segment.map.mailboxes[box.name]
         most = box.depth if box.name.endswith(".operator") else NEWEST
         first = address + MAILBOX_HEAD_SIZE
-        yield MirroredRing(address + 8 * Box.HEAD, first, slot_stride(box), box.depth, most, is_mailbox=True)
+        yield MirroredRing(
+            address + 8 * Box.HEAD, first, slot_stride(box), box.depth, most, is_mailbox=True
+        )
 
 
 def _merged(stretches: Iterable[Stretch]) -> list[Stretch]:

@@ -1,7 +1,7 @@
 """A session with the racks at one host, and the questions that it asks them.
 
-It listens nowhere and ends with its context. Everything is asked again until it is answered or `PATIENCE_S` is over: a
-rack that many ask drops questions.
+It listens nowhere and ends with its context. Everything is asked again until it is answered or
+`PATIENCE_S` is over: a rack that many ask drops questions.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class _Question(NamedTuple):
 
 
 class Questioner:
-    """A session at one host, in a context. Raises `Failure` when nobody is there, or it refuses this user."""
+    """A session at one host, in a context. Raises `Failure` when nobody is there, or it refuses
+    this user."""
 
     def __init__(self, at: HostAddress, asker: Asker) -> None:
         self._at = at
@@ -71,7 +72,9 @@ class Questioner:
         check_reach(at, asker)
         protocol = "tls" if asker.certificates else "tcp"
         endpoint = f"{protocol}/{at.host}:{at.port}"
-        table = LanTable(connect=(endpoint,), certificates=asker.certificates or None, most_bytes=MOST_BYTES)
+        table = LanTable(
+            connect=(endpoint,), certificates=asker.certificates or None, most_bytes=MOST_BYTES
+        )
         try:
             self._link = LanLink(asker.name, table, asks=True)
         except LevelError as error:
@@ -103,7 +106,8 @@ class Questioner:
             self._changed.notify_all()
 
     def launch(self, rack: str) -> FarLaunch:
-        """Return the launch of a rack that is there. Raises `Failure` when it is not: it names those that are."""
+        """Return the launch of a rack that is there. Raises `Failure` when it is not: it names
+        those that are."""
         with self._changed:
             self._changed.wait_for(lambda: self._launches, CONNECT_S)
             self._changed.wait_for(lambda: rack in self._launches, OTHERS_S)
@@ -128,16 +132,20 @@ class Questioner:
         return self._launches.get(rack) == launch
 
     def ask(self, asked: FarLaunch, what: What, payloads: Sequence[bytes]) -> Iterator[DeskAnswer]:
-        """Yield the answers to questions of one kind, in their order. Raises `Failure` when one has none, or a refusal.
+        """Yield the answers to questions of one kind, in their order. Raises `Failure` when one has
+        none, or a refusal.
 
         All are on their way at once; one that comes back without an answer is asked again.
         """
-        pending = [self._question(asked.rack, what, payload, self._number + 1) for payload in payloads]
+        pending = [
+            self._question(asked.rack, what, payload, self._number + 1) for payload in payloads
+        ]
         for payload, question in zip(payloads, pending, strict=True):
             yield self._granted(asked.rack, what, self._answer(asked, what, payload, question))
 
     def _question(self, rack: str, what: What, payload: bytes, first: int) -> _Question:
-        """Ask; `first` is the number under which this was asked for the first time: nothing is done twice."""
+        """Ask; `first` is the number under which this was asked for the first time: nothing is done
+        twice."""
         self._number += 1
         key = question_key(rack, what, self._asker.name)
         head = Envelope(VERSION, self._session, self._number, first, 0, 0, 0)
@@ -151,8 +159,11 @@ class Questioner:
         )
         return _Question(self._number, first, key, replies)
 
-    def _answer(self, asked: FarLaunch, what: What, payload: bytes, question: _Question) -> DeskAnswer:
-        """Return the answer to a question. Raises `Failure` when there is none within the patience."""
+    def _answer(
+        self, asked: FarLaunch, what: What, payload: bytes, question: _Question
+    ) -> DeskAnswer:
+        """Return the answer to a question. Raises `Failure` when there is none within the
+        patience."""
         deadline = time.monotonic() + PATIENCE_S
         returned = 0
         timed_out = False
@@ -170,7 +181,10 @@ class Questioner:
                 raise Failure(f"rack '{asked.rack}' {self._denied(what)}")
             if time.monotonic() > deadline:
                 why = "its adapter does not cycle; does `rack step` hold it?"
-                raise Failure(f"rack '{asked.rack}' at {self._at} has not answered for {PATIENCE_S:g} s: {why}")
+                raise Failure(
+                    f"rack '{asked.rack}' at {self._at} has not answered for {PATIENCE_S:g} s:"
+                    f" {why}"
+                )
             self._until.wait(PAUSE_S)
             question = self._question(asked.rack, what, payload, question.first)
 
@@ -186,14 +200,19 @@ class Questioner:
         return DeskAnswer.unpacked(payload)
 
     def _denied(self, what: What) -> str:
-        return f"does not permit '{self._asker.name}' to {NEEDED[what]}; its config: adapter.lan.permit"
+        return (
+            f"does not permit '{self._asker.name}' to {NEEDED[what]}; its config:"
+            " adapter.lan.permit"
+        )
 
     def _granted(self, rack: str, what: What, answer: DeskAnswer) -> DeskAnswer:
         if answer.code is Code.GRANTED:
             return answer
         reasons = {
             Code.NOT_PERMITTED: self._denied(what),
-            Code.OTHER_VERSION: f"is of another version; this program asks racks of version {VERSION}",
+            Code.OTHER_VERSION: (
+                f"is of another version; this program asks racks of version {VERSION}"
+            ),
             Code.OUTSIDE: "has no such memory",
             Code.NOT_VALID: "knows no such command",
             Code.PAST: "has passed that tick",
@@ -204,7 +223,8 @@ class Questioner:
 
 
 def check_reach(at: HostAddress, asker: Asker) -> None:
-    """Raise `Failure` when nobody listens there, it refuses this user's certificate, or there is none to show."""
+    """Raise `Failure` when nobody listens there, it refuses this user's certificate, or there is
+    none to show."""
     host = at.host.strip("[]")
     try:
         with socket.create_connection((host, at.port), CONNECT_S) as connection:
@@ -219,21 +239,27 @@ def check_reach(at: HostAddress, asker: Asker) -> None:
     except TimeoutError:
         raise Failure(f"{at}: no answer at port {at.port} within {CONNECT_S:g} s") from None
     except OSError as error:
-        why = os.strerror(error.errno) if isinstance(error.errno, int) and error.errno > 0 else error.strerror
+        why = (
+            os.strerror(error.errno)
+            if isinstance(error.errno, int) and error.errno > 0
+            else error.strerror
+        )
         raise Failure(f"{at}: cannot connect to port {at.port}: {why or error}") from None
     if not asker.certificates and not address.is_loopback:
         raise Failure(f"{at}: not this machine, so it needs certificates; see --certificates", 2)
 
 
 def _shake_hands(connection: socket.socket, host: str, asker: Asker) -> None:
-    """Show the certificate and look at the other one, as the session will: it would only try again and again."""
+    """Show the certificate and look at the other one, as the session will: it would only try again
+    and again."""
     credentials = Credentials(Path(asker.certificates), asker.name)
     if (flaw := next(credentials.flaws(), None)) is not None:
         raise Failure(str(flaw))
     context = ssl.create_default_context(cafile=credentials.authority)
     context.load_cert_chain(credentials.certificate, credentials.key)
     with context.wrap_socket(connection, server_hostname=host) as secure:
-        # The other side judges our certificate after its own part is done: a refusal comes as the first thing to read.
+        # The other side judges our certificate after its own part is done: a refusal comes as the
+        # first thing to read.
         secure.settimeout(REFUSAL_S)
         with suppress(TimeoutError):
             secure.recv(1)

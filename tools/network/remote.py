@@ -30,8 +30,8 @@ AT_ONCE = 4
 class RemoteRack:
     """One launch of a rack on another machine, in a context.
 
-    `segment` is a mirror of its segment as of the last `refresh`. Raises `Failure` when the rack cannot be reached, or
-    does not permit this user to watch.
+    `segment` is a mirror of its segment as of the last `refresh`. Raises `Failure` when the rack
+    cannot be reached, or does not permit this user to watch.
     """
 
     def __init__(self, address: RackAddress, asker: Asker | None = None) -> None:
@@ -82,7 +82,8 @@ class RemoteRack:
 
     @contextmanager
     def claim(self, request: Request) -> Iterator[RequestEntry]:
-        """Give a request to the rack, and withdraw it at the end of the `with` block unless it has been issued."""
+        """Give a request to the rack, and withdraw it at the end of the `with` block unless it has
+        been issued."""
         self._check_right("command")
         (answer,) = self._racks.ask(self._launch, "give", [packed_request(request)])
         ticket = Ticket.unpacked(answer.content)
@@ -108,7 +109,8 @@ class RemoteRack:
 
 
 def stop(address: RackAddress, asker: Asker) -> int:
-    """Set the emergency stop of a rack; return the tick at which that was done. Raises `Failure`."""
+    """Set the emergency stop of a rack; return the tick at which that was done. Raises
+    `Failure`."""
     with Questioner(address.at, asker) as racks:
         (answer,) = racks.ask(racks.launch(address.rack), "stop", [b""])
         return answer.tick
@@ -130,7 +132,8 @@ def _questions(stretches: Sequence[Stretch]) -> Iterator[list[Stretch]]:
 
 
 def _parts(content: bytes, stretches: Sequence[Stretch]) -> Iterator[bytes]:
-    """Yield the part of an answer that belongs to each stretch. Raises `Failure` when it is too short or too long."""
+    """Yield the part of an answer that belongs to each stretch. Raises `Failure` when it is too
+    short or too long."""
     if len(content) != sum(stretch.size for stretch in stretches):
         raise Failure("an answer is not as long as what was asked for")
     at = 0

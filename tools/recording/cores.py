@@ -1,7 +1,8 @@
 """What the machine did to its cores during a run, apart from our own lateness.
 
-Steal is time during which the hypervisor held a core that this machine needed; /proc/stat counts it by core. A core
-that runs at a lower frequency computes longer; cpufreq shows it, or else /proc/cpuinfo where it has the field.
+Steal is time during which the hypervisor held a core that this machine needed; /proc/stat counts it
+by core. A core that runs at a lower frequency computes longer; cpufreq shows it, or else
+/proc/cpuinfo where it has the field.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ _MS = 1000 // os.sysconf("SC_CLK_TCK")
 
 
 class Stolen(NamedTuple):
-    """Time stolen from a core between two looks (CLOCK_MONOTONIC); the kernel counts in steps of 10 ms."""
+    """Time stolen from a core between two looks (CLOCK_MONOTONIC); the kernel counts in steps of 10
+    ms."""
 
     from_ns: int
     to_ns: int
@@ -36,7 +38,8 @@ class Stolen(NamedTuple):
 
 @dataclass(frozen=True)
 class CoreRecord:
-    """What was seen in `lasted_ns`: the rises of steal, earliest first, and lowest and highest MHz by core.
+    """What was seen in `lasted_ns`: the rises of steal, earliest first, and lowest and highest MHz
+    by core.
 
     `stolen` is None where steal was not measured; a core without a frequency is not in `mhz`.
     """
@@ -51,16 +54,24 @@ class CoreRecord:
 
     @classmethod
     def of(cls, text: str | bytes) -> Self:
-        """Return the record in JSON. Raises `ValueError`, `KeyError` or `TypeError` for anything else."""
+        """Return the record in JSON. Raises `ValueError`, `KeyError` or `TypeError` for anything
+        else."""
         found = json.loads(text)
-        stolen = None if found["stolen"] is None else tuple(Stolen(*map(int, span)) for span in found["stolen"])
+        stolen = (
+            None
+            if found["stolen"] is None
+            else tuple(Stolen(*map(int, span)) for span in found["stolen"])
+        )
         mhz = tuple((int(core), float(low), float(high)) for core, low, high in found["mhz"])
         return cls(int(found["lasted_ns"]), stolen, mhz)
 
     def stolen_ms(self) -> dict[int, int]:
         """Return the time stolen by core; cores that lost none are left out."""
         spans = self.stolen or ()
-        return {core: sum(s.ms for s in spans if s.core == core) for core in sorted({s.core for s in spans})}
+        return {
+            core: sum(s.ms for s in spans if s.core == core)
+            for core in sorted({s.core for s in spans})
+        }
 
 
 UNMEASURED = CoreRecord()
@@ -83,7 +94,11 @@ class CoreMeter:
         now = time.monotonic_ns()
         if counts != self._counts:
             rises = {core: count - self._counts.get(core, count) for core, count in counts.items()}
-            self._stolen += [Stolen(self._looked_ns, now, core, rise * _MS) for core, rise in rises.items() if rise > 0]
+            self._stolen += [
+                Stolen(self._looked_ns, now, core, rise * _MS)
+                for core, rise in rises.items()
+                if rise > 0
+            ]
         self._counts = counts
         self._looked_ns = now
         if time.monotonic() >= self._frequency_at:
@@ -95,13 +110,19 @@ class CoreMeter:
     def record(self) -> CoreRecord:
         """Return what was seen up to the last look."""
         mhz = tuple((core, low, high) for core, (low, high) in sorted(self._mhz.items()))
-        return CoreRecord(self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None, mhz)
+        return CoreRecord(
+            self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None, mhz
+        )
 
 
 def _counts() -> dict[int, int]:
     """Return steal by core, in the kernel's ticks; empty where the kernel does not count it."""
     lines = [line.split() for line in STAT.read_text().splitlines()]
-    cores = [line for line in lines if line[0].startswith("cpu") and line[0] != "cpu" and len(line) > STEAL]
+    cores = [
+        line
+        for line in lines
+        if line[0].startswith("cpu") and line[0] != "cpu" and len(line) > STEAL
+    ]
     return {int(line[0].removeprefix("cpu")): int(line[STEAL]) for line in cores}
 
 
@@ -113,6 +134,9 @@ def _frequencies() -> Iterator[tuple[int, float]]:
         with suppress(OSError, ValueError):
             yield int(path.parts[-3].removeprefix("cpu")), int(path.read_text()) / 1000
     for block in () if found else CPUINFO.read_text().split("\n\n"):
-        fields = {name.strip(): value for name, _, value in (line.partition(":") for line in block.splitlines())}
+        fields = {
+            name.strip(): value
+            for name, _, value in (line.partition(":") for line in block.splitlines())
+        }
         with suppress(KeyError, ValueError):
             yield int(fields["processor"]), float(fields["cpu MHz"])

@@ -16,8 +16,8 @@ from rack.tools.recording.stalls import stalls_of
 START_UP_S = 0.1
 """Simulated time after the start of a process in which its cycles are not judged.
 
-It touches its memory for the first time and fills its caches: the first cycle of each level of the default rack takes
-2 to 8 times as long as usual; from the sixth on they are alike.
+It touches its memory for the first time and fills its caches: the first cycle of each level of the
+default rack takes 2 to 8 times as long as usual; from the sixth on they are alike.
 """
 WORST = 100.0
 """The percentile of eq. 3.6: the longest of all cycles."""
@@ -29,11 +29,11 @@ _EXCHANGE, _READ, _PROCESS, _WRITE = range(4)
 class Cycles:
     """The cycles of one task, oldest first; of a planner only those that made a plan.
 
-    `rows` are the trace records, shape (n,). `parts` are processor times, ns, shape (n, 4): C, R, X, W of an executor;
-    0, reading, P, U of a planner. `is_judged` excludes the start-up of a process, and the `stalled` cycles: those in
-    which the core may have been away (see `stalls_of`); bool, shape (n,).
-    `core` and `priority` are those that the task obtained; `overhead_ns` is the processor time of a cycle outside its
-    parts, for waking up and closing it.
+    `rows` are the trace records, shape (n,). `parts` are processor times, ns, shape (n, 4): C, R,
+    X, W of an executor; 0, reading, P, U of a planner. `is_judged` excludes the start-up of a
+    process, and the `stalled` cycles: those in which the core may have been away (see `stalls_of`);
+    bool, shape (n,). `core` and `priority` are those that the task obtained; `overhead_ns` is the
+    processor time of a cycle outside its parts, for waking up and closing it.
     """
 
     task: TaskSpec
@@ -103,12 +103,15 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
             whole = settled & (away[core].within(rows["start_ns"], rows["end_ns"]) == 0)
             judged = whole if whole.any() else settled
             stalled = int(settled.sum() - judged.sum())
-            found[task.name] = Cycles(task, core, priority, rows, parts, judged, stalled, overhead_ns(rows))
+            found[task.name] = Cycles(
+                task, core, priority, rows, parts, judged, stalled, overhead_ns(rows)
+            )
     return found
 
 
 def _settled(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
-    """Return which cycles do not belong to the start-up of a process; all where none would be left."""
+    """Return which cycles do not belong to the start-up of a process; all where none would be
+    left."""
     span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
     settled = np.ones(len(ticks), bool)
     for begun in (0, *restarts(recording).get(task, ())):
@@ -126,12 +129,13 @@ def restarts(recording: Recording) -> dict[str, list[int]]:
 
 
 def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[str, Budget]:
-    """Return the processor time that each level of a run took, by board; levels that never ran are left out.
+    """Return the processor time that each level of a run took, by board; levels that never ran are
+    left out.
 
-    Each part is the longest of all cycles (eq. 3.6), whether or not they fell into the same one; with a `percentile`
-    below 100, the longest of that many in a hundred. The start-up of processes (`START_UP_S`) is excluded, and so are
-    cycles with a stall in them: a virtual machine stalled by its host counts that as processor time. Raises
-    `Failure` as `cycles_of`.
+    Each part is the longest of all cycles (eq. 3.6), whether or not they fell into the same one;
+    with a `percentile` below 100, the longest of that many in a hundred. The start-up of processes
+    (`START_UP_S`) is excluded, and so are cycles with a stall in them: a virtual machine stalled by
+    its host counts that as processor time. Raises `Failure` as `cycles_of`.
     """
     return budgets_of(cycles_of(recording), percentile)
 

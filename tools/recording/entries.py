@@ -19,9 +19,11 @@ from rack.tools.recording.recording import Recording
 
 
 def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
-    """Return what each bus adapter of a config wrote in the run in folder `run`, by adapter and port.
+    """Return what each bus adapter of a config wrote in the run in folder `run`, by adapter and
+    port.
 
-    Raises `ConfigError` for mistakes in the config, and `Failure` if the run has other entries, or lost some.
+    Raises `ConfigError` for mistakes in the config, and `Failure` if the run has other entries, or
+    lost some.
     """
     layout = resolve(config).layout
     recording = Recording(run)
@@ -29,7 +31,9 @@ def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
     hosts = {host.name for host in layout.hosts}
     found: dict[str, Entries] = {}
     for board, entries in _bridges(config):
-        inward = [port for port, entry in entries.items() if layout.mailbox(entry.source).writer in hosts]
+        inward = [
+            port for port, entry in entries.items() if layout.mailbox(entry.source).writer in hosts
+        ]
         boxes = {port: layout.mailbox(f"{board}.{port}") for port in (*inward, STATUS)}
         for box in boxes.values():
             _check(box, ran.get(box.name), recording)
@@ -49,14 +53,22 @@ def _bridges(config: RackConfig) -> Iterator[tuple[str, dict[str, EntryConfig]]]
 
 
 def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:
-    if recorded is None or (recorded.message, recorded.version, recorded.size) != (box.message, box.version, box.size):
+    if recorded is None or (recorded.message, recorded.version, recorded.size) != (
+        box.message,
+        box.version,
+        box.size,
+    ):
         what = (
-            "no such mailbox" if recorded is None else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
+            "no such mailbox"
+            if recorded is None
+            else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
         )
         wanted = f"{box.message} {box.version}, {box.size} bytes"
         raise Failure(f"--entries {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
     if lost := recording.lost.get(box.name):
-        raise Failure(f"--entries {recording.folder}: {box.name}: its recorder lost {lost} messages", 2)
+        raise Failure(
+            f"--entries {recording.folder}: {box.name}: its recorder lost {lost} messages", 2
+        )
 
 
 def _rows(recording: Recording, box: MailboxSpec, is_queued: bool) -> list[tuple[int, bytes]]:

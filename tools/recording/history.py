@@ -1,4 +1,5 @@
-"""What happened in a run: misses, what the machine did to its cores, holds, and the tick at which two runs diverge."""
+"""What happened in a run: misses, what the machine did to its cores, holds, and the tick at which
+two runs diverge."""
 
 from __future__ import annotations
 
@@ -23,21 +24,41 @@ OWN = "holding"
 
 
 def misses(recording: Recording) -> list[dict[str, Any]]:
-    """Return every miss in the trace, earliest first: task, tick, `what` ("late" or "skipped"), count, times.
+    """Return every miss in the trace, earliest first: task, tick, `what` ("late" or "skipped"),
+    count, times.
 
     A skipped release leaves no record of its own: the next record has the number skipped before it.
     """
-    found = [miss for task in recording.layout.tasks for miss in _misses_of(task, recording.trace(task.name))]
+    found = [
+        miss
+        for task in recording.layout.tasks
+        for miss in _misses_of(task, recording.trace(task.name))
+    ]
     return sorted(found, key=lambda miss: (miss["tick"], miss["task"]))
 
 
 def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
     rows = cycles[is_missed(cycles) | (skipped(cycles) > 0)]
     found = []
-    columns = rows["tick"], skipped(rows), is_missed(rows), lateness_ns(rows) * 1e-6, lasted_ns(rows) * 1e-6
-    for tick, before, missed, late_ms, took_ms in zip(*(column.tolist() for column in columns), strict=True):
+    columns = (
+        rows["tick"],
+        skipped(rows),
+        is_missed(rows),
+        lateness_ns(rows) * 1e-6,
+        lasted_ns(rows) * 1e-6,
+    )
+    for tick, before, missed, late_ms, took_ms in zip(
+        *(column.tolist() for column in columns), strict=True
+    ):
         if before:
-            found.append({"task": task.name, "tick": tick - before * task.every, "what": "skipped", "count": before})
+            found.append(
+                {
+                    "task": task.name,
+                    "tick": tick - before * task.every,
+                    "what": "skipped",
+                    "count": before,
+                }
+            )
         if missed:
             times = {"started_ms": round(late_ms, 6), "took_ms": round(took_ms, 6)}
             found.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
@@ -46,7 +67,9 @@ def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
 
 def counted(found: Sequence[dict[str, Any]]) -> tuple[int, int]:
     """Return how many cycles of `misses` ended late, and how many were skipped."""
-    late, left_out = (sum(miss["count"] for miss in found if miss["what"] == what) for what in ("late", "skipped"))
+    late, left_out = (
+        sum(miss["count"] for miss in found if miss["what"] == what) for what in ("late", "skipped")
+    )
     return late, left_out
 
 
@@ -67,17 +90,24 @@ def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
 
 
 def holds(recording: Recording) -> list[dict[str, Any]]:
-    """Return every hold, the earliest first; `until_s` is None where it lasted to the end of the run.
+    """Return every hold, the earliest first; `until_s` is None where it lasted to the end of the
+    run.
 
-    `by` is "operator", with the command as `why`; or "holding", with the last reason that the level gave.
+    `by` is "operator", with the command as `why`; or "holding", with the last reason that the level
+    gave.
     """
-    levels = [mailbox.removesuffix(".status") for mailbox in recording.mailboxes if mailbox.endswith(".status")]
+    levels = [
+        mailbox.removesuffix(".status")
+        for mailbox in recording.mailboxes
+        if mailbox.endswith(".status")
+    ]
     found = [hold for level in levels for hold in _holds_of(recording, level)]
     return sorted(found, key=lambda hold: (hold["since_s"], hold["level"]))
 
 
 def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
-    """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when first."""
+    """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when
+    first."""
     found = {}
     for mailbox in recording.mailboxes:
         if not {"table", "row", "fired"} <= recording.fields(mailbox):
@@ -86,12 +116,22 @@ def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
         row = recording.signal(mailbox, "row")
         texts = recording.signal(mailbox, "table"), recording.signal(mailbox, "fired")
         cycles: dict[tuple[str, int, str], list[int]] = {}
-        for tick, key in zip(ticks.tolist(), zip(texts[0], row.tolist(), texts[1], strict=True), strict=True):
+        for tick, key in zip(
+            ticks.tolist(), zip(texts[0], row.tolist(), texts[1], strict=True), strict=True
+        ):
             cycles.setdefault(key, [0, tick])[0] += 1
         tick_s = recording.layout.clock_ns * 1e-9
         found[mailbox.removesuffix(".status")] = [
-            {"table": table, "row": number, "name": name, "cycles": count, "first_s": round(first * tick_s, 6)}
-            for (table, number, name), (count, first) in sorted(cycles.items(), key=lambda item: item[1][1])
+            {
+                "table": table,
+                "row": number,
+                "name": name,
+                "cycles": count,
+                "first_s": round(first * tick_s, 6),
+            }
+            for (table, number, name), (count, first) in sorted(
+                cycles.items(), key=lambda item: item[1][1]
+            )
         ]
     return found
 
@@ -104,12 +144,20 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
         return
     ticks = recording.signal(mailbox, "tick")
     own = recording.signal(mailbox, "state") == State.HOLDING
-    standing = recording.signal(mailbox, "standing").astype(int) if "standing" in fields else np.zeros(len(ticks), int)
+    standing = (
+        recording.signal(mailbox, "standing").astype(int)
+        if "standing" in fields
+        else np.zeros(len(ticks), int)
+    )
     # An operator's command takes precedence over the level's own state.
     what = np.where(standing > 0, standing, -own.astype(int))
     for first, end in _stretches(what):
         is_operators = what[first] > 0
-        why = Operation(what[first]).name.lower() if is_operators else str(recording.signal(mailbox, "reason")[end - 1])
+        why = (
+            Operation(what[first]).name.lower()
+            if is_operators
+            else str(recording.signal(mailbox, "reason")[end - 1])
+        )
         since = int(ticks[first])
         until = int(ticks[end]) if end < len(ticks) else None
         yield {
@@ -123,32 +171,40 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
 
 
 def _stretches(what: np.ndarray) -> list[tuple[int, int]]:
-    """Return the stretches of equal numbers other than 0, each as its first place and the one after its last."""
+    """Return the stretches of equal numbers other than 0, each as its first place and the one after
+    its last."""
     borders = [0, *(np.flatnonzero(np.diff(what)) + 1).tolist(), len(what)]
     return [(first, end) for first, end in pairwise(borders) if first < end and what[first]]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two runs diverge: the release tick of the first message that differs, and its mailbox."""
+    """Where two runs diverge: the release tick of the first message that differs, and its
+    mailbox."""
 
     tick: int
     mailbox: str
 
 
 def first_difference(one: Recording, other: Recording) -> Difference | None:
-    """Return where two runs diverge, up to the end of the shorter one; None when all that both wrote is equal.
+    """Return where two runs diverge, up to the end of the shorter one; None when all that both
+    wrote is equal.
 
     Raises `Failure` when the two have no mailbox in common, or either lost rows.
     """
     for recording in (one, other):
         lost = sum(recording.lost.values())
         if lost:
-            raise Failure(f"{recording.folder}: its recorder lost {lost} rows; the two runs cannot be compared")
+            raise Failure(
+                f"{recording.folder}: its recorder lost {lost} rows; the two runs cannot be"
+                " compared"
+            )
     shared = [name for name in one.mailboxes if name in other.mailboxes]
     if not shared:
         raise Failure(f"{one.folder} and {other.folder} have no mailbox in common")
-    found = [difference for name in shared if (difference := _difference(one, other, name)) is not None]
+    found = [
+        difference for name in shared if (difference := _difference(one, other, name)) is not None
+    ]
     return min(found, key=lambda difference: difference.tick, default=None)
 
 
@@ -160,4 +216,6 @@ def _difference(one: Recording, other: Recording, mailbox: str) -> Difference | 
     if not len(differs):
         return None
     first = differs[0]
-    return Difference(int(min(recording.signal(mailbox, "tick")[first] for recording in (one, other))), mailbox)
+    return Difference(
+        int(min(recording.signal(mailbox, "tick")[first] for recording in (one, other))), mailbox
+    )

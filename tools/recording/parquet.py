@@ -1,9 +1,10 @@
 """The two parquet files of a run.
 
-cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks. signals.parquet is what the
-tasks wrote to their mailboxes: one row a message. Each of its row groups holds rows of one mailbox, whose own columns
-are filled; those of all others are null. Its metadata hold when the rack was launched, and the checksum of the
-config.toml next to it: a config that is cut off at the end of a table is a valid config.
+cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks.
+signals.parquet is what the tasks wrote to their mailboxes: one row a message. Each of its row
+groups holds rows of one mailbox, whose own columns are filled; those of all others are null. Its
+metadata hold when the rack was launched, and the checksum of the config.toml next to it: a config
+that is cut off at the end of a table is a valid config.
 """
 
 from __future__ import annotations
@@ -24,14 +25,17 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 
-TRACE_SCHEMA = pa.schema([pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)])
+TRACE_SCHEMA = pa.schema(
+    [pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)]
+)
 CONFIG = "config.toml"
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 """Columns that the messages of all mailboxes have."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
-"""Rows are written in large blocks: a file's footer has an entry for every column of every block."""
+"""Rows are written in large blocks: a file's footer has an entry for every column of every
+block."""
 
 
 def config_check(folder: Path) -> str:
@@ -46,7 +50,9 @@ class CyclesFile:
     def __init__(self, path: Path) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
         self._rows = 0
-        self._writer = pq.ParquetWriter(path, TRACE_SCHEMA, compression="zstd", use_dictionary=["task"])
+        self._writer = pq.ParquetWriter(
+            path, TRACE_SCHEMA, compression="zstd", use_dictionary=["task"]
+        )
 
     def add(self, task: str, rows: np.ndarray) -> None:
         """Add trace records of a task, shape (rows,)."""
@@ -64,14 +70,20 @@ class CyclesFile:
         rows = np.concatenate([block for _, block in waiting])
         names = np.repeat([task for task, _ in waiting], [len(block) for _, block in waiting])
         arrays = [pa.array(names), *(pa.array(np.ascontiguousarray(rows[name])) for name in FIELDS)]
-        self._writer.write_batch(pa.record_batch(arrays, schema=TRACE_SCHEMA), row_group_size=len(rows))
+        self._writer.write_batch(
+            pa.record_batch(arrays, schema=TRACE_SCHEMA), row_group_size=len(rows)
+        )
         self._waiting = []
         self._rows = 0
 
     def close(
-        self, lost: Mapping[str, int], cores: CoreRecord = UNMEASURED, gaps: Sequence[tuple[str, int, int]] = ()
+        self,
+        lost: Mapping[str, int],
+        cores: CoreRecord = UNMEASURED,
+        gaps: Sequence[tuple[str, int, int]] = (),
     ) -> None:
-        """Finish the file; store as metadata the rows lost by task, what the machine did to its cores, and the gaps."""
+        """Finish the file; store as metadata the rows lost by task, what the machine did to its
+        cores, and the gaps."""
         self._flush()
         metadata = {"lost": json.dumps(lost), "cores": cores.text(), "gaps": json.dumps(gaps)}
         self._writer.add_key_value_metadata(metadata)
@@ -92,7 +104,12 @@ class SignalsFile:
         metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
         metadata |= {} if launch is None else {"launch": json.dumps(launch)}
         self._schema = pa.schema(fields, metadata=metadata)
-        texts = [column.name for columns in self._columns.values() for column in columns if column.kind[1] == "S"]
+        texts = [
+            column.name
+            for columns in self._columns.values()
+            for column in columns
+            if column.kind[1] == "S"
+        ]
         self._writer = pq.ParquetWriter(
             path,
             self._schema,
@@ -105,7 +122,10 @@ class SignalsFile:
         """Add rows of a mailbox's ring, shape (rows,), at least one."""
         waiting = self._waiting[mailbox]
         waiting.append(rows)
-        if sum(map(len, waiting)) >= MESSAGE_ROWS or sum(block.nbytes for block in waiting) >= MESSAGE_BYTES:
+        if (
+            sum(map(len, waiting)) >= MESSAGE_ROWS
+            or sum(block.nbytes for block in waiting) >= MESSAGE_BYTES
+        ):
             self._flush(mailbox)
 
     def _flush(self, mailbox: str) -> None:
@@ -116,8 +136,13 @@ class SignalsFile:
         filled = {"mailbox": pa.array([mailbox] * len(rows))}
         filled |= {name: pa.array(np.ascontiguousarray(rows[name])) for name in HEAD}
         filled |= {column.name: column.array(rows["message"]) for column in self._columns[mailbox]}
-        arrays = [filled[f.name] if f.name in filled else pa.nulls(len(rows), f.type) for f in self._schema]
-        self._writer.write_batch(pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows))
+        arrays = [
+            filled[f.name] if f.name in filled else pa.nulls(len(rows), f.type)
+            for f in self._schema
+        ]
+        self._writer.write_batch(
+            pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows)
+        )
 
     def close(self, lost: Mapping[str, int]) -> None:
         """Finish the file; store the rows lost by mailbox as metadata."""
@@ -144,17 +169,21 @@ class Column:
     def field(self) -> pa.Field:
         """The column's Arrow field; shape and unit are in its metadata."""
         element = pa.string() if self.kind[1] == "S" else pa.from_numpy_dtype(np.dtype(self.kind))
-        # All rows have the same length, but the nulls of a fixed-size list, in the rows of all other mailboxes, would
-        # cost as much memory as values.
+        # All rows have the same length, but the nulls of a fixed-size list, in the rows of all
+        # other mailboxes, would cost as much memory as values.
         arrow = pa.list_(element) if self.shape else element
-        return pa.field(self.name, arrow, metadata={"shape": json.dumps(self.shape), "unit": self.unit})
+        return pa.field(
+            self.name, arrow, metadata={"shape": json.dumps(self.shape), "unit": self.unit}
+        )
 
     def array(self, messages: np.ndarray) -> pa.Array:
         """Return the column of a block of messages, shape (rows,)."""
         for key in self.path:
             messages = messages[key]
         flat = np.ascontiguousarray(messages).reshape(-1)
-        values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.kind[1] == "S" else flat)
+        values = pa.array(
+            np.strings.decode(flat, "ascii", "replace") if self.kind[1] == "S" else flat
+        )
         if not self.shape:
             return values
         offsets = np.arange(len(messages) + 1, dtype=np.int32) * prod(self.shape)
@@ -162,7 +191,8 @@ class Column:
 
 
 def columns_of(mailbox: MailboxSpec) -> list[Column]:
-    """Return the columns of a mailbox in the order of its fields; groups of fields are flattened."""
+    """Return the columns of a mailbox in the order of its fields; groups of fields are
+    flattened."""
     return list(_columns(mailbox.name, (), (), mailbox.fields))
 
 

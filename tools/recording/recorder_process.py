@@ -1,4 +1,5 @@
-"""The recorder process as its launcher sees it: spawned, never forked, so that no board inherits its threads."""
+"""The recorder process as its launcher sees it: spawned, never forked, so that no board inherits
+its threads."""
 
 from __future__ import annotations
 
@@ -23,20 +24,24 @@ ATTACH_S = 30.0
 """Longest wait for the recorder to begin."""
 IDLE_LOOKS = 100
 STOPPED_LOOKS = 5
-"""Looks, 0.2 s to 1 s apart, at a recorder that uses no processor time, after which it is killed: on a loaded machine
-it is slow, but never idle. Fewer for one that a signal has stopped. Looks, not seconds: Ctrl-Z stops both processes.
+"""Looks, 0.2 s to 1 s apart, at a recorder that uses no processor time, after which it is killed:
+on a loaded machine it is slow, but never idle. Fewer for one that a signal has stopped. Looks, not
+seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
-"""Exit status of a recorder whose files cannot be written, as on a full disk: another one could not either."""
+"""Exit status of a recorder whose files cannot be written, as on a full disk: another one could not
+either."""
 
 
 class RecorderProcess:
-    """A recorder for a rack that is about to run; it imports its libraries while the rack is being launched.
+    """A recorder for a rack that is about to run; it imports its libraries while the rack is being
+    launched.
 
-    One that dies is restarted up to RESTARTS times, in the same folder; one that hangs is killed first. Lockstep waits
-    meanwhile. If its files cannot be written, `news` and `finish` raise `Failure`.
+    One that dies is restarted up to RESTARTS times, in the same folder; one that hangs is killed
+    first. Lockstep waits meanwhile. If its files cannot be written, `news` and `finish` raise
+    `Failure`.
     """
 
     def __init__(self) -> None:
@@ -69,8 +74,11 @@ class RecorderProcess:
         """Process id of the recorder."""
         return self._process.pid
 
-    def attach(self, rack: str, folder: Path, port: int | None = None, words: memoryview | None = None) -> bool:
-        """Record that rack into that folder, and serve a viewer on that port; return False if it has not begun in time.
+    def attach(
+        self, rack: str, folder: Path, port: int | None = None, words: memoryview | None = None
+    ) -> bool:
+        """Record that rack into that folder, and serve a viewer on that port; return False if it
+        has not begun in time.
 
         With the `words` of a rack in lockstep, that waits for it, in any case.
         """
@@ -137,7 +145,12 @@ class RecorderProcess:
         """Return how it ended, with the last line that it printed on stderr."""
         size = os.fstat(self._complaints).st_size
         status = self._process.returncode
-        last = os.pread(self._complaints, 4096, max(0, size - 4096)).decode(errors="replace").strip().splitlines()[-1:]
+        last = (
+            os.pread(self._complaints, 4096, max(0, size - 4096))
+            .decode(errors="replace")
+            .strip()
+            .splitlines()[-1:]
+        )
         if status == UNWRITABLE:
             raise Failure("".join(last))
         return ": ".join((f"the recorder ended with status {status}", *last))
@@ -147,7 +160,8 @@ class RecorderProcess:
             self._words[System.FOLLOWER_PID] = pid
 
     def finish(self, in_a_hurry: bool = False) -> str:
-        """Let it record what is left and finish its files; return how it ended. It may be called again.
+        """Let it record what is left and finish its files; return how it ended. It may be called
+        again.
 
         In a hurry it does without the viewer's file if it has not begun that one yet.
         """

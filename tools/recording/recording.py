@@ -36,7 +36,8 @@ class Missing(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """Ticks of which a recording lacks rows, from the first to the last, and of which tasks and mailboxes."""
+    """Ticks of which a recording lacks rows, from the first to the last, and of which tasks and
+    mailboxes."""
 
     first: int
     last: int
@@ -45,7 +46,10 @@ class Gap(NamedTuple):
     def __str__(self) -> str:
         """Return it as text."""
         more = f" and {len(self.rings) - 3} more" if len(self.rings) > 3 else ""
-        return f"ticks {self.first:,} to {self.last:,} of {', '.join(self.rings[:3])}{more} are not recorded"
+        return (
+            f"ticks {self.first:,} to {self.last:,} of {', '.join(self.rings[:3])}{more} are not"
+            " recorded"
+        )
 
 
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
@@ -53,9 +57,11 @@ UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 
 
 class Recording:
-    """The folder of a run. Every part raises `Failure`, with the file and its fault, when it cannot be read.
+    """The folder of a run. Every part raises `Failure`, with the file and its fault, when it cannot
+    be read.
 
-    The spool of a recorder that was killed is first turned into readable files, with a note on stderr.
+    The spool of a recorder that was killed is first turned into readable files, with a note on
+    stderr.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,13 +70,18 @@ class Recording:
         """The resolved config, as TOML text."""
         with _naming(folder):
             if mend(folder):
-                _note(f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and signals.parquet")
+                _note(
+                    f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
+                    " signals.parquet"
+                )
         self._cycles = self._open("cycles.parquet", ("task", "tick"))
         self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
         # Earlier versions stored no checksum.
         recorded = (self._signals.schema_arrow.metadata or {}).get(b"config", b"").decode()
         if recorded and recorded != config_check(folder):
-            raise Failure(f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2)
+            raise Failure(
+                f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2
+            )
 
     @cached_property
     def rack_config(self) -> RackConfig:
@@ -94,7 +105,9 @@ class Recording:
         try:
             return path.read_text(encoding="utf-8")
         except UnicodeDecodeError as error:
-            raise Failure(f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2) from None
+            raise Failure(
+                f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2
+            ) from None
         except OSError as error:
             raise Failure(f"{path}: {error.strerror}", 2) from None
 
@@ -118,7 +131,8 @@ class Recording:
 
     @cached_property
     def ended(self) -> dict[str, Any]:
-        """Counts at the end of the run, as in `rack.tools.live.launch.RunResult`; empty where they are not recorded."""
+        """Counts at the end of the run, as in `rack.tools.live.launch.RunResult`; empty where they
+        are not recorded."""
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @cached_property
@@ -128,28 +142,40 @@ class Recording:
             text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
             boxes = [mailbox_of({**m, "fields": ()}) for m in text["mailboxes"]]
             # Earlier versions recorded no host boards.
-            tasks, hosts = (tuple(TaskSpec(**task) for task in text.get(key, ())) for key in ("tasks", "hosts"))
+            tasks, hosts = (
+                tuple(TaskSpec(**task) for task in text.get(key, ())) for key in ("tasks", "hosts")
+            )
             return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes), hosts)
 
     @cached_property
     def whole_layout(self) -> Layout:
         """The rack's layout with the fields of its messages."""
         with _naming(self.folder / "signals.parquet"):
-            return layout_of({"hosts": (), **json.loads(self._signals.schema_arrow.metadata[b"layout"])})
+            return layout_of(
+                {"hosts": (), **json.loads(self._signals.schema_arrow.metadata[b"layout"])}
+            )
 
     @property
     def launch(self) -> Launch:
-        """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do not hold it."""
+        """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do
+        not hold it."""
         text = (self._signals.schema_arrow.metadata or {}).get(b"launch")
         if text is None:
-            why = "does not say when the rack was launched: it was recorded by an earlier version; run the rack again"
+            why = (
+                "does not say when the rack was launched: it was recorded by an earlier version;"
+                " run the rack again"
+            )
             raise Failure(f"{self.folder}: {why}", 2)
         return Launch(*json.loads(text))
 
     @cached_property
     def lost(self) -> dict[str, int]:
         """Rows that were written and are not in the files, by task and by mailbox."""
-        return dict(self.ended["rows_lost"]) if "rows_lost" in self.ended else self._lost_before_the_end
+        return (
+            dict(self.ended["rows_lost"])
+            if "rows_lost" in self.ended
+            else self._lost_before_the_end
+        )
 
     @cached_property
     def _lost_before_the_end(self) -> dict[str, int]:
@@ -160,8 +186,8 @@ class Recording:
     def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
         """Return where rows are missing, in order; gaps that overlap are one.
 
-        `lost` (default: as known at the end) counts them by ring, for a run of `ticks`: what the files do not know of
-        was lost after their last row.
+        `lost` (default: as known at the end) counts them by ring, for a run of `ticks`: what the
+        files do not know of was lost after their last row.
         """
         lost = self.lost if lost is None else lost
         ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
@@ -170,7 +196,9 @@ class Recording:
         for name, count in lost.items():
             if count > self._lost_before_the_end.get(name, 0):
                 recorded = name in self.cycles or name in self.mailboxes
-                found.append((name, int(self.rows(name)["tick"][-1]) + 1 if recorded else 0, ticks - 1))
+                found.append(
+                    (name, int(self.rows(name)["tick"][-1]) + 1 if recorded else 0, ticks - 1)
+                )
         merged: list[Gap] = []
         for ring, first, last in sorted(found, key=lambda gap: gap[1]):
             if merged and first <= merged[-1].last + 1:
@@ -183,8 +211,15 @@ class Recording:
 
     def untraced(self) -> dict[str, tuple[int, int]]:
         """Return the tasks with cycles that are not recorded: how many are, and of how many."""
-        ran = {name: task["plans" if name.endswith(".planner") else "cycles"] for name, task in self._counts.items()}
-        return {name: (len(self.cycles.get(name, ())), count) for name, count in ran.items() if self.lost.get(name)}
+        ran = {
+            name: task["plans" if name.endswith(".planner") else "cycles"]
+            for name, task in self._counts.items()
+        }
+        return {
+            name: (len(self.cycles.get(name, ())), count)
+            for name, count in ran.items()
+            if self.lost.get(name)
+        }
 
     @property
     def _counts(self) -> dict[str, dict[str, int]]:
@@ -192,7 +227,8 @@ class Recording:
         return found
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
-        """Return what the files lack of the rings of a rack that has ended, by task and by mailbox."""
+        """Return what the files lack of the rings of a rack that has ended, by task and by
+        mailbox."""
         found = {}
         for name, ring in rings(segment).items():
             lost = self.lost[name]
@@ -206,14 +242,16 @@ class Recording:
             ring.resume(at)
             written = at + ring.waiting
             left, overwritten = ring.drain()
-            # Messages that every reader rejects are absent and not lost; those lost last are overwritten.
+            # Messages that every reader rejects are absent and not lost; those lost last are
+            # overwritten.
             if count := min(lost, at - rows) + overwritten + len(left):
                 found[name] = Missing(count, written)
         return found
 
     @cached_property
     def cores(self) -> CoreRecord:
-        """What the machine did to its cores; empty if the recorder did not measure it, or was killed."""
+        """What the machine did to its cores; empty if the recorder did not measure it, or was
+        killed."""
         with _naming(self.folder / "cycles.parquet"):
             text = self._cycles.metadata.metadata.get(b"cores")
             return UNMEASURED if text is None else CoreRecord.of(text)
@@ -221,12 +259,16 @@ class Recording:
     def need_all_columns(self) -> None:
         """Raise `Failure` for a trace that lacks columns."""
         if lacking := [name for name in FIELDS if name not in self._cycles.schema_arrow.names]:
-            why = f"cycles.parquet has no column {', '.join(lacking)}: it was recorded by an earlier version"
+            why = (
+                f"cycles.parquet has no column {', '.join(lacking)}: it was recorded by an earlier"
+                " version"
+            )
             raise Failure(f"{self.folder}: {why}; run the rack again", 2)
 
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
-        """The trace by task: structured rows, oldest first, with the fields of `rack.backplane.trace.RECORD`."""
+        """The trace by task: structured rows, oldest first, with the fields of
+        `rack.backplane.trace.RECORD`."""
         with _naming(self.folder / "cycles.parquet"):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
@@ -237,7 +279,8 @@ class Recording:
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
     def place(self, task: TaskSpec) -> tuple[int, int]:
-        """Return core and priority that a task obtained; those of the config where the run's end is not recorded."""
+        """Return core and priority that a task obtained; those of the config where the run's end is
+        not recorded."""
         counted = self.ended.get("tasks", {}).get(task.name, {})
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
@@ -246,24 +289,36 @@ class Recording:
         return self.cycles.get(task, np.empty(0, dtype=RECORD))
 
     def signal(self, mailbox: str, field: str) -> np.ndarray:
-        """Return one field of every message of a mailbox, oldest first, shape (messages, *shape of the field).
+        """Return one field of every message of a mailbox, oldest first, shape (messages, *shape of
+        the field).
 
-        "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox. Raises `KeyError`.
+        "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox.
+        Raises `KeyError`.
         """
         schema = self._signals.schema_arrow
         name = field if field in schema.names else f"{mailbox}.{field}"
         column = schema.field(name)
-        groups = [group for group in range(self._signals.num_row_groups) if self._mailbox_of(group) == mailbox]
+        groups = [
+            group
+            for group in range(self._signals.num_row_groups)
+            if self._mailbox_of(group) == mailbox
+        ]
         with _naming(self.folder / "signals.parquet"):
-            read = [self._signals.read_row_group(group, columns=[name]).column(0).combine_chunks() for group in groups]
+            read = [
+                self._signals.read_row_group(group, columns=[name]).column(0).combine_chunks()
+                for group in groups
+            ]
         shape = tuple(json.loads(column.metadata[b"shape"])) if column.metadata else ()
-        values = [(block.flatten() if shape else block).to_numpy(zero_copy_only=False) for block in read]
+        values = [
+            (block.flatten() if shape else block).to_numpy(zero_copy_only=False) for block in read
+        ]
         if not values:
             return np.empty((0, *shape))
         return np.concatenate(values).reshape(-1, *shape)
 
     def messages(self, box: MailboxSpec) -> np.ndarray:
-        """Return every message of a mailbox as it was written, oldest first; `box` with its fields."""
+        """Return every message of a mailbox as it was written, oldest first; `box` with its
+        fields."""
         found = np.zeros(len(self.signal(box.name, "tick")), message_dtype(box.fields, box.size))
         for column in columns_of(box):
             part = found
@@ -273,7 +328,8 @@ class Recording:
         return found
 
     def rows(self, name: str) -> np.ndarray:
-        """Return what a recorder took from a ring, oldest first: trace records of a task, or messages of a mailbox."""
+        """Return what a recorder took from a ring, oldest first: trace records of a task, or
+        messages of a mailbox."""
         if name in self.cycles:
             return self.cycles[name]
         box = self.whole_layout.mailbox(name)
@@ -285,13 +341,17 @@ class Recording:
 
     def fields(self, mailbox: str) -> set[str]:
         """Return the fields of a mailbox's messages."""
-        names = [name for name in self._signals.schema_arrow.names if name.startswith(f"{mailbox}.")]
+        names = [
+            name for name in self._signals.schema_arrow.names if name.startswith(f"{mailbox}.")
+        ]
         return {name.removeprefix(f"{mailbox}.") for name in names}
 
     @cached_property
     def mailboxes(self) -> list[str]:
         """The mailboxes that hold messages."""
-        return list(dict.fromkeys(self._mailbox_of(group) for group in range(self._signals.num_row_groups)))
+        return list(
+            dict.fromkeys(self._mailbox_of(group) for group in range(self._signals.num_row_groups))
+        )
 
     def _mailbox_of(self, group: int) -> str:
         # A row group holds rows of one mailbox only: its smallest name is its only one.
@@ -304,7 +364,9 @@ def _naming(path: Path) -> Iterator[None]:
     try:
         yield
     except UNREADABLE as error:
-        raise Failure(f"{path}: not readable as a recording: {' '.join(str(error).split()) or error!r}", 2) from None
+        raise Failure(
+            f"{path}: not readable as a recording: {' '.join(str(error).split()) or error!r}", 2
+        ) from None
 
 
 def _event(line: str, place: str) -> dict[str, Any]:

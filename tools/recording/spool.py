@@ -1,10 +1,11 @@
-"""The files of a recording, and the spool that makes them safe: a parquet file is readable only once its footer,
-written last, is there.
+"""The files of a recording, and the spool that makes them safe: a parquet file is readable only
+once its footer, written last, is there.
 
-Every ring's rows also go to `recorder.spool` as they are, compressed, one frame a ring about four times a second. A
-restarted recorder continues from the spool; `mend` makes the parquet files from the spool of a recorder that is gone.
-The spool is removed when the files are complete. A truncated last frame is dropped. The rings hold two seconds, so a
-recorder that is back within that time loses nothing.
+Every ring's rows also go to `recorder.spool` as they are, compressed, one frame a ring about four
+times a second. A restarted recorder continues from the spool; `mend` makes the parquet files from
+the spool of a recorder that is gone. The spool is removed when the files are complete. A truncated
+last frame is dropped. The rings hold two seconds, so a recorder that is back within that time loses
+nothing.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ class Frame(NamedTuple):
 class RunFiles:
     """cycles.parquet and signals.parquet of a folder, being written.
 
-    By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far. `gaps` holds where they
-    were lost: ring, first and last tick without rows.
+    By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far.
+    `gaps` holds where they were lost: ring, first and last tick without rows.
     """
 
     def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
@@ -88,7 +89,9 @@ class RunFiles:
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
         """Finish both files; the trace keeps what the machine did to its cores."""
         tasks = set(self.tasks)
-        self._cycles.close({name: count for name, count in self.lost.items() if name in tasks}, cores, self.gaps)
+        self._cycles.close(
+            {name: count for name, count in self.lost.items() if name in tasks}, cores, self.gaps
+        )
         self._signals.close({name: count for name, count in self.lost.items() if name not in tasks})
 
 
@@ -114,7 +117,8 @@ def mend(folder: Path) -> bool:
 
 
 class Spool:
-    """The spool of a folder, open for writing; continues one that another recorder left, after `resume`.
+    """The spool of a folder, open for writing; continues one that another recorder left, after
+    `resume`.
 
     Raises `Failure` when another recorder has it open, or it belongs to another rack.
     """
@@ -135,7 +139,9 @@ class Spool:
                 self._file.write(_HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text)
             self._file.seek(0)
             if (found := _read_head(self._file, self.path)) != (layout, launch):
-                raise Failure(f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'")
+                raise Failure(
+                    f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'"
+                )
         except BaseException:
             self.close()
             raise
@@ -155,7 +161,8 @@ class Spool:
         self._lost[ring] += lost
 
     def flush(self, now: bool = False) -> bool:
-        """Write what waits, when it is due or `now`; return whether it did. Raises `OSError` when the disk is full."""
+        """Write what waits, when it is due or `now`; return whether it did. Raises `OSError` when
+        the disk is full."""
         if not now and time.monotonic() < self._flush_at:
             return False
         self._flush_at = time.monotonic() + FLUSH_S
@@ -170,7 +177,9 @@ class Spool:
             lost = self._lost[ring]
             if blocks or lost:
                 rows = sum(map(len, blocks))
-                packed = pa.compress(b"".join(block.tobytes() for block in blocks), codec="zstd", asbytes=True)
+                packed = pa.compress(
+                    b"".join(block.tobytes() for block in blocks), codec="zstd", asbytes=True
+                )
                 yield _FRAME.pack(place, rows, lost, len(packed), zlib.crc32(packed)) + packed
                 self._waiting[ring], self._lost[ring] = [], 0
 
@@ -211,7 +220,9 @@ def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Frame]:
 def rings(segment: Segment) -> dict[str, Ring]:
     """Return every ring of a rack: traces by task, then messages by mailbox."""
     traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
-    return traces | {mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in segment.layout.timed}
+    return traces | {
+        mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in segment.layout.timed
+    }
 
 
 def _dtypes(layout: Layout) -> dict[str, np.dtype]:

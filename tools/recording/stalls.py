@@ -1,9 +1,11 @@
-"""What took the cores of a rack in real time: the hypervisor by the kernel's count, or without one, or a host's quota.
+"""What took the cores of a rack in real time: the hypervisor by the kernel's count, or without one,
+or a host's quota.
 
-A host that takes a core away need not count that as steal. It then shows where the rack was due and left no stamp: the
-clock's board, which preempts all else on its core, woke late (its own `CLOCK_LATE`); or a task was due on another core
-and no task left a stamp there. Both must have a real-time priority: without one they wait for any program. Alternative
-considered: a trace of the clock. It shows no more, and needs a ring of its own.
+A host that takes a core away need not count that as steal. It then shows where the rack was due and
+left no stamp: the clock's board, which preempts all else on its core, woke late (its own
+`CLOCK_LATE`); or a task was due on another core and no task left a stamp there. Both must have a
+real-time priority: without one they wait for any program. Alternative considered: a trace of the
+clock. It shows no more, and needs a ring of its own.
 """
 
 from __future__ import annotations
@@ -28,15 +30,16 @@ CLUSTERED = 0.75
 WINDOW = 0.02
 """So many stalls, of which this part ends within one window, a part of the period, are no chance.
 
-With phases that have nothing to do with the period, four of five end within 2 % of it once in 6,300 runs; more stalls
-make that rarer still. Three quarters, since a level that is late by itself ends at few phases: at two, if its cycle is
-half the period.
+With phases that have nothing to do with the period, four of five end within 2 % of it once in 6,300
+runs; more stalls make that rarer still. Three quarters, since a level that is late by itself ends
+at few phases: at two, if its cycle is half the period.
 """
 
 
 @dataclass(frozen=True)
 class Absence:
-    """A core that was away without steal: how often, the longest time, and the cycles lost meanwhile."""
+    """A core that was away without steal: how often, the longest time, and the cycles lost
+    meanwhile."""
 
     core: int
     times: int
@@ -48,7 +51,8 @@ class Absence:
 class Quota:
     """Stalls that end at one phase of `QUOTA_NS`: `together` of `stalls`.
 
-    They also end at one phase of the cycles of `levels`, multiples of that, which may then be the cause.
+    They also end at one phase of the cycles of `levels`, multiples of that, which may then be the
+    cause.
     """
 
     together: int
@@ -58,7 +62,8 @@ class Quota:
 
 @dataclass(frozen=True)
 class Stalls:
-    """What took the cycles of a run: `lost` counts all, late or skipped, `during_steal` those due while it rose."""
+    """What took the cycles of a run: `lost` counts all, late or skipped, `during_steal` those due
+    while it rose."""
 
     lost: int
     during_steal: int
@@ -69,7 +74,8 @@ class Stalls:
 def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     """Return what took the cycles of a run, and by core when it was away.
 
-    While the clock's core is away without steal, the whole machine may be: that counts for every core.
+    While the clock's core is away without steal, the whole machine may be: that counts for every
+    core.
     """
     config = recording.rack_config
     tasks = recording.layout.tasks
@@ -86,7 +92,8 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     clock = _late_clock(recording.events if is_shown else [], rows, grid_ns)
     without_clock = Occupation(*clock)
     urgent = np.where(is_shown & (priority > 0), due, rows["start_ns"])
-    # What cost releases was over as the next cycle began; what made a cycle late may have come in its midst.
+    # What cost releases was over as the next cycle began; what made a cycle late may have come in
+    # its midst.
     resumed = np.where(is_missed(rows), rows["end_ns"], rows["start_ns"])
     lost = skipped(rows) + is_missed(rows)
     spans = np.array(recording.cores.stolen or (), np.int64).reshape(-1, 4)
@@ -118,29 +125,44 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     return Stalls(int(lost.sum()), during_steal, absences, quota), away
 
 
-def _late_clock(events: list[dict[str, Any]], rows: np.ndarray, grid_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return since when the clock's board was away, due at a grid point, and until when; `rows` are on its grid."""
-    late = [(e["since"], e["value"]) for e in events if e.get("code") == "clock_late" and e["board"] == CLOCK]
+def _late_clock(
+    events: list[dict[str, Any]], rows: np.ndarray, grid_ns: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return since when the clock's board was away, due at a grid point, and until when; `rows` are
+    on its grid."""
+    late = [
+        (e["since"], e["value"])
+        for e in events
+        if e.get("code") == "clock_late" and e["board"] == CLOCK
+    ]
     since, late_ns = np.array(late, np.int64).reshape(-1, 2).T
     due = (rows["release_ns"] - rows["tick"] * grid_ns).max(initial=0) + since * grid_ns
     return due, due + late_ns
 
 
 def _unstamped(rows: np.ndarray, due: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return since when each cycle of a core, all its `rows`, was due and no task left a stamp, until it started."""
+    """Return since when each cycle of a core, all its `rows`, was due and no task left a stamp,
+    until it started."""
     stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
     # Before its first stamp a core is not judged: place -1 is the last stamp of the run.
     return np.maximum(due, stamps[np.searchsorted(stamps, rows["start_ns"]) - 1]), rows["start_ns"]
 
 
 def _quota(ends: np.ndarray, cycles_ns: dict[str, int]) -> Quota | None:
-    """Return at how many of the `ends` of stalls a quota ended, if that is no chance; `cycles_ns` are by level.
+    """Return at how many of the `ends` of stalls a quota ended, if that is no chance; `cycles_ns`
+    are by level.
 
     Lost cycles that overlap, on any core, are one stall; it ends as the last of them runs again.
     """
-    if len(ends) < LEAST_STALLS or (together := _at_one_phase(ends, QUOTA_NS)) < CLUSTERED * len(ends):
+    if len(ends) < LEAST_STALLS or (together := _at_one_phase(ends, QUOTA_NS)) < CLUSTERED * len(
+        ends
+    ):
         return None
-    levels = [name for name, ns in cycles_ns.items() if not ns % QUOTA_NS and _at_one_phase(ends, ns) >= together]
+    levels = [
+        name
+        for name, ns in cycles_ns.items()
+        if not ns % QUOTA_NS and _at_one_phase(ends, ns) >= together
+    ]
     return Quota(together, len(ends), levels)
 
 

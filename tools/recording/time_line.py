@@ -1,12 +1,14 @@
 """Recordings of several racks on one time line: that of the first one.
 
-In real time each machine has its own CLOCK_MONOTONIC, and each rack its own grid on it. Racks that work together over
-a network record the offset of the other's clock (`rack.levels.peer`): from rack to rack, these offsets lead to the
-first one's. In lockstep all racks have one simulated time, and there is nothing to convert.
+In real time each machine has its own CLOCK_MONOTONIC, and each rack its own grid on it. Racks that
+work together over a network record the offset of the other's clock (`rack.levels.peer`): from rack
+to rack, these offsets lead to the first one's. In lockstep all racks have one simulated time, and
+there is nothing to convert.
 
-Recordings of different launches share no time line. In real time the mailbox of a peer says where the peer's simulated
-time is, and the peer's recording says so too: launches have no tick 0 in common. In lockstep, where every launch begins
-at 0, what a rack took from another must be what that one wrote.
+Recordings of different launches share no time line. In real time the mailbox of a peer says where
+the peer's simulated time is, and the peer's recording says so too: launches have no tick 0 in
+common. In lockstep, where every launch begins at 0, what a rack took from another must be what that
+one wrote.
 """
 
 from __future__ import annotations
@@ -40,10 +42,15 @@ class RackGrid:
         cycles = [rows for rows in recording.cycles.values() if len(rows)]
         if not cycles:
             raise Failure(f"{recording.folder}: no cycle of any task is recorded", 2)
-        releases = np.concatenate([rows["release_ns"] - rows["tick"] * self.period_ns for rows in cycles])
+        releases = np.concatenate(
+            [rows["release_ns"] - rows["tick"] * self.period_ns for rows in cycles]
+        )
         self.epoch_ns = int(np.median(releases))
         """CLOCK_MONOTONIC of tick 0."""
-        self.ticks = min(int(rows["tick"].min()) for rows in cycles), max(int(rows["tick"].max()) for rows in cycles)
+        self.ticks = (
+            min(int(rows["tick"].min()) for rows in cycles),
+            max(int(rows["tick"].max()) for rows in cycles),
+        )
         """The first and the last one recorded."""
 
     def stamp_ns(self, ticks: Ints, within_ns: Ints | int = 0) -> Ints:
@@ -59,7 +66,8 @@ class RackGrid:
 
 @dataclass(frozen=True)
 class Shift:
-    """How far CLOCK_MONOTONIC of one machine is ahead of another's: `by_ns`, at `at_ns` of the first; both (n,)."""
+    """How far CLOCK_MONOTONIC of one machine is ahead of another's: `by_ns`, at `at_ns` of the
+    first; both (n,)."""
 
     at_ns: Ints
     by_ns: Ints
@@ -79,7 +87,8 @@ class Shift:
 
 @dataclass(frozen=True)
 class RackPlace:
-    """A recorded rack on the time line: by what shifts its clock leads to the first rack's; in lockstep by none."""
+    """A recorded rack on the time line: by what shifts its clock leads to the first rack's; in
+    lockstep by none."""
 
     own: RackGrid
     line: RackGrid
@@ -98,7 +107,9 @@ class RackPlace:
             return f"{text}: both ran in lockstep, tick by tick"
         begin = self.line.time_ns(self.stamps_ns(np.array([self.own.epoch_ns])))[0] * 1e-9
         uncertain_ms = self.uncertainty_ns * self.line.clock_ns / self.line.period_ns * 1e-6
-        return f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
+        return (
+            f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
+        )
 
     def stamps_ns(self, stamps_ns: Ints) -> Ints:
         """Return stamps of its machine as stamps of the line's."""
@@ -107,7 +118,8 @@ class RackPlace:
         return stamps_ns
 
     def times_ns(self, ticks: Ints, within_ns: Ints | int) -> Ints:
-        """Return simulated times on the line of its ticks, and `within_ns` of its own simulated time later."""
+        """Return simulated times on the line of its ticks, and `within_ns` of its own simulated
+        time later."""
         if self.own is self.line or self.own.is_lockstep:
             return ticks * self.own.clock_ns + within_ns
         return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
@@ -133,8 +145,9 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
         if (found := next(ways, None)) is None:
             lone = next(grid for at, grid in enumerate(grids) if at not in placed)
             raise Failure(
-                f"{lone.recording.folder}: rack '{lone.rack}' and {_named(grids[at] for at in placed)} never met: no "
-                "recording holds a comparison of their clocks; each rack needs one that has it among its peers",
+                f"{lone.recording.folder}: rack '{lone.rack}' and"
+                f" {_named(grids[at] for at in placed)} never met: no recording holds a comparison"
+                " of their clocks; each rack needs one that has it among its peers",
                 2,
             )
         a, b, shifts = found
@@ -150,15 +163,20 @@ def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
     for other in others:
         if other.rack == grid.rack:
             where = f"{other.recording.folder} and {grid.recording.folder}"
-            raise Failure(f"{where}: both are of rack '{grid.rack}'; give one recording of each rack", 2)
+            raise Failure(
+                f"{where}: both are of rack '{grid.rack}'; give one recording of each rack", 2
+            )
         if other.is_lockstep != grid.is_lockstep:
             timed, stepped = (other, grid) if grid.is_lockstep else (grid, other)
-            where = f"{stepped.recording.folder} ran in lockstep, {timed.recording.folder} in real time"
+            where = (
+                f"{stepped.recording.folder} ran in lockstep, {timed.recording.folder} in real time"
+            )
             raise Failure(f"{where}: they have no time in common", 2)
 
 
 def _way(own: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
-    """Return the shift that leads from a rack's clock to another's, if either has compared them; in lockstep none."""
+    """Return the shift that leads from a rack's clock to another's, if either has compared them; in
+    lockstep none."""
     if own.is_lockstep:
         met = [_has_met(one, two) for one, two in ((own, other), (other, own))]
         return () if any(met) else None
@@ -170,12 +188,17 @@ def _way(own: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
 def _mailbox(of: RackGrid, peer: RackGrid) -> str | None:
     """Return the mailbox in which a rack keeps what it knows of another, if there is one."""
     boxes = of.recording.layout.mailboxes
-    names = (box.name for box in boxes if box.message == PEER.name and box.name.endswith(f".{peer_port(peer.rack)}"))
+    names = (
+        box.name
+        for box in boxes
+        if box.message == PEER.name and box.name.endswith(f".{peer_port(peer.rack)}")
+    )
     return next((name for name in names if name in of.recording.mailboxes), None)
 
 
 def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
-    """Return how far a peer's clock is ahead, as a rack has recorded it; None if it never measured that.
+    """Return how far a peer's clock is ahead, as a rack has recorded it; None if it never measured
+    that.
 
     Raises `Failure` if it has met other launches of the peer only.
     """
@@ -196,8 +219,9 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
     if not is_this.any():
         began_s = float(apart_ns[-1]) * 1e-9 * peer.period_ns / peer.clock_ns
         raise Failure(
-            f"{of.recording.folder} and {peer.recording.folder} are not of the same run: the rack '{peer.rack}' that "
-            f"'{of.rack}' met began {abs(began_s):.3f} s {'later' if began_s > 0 else 'earlier'}",
+            f"{of.recording.folder} and {peer.recording.folder} are not of the same run: the rack"
+            f" '{peer.rack}' that '{of.rack}' met began {abs(began_s):.3f} s"
+            f" {'later' if began_s > 0 else 'earlier'}",
             2,
         )
     at_ns = at_ns[is_this]
@@ -213,7 +237,8 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
 
 
 def _has_met(of: RackGrid, peer: RackGrid) -> bool:
-    """Return whether a rack in lockstep worked with another. Raises `Failure` if that was not in this run."""
+    """Return whether a rack in lockstep worked with another. Raises `Failure` if that was not in
+    this run."""
     mailbox = _mailbox(of, peer)
     if mailbox is None or not (of.recording.signal(mailbox, "presence") == Presence.THERE).any():
         return False
@@ -238,7 +263,8 @@ def _check_import(of: RackGrid, taken: str, peer: RackGrid, written: str) -> Non
         first, end = np.searchsorted(at_ns, (since_ns, since_ns + of.clock_ns))
         if first < end and row["message"].tobytes() not in content[first:end]:
             raise Failure(
-                f"{of.recording.folder} and {peer.recording.folder} are not of the same run: what '{of.rack}' took "
-                f"from '{peer.rack}' at {since_ns * 1e-9:.4f} s, in {taken}, is not what that one wrote to {written}",
+                f"{of.recording.folder} and {peer.recording.folder} are not of the same run: what"
+                f" '{of.rack}' took from '{peer.rack}' at {since_ns * 1e-9:.4f} s, in {taken}, is"
+                f" not what that one wrote to {written}",
                 2,
             )

@@ -1,4 +1,5 @@
-"""A config judged by the timing model, and a change of one of its boards, judged on the whole rack."""
+"""A config judged by the timing model, and a change of one of its boards, judged on the whole
+rack."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from rack.boards.errors import ConfigError
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import predict
 from rack.levels.timing.tasks import Budget
-from rack.levels.timing.verdicts import LOAD, EquationVerdict, level_verdicts, system_verdicts, verdicts
+from rack.levels.timing.verdicts import (
+    LOAD,
+    EquationVerdict,
+    level_verdicts,
+    system_verdicts,
+    verdicts,
+)
 
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None removes a key."""
@@ -44,12 +51,17 @@ class JudgedConfig:
     @property
     def budgets(self) -> dict[str, Budget]:
         """The known budgets, by board."""
-        return {name: board.budget for name, board in self.timing.boards.items() if board.budget is not None}
+        return {
+            name: board.budget
+            for name, board in self.timing.boards.items()
+            if board.budget is not None
+        }
 
     def changed(
         self, board: str, settings: Settings, mailboxes: Mapping[str, Protocol] | None = None
     ) -> JudgedConfig | None:
-        """Return the config with other settings of a board, loaded anew and judged; None if it is invalid.
+        """Return the config with other settings of a board, loaded anew and judged; None if it is
+        invalid.
 
         `mailboxes` are those that get another protocol.
         """
@@ -71,26 +83,32 @@ class JudgedConfig:
         return tuple(verdict for verdict in self.verdicts if not verdict.holds)
 
     def failing_of(self, board: str) -> set[tuple[str, str, str]]:
-        """Return the keys of the failures of a board's own tasks; without any, of overloads of its cores."""
+        """Return the keys of the failures of a board's own tasks; without any, of overloads of its
+        cores."""
         names = {board, f"{board}.planner"}
         own = {verdict.key for verdict in self.failing if verdict.subject in names}
         cores = {f"core {core}" for core in self.timing.cores_of(board)}
         return own or {v.key for v in self.failing if v.equation == LOAD and v.subject in cores}
 
     def cures(self, board: str, before: JudgedConfig) -> bool:
-        """Return whether all failures of the board in `before` are gone, and no new ones have appeared."""
+        """Return whether all failures of the board in `before` are gone, and no new ones have
+        appeared."""
         failing = {verdict.key for verdict in self.failing}
         old = {verdict.key for verdict in before.failing}
         return failing < old and not failing & before.failing_of(board)
 
     def is_sound(self, changed: RackTiming, board: str) -> bool:
-        """Return whether one changed board satisfies its own equations and lets the system respond as before.
+        """Return whether one changed board satisfies its own equations and lets the system respond
+        as before.
 
         This is a quick check; it leaves out the effect on other tasks on the core.
         """
         old = {verdict.key for verdict in self.failing}
         system = (verdict for verdict in system_verdicts(changed) if verdict.key not in old)
-        return all(verdict.holds for verdict in chain(level_verdicts(changed, changed.level(board)), system))
+        return all(
+            verdict.holds
+            for verdict in chain(level_verdicts(changed, changed.level(board)), system)
+        )
 
 
 @dataclass(frozen=True)
@@ -103,13 +121,17 @@ class Change:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The keys of the board's table that change, with their new values; None: the key is removed."""
+        """The keys of the board's table that change, with their new values; None: the key is
+        removed."""
         old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
-        return {key: getattr(new, key) for key in CHANGEABLE if getattr(old, key) != getattr(new, key)}
+        return {
+            key: getattr(new, key) for key in CHANGEABLE if getattr(old, key) != getattr(new, key)
+        }
 
     @property
     def cost(self) -> tuple[bool, float, int, int]:
-        """The cost, for comparison: a core that this machine lacks, the slowdown, new cores and slots, then keys.
+        """The cost, for comparison: a core that this machine lacks, the slowdown, new cores and
+        slots, then keys.
 
         A longer cycle makes a level slower and its plans older: both factors count.
         """
@@ -120,7 +142,12 @@ class Change:
         factor = new.cycle_ns / old.cycle_ns
         if old.slice_ns is not None and new.slice_ns is not None:
             factor *= max(new.slice_ns / old.slice_ns, 1.0)
-        return lacking, factor, 2 * len(cores) + ("planner_slot" in self.settings), len(self.settings)
+        return (
+            lacking,
+            factor,
+            2 * len(cores) + ("planner_slot" in self.settings),
+            len(self.settings),
+        )
 
     @property
     def text(self) -> str:
@@ -129,7 +156,12 @@ class Change:
 
     def document(self) -> dict[str, Any]:
         """Return it as plain data."""
-        return {"board": self.board, "text": self.text, "settings": self.settings, "protocols": self._protocols()}
+        return {
+            "board": self.board,
+            "text": self.text,
+            "settings": self.settings,
+            "protocols": self._protocols(),
+        }
 
     def _parts(self) -> Iterator[str]:
         old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
@@ -147,7 +179,10 @@ class Change:
         yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self._protocols().items())
         if "every" in changed or "within_cycles" in changed:
             yield from self._cycles()
-        if changed.get("coupling") == "loose" and not self.after.timing.level(self.board).exchange_ns:
+        if (
+            changed.get("coupling") == "loose"
+            and not self.after.timing.level(self.board).exchange_ns
+        ):
             yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
 
     def _cycles(self) -> Iterator[str]:
@@ -159,7 +194,9 @@ class Change:
         if new.slice_ns is not None:
             age = f"a plan every {new.slice_ns * 1e-6:g} ms"
             same = new.within_cycles == old.within_cycles
-            yield age if same else f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
+            yield (
+                age if same else f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
+            )
 
     def _response(self) -> str:
         """Return the change of the system's response time, as text."""
@@ -169,11 +206,21 @@ class Change:
     def _sharing(self, core: int) -> str:
         """Return which other tasks are on a core, and whether this machine has it."""
         own = (self.board, f"{self.board}.planner")
-        others = [name for name, place in self.after.timing.cores.items() if place == core and name not in own]
+        others = [
+            name
+            for name, place in self.after.timing.cores.items()
+            if place == core and name not in own
+        ]
         sharing = f"shared with {', '.join(others)}" if others else "not shared"
         obtained = obtained_core(core)
-        return sharing if obtained == core else f"{sharing}; this machine has no core {core}, uses core {obtained}"
+        return (
+            sharing
+            if obtained == core
+            else f"{sharing}; this machine has no core {core}, uses core {obtained}"
+        )
 
     def _protocols(self) -> dict[str, str]:
         old, new = (rack.config.protocol.mailbox for rack in (self.before, self.after))
-        return {mailbox: protocol for mailbox, protocol in new.items() if old.get(mailbox) != protocol}
+        return {
+            mailbox: protocol for mailbox, protocol in new.items() if old.get(mailbox) != protocol
+        }

@@ -1,7 +1,8 @@
 """The response of the whole system, measured and compared with its bounds (eqs 3.2 and 3.3).
 
-Every message carries the tick of the oldest information that it rests on. A command can therefore be followed from
-the release of the highest level to the cycle of the lowest level that acts on it, and a status back up.
+Every message carries the tick of the oldest information that it rests on. A command can therefore
+be followed from the release of the highest level to the cycle of the lowest level that acts on it,
+and a status back up.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ LOSSES = ("died", "hang")
 
 
 def system_response(recording: Recording) -> dict[str, Any] | None:
-    """Return the response down (commands) and up (statuses), in ticks and ms; None without a hierarchy.
+    """Return the response down (commands) and up (statuses), in ticks and ms; None without a
+    hierarchy.
 
-    It is that of the chains with the longest response; `others` holds the same for all other chains of the rack.
-    `beyond` are the responses longer than their bound, each with the delays that the run shows; `unseen` counts those
-    that cannot be measured because the recording lacks messages.
+    It is that of the chains with the longest response; `others` holds the same for all other chains
+    of the rack. `beyond` are the responses longer than their bound, each with the delays that the
+    run shows; `unseen` counts those that cannot be measured because the recording lacks messages.
     """
     rack = rack_timing(recording.rack_config, recording.layout)
     first = rack.hierarchy
@@ -38,7 +40,9 @@ def system_response(recording: Recording) -> dict[str, Any] | None:
         return None
     return {
         **_response(recording, rack, first),
-        "others": [_response(recording, rack, chains) for chains in rack.parallel if chains != first],
+        "others": [
+            _response(recording, rack, chains) for chains in rack.parallel if chains != first
+        ],
     }
 
 
@@ -51,22 +55,28 @@ def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) ->
         "bound_eq_3_2_ms": system_response_bound_ns(cycles) * tick_ms,
         "sum_eq_3_3_ms": system_response_ns((), cycles) * tick_ms,
         "command": _way(recording, rack, chains.chains, chains.levels),
-        "status": _way(recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]),
+        "status": _way(
+            recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]
+        ),
     }
 
 
 def _way(
     recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
 ) -> dict[str, Any]:
-    """Judge the response along all of these chains, from their first board's release to the last one's cycle.
+    """Judge the response along all of these chains, from their first board's release to the last
+    one's cycle.
 
-    `levels` are those over which it is measured: after a level that does not pass the information on, it begins anew.
+    `levels` are those over which it is measured: after a level that does not pass the information
+    on, it begins anew.
     """
     layout = recording.layout
     ways = [(boards, mailboxes_along(layout, boards)) for boards in chains]
     passed = min(len(mailboxes) for _, mailboxes in ways)
     start = len(levels) - passed - 1 if passed else len(levels)
-    bound_ms = max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
+    bound_ms = (
+        max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
+    )
     found = [
         _along(recording, boards[start:], boxes[-passed:], bound_ms)
         for boards, boxes in ways
@@ -87,10 +97,11 @@ def _way(
 def _along(
     recording: Recording, boards: Sequence[str], boxes: Sequence[MailboxSpec], bound_ms: float
 ) -> tuple[np.ndarray, list[dict[str, Any]], int]:
-    """Return the responses along one chain by its mailboxes, ms, those beyond the bound, and the number unseen.
+    """Return the responses along one chain by its mailboxes, ms, those beyond the bound, and the
+    number unseen.
 
-    The worst case is information that just misses a release whose message went all the way: it waits for the next one
-    that does.
+    The worst case is information that just misses a release whose message went all the way: it
+    waits for the next one that does.
     """
     layout = recording.layout
     mailbox = boxes[-1].name
@@ -98,7 +109,8 @@ def _along(
     tick_ms = layout.clock_ns * 1e-6
     basis = recording.signal(mailbox, "basis")
     visible_at = recording.signal(mailbox, "visible_at")
-    # A message that nothing had reached when it was written rests on its own tick: before all that counts here.
+    # A message that nothing had reached when it was written rests on its own tick: before all that
+    # counts here.
     begun = max(int(recording.signal(box.name, "visible_at")[0]) for box in boxes)
     real = np.flatnonzero(basis >= begun)
     arrived, at = np.unique(basis[real], return_index=True)
@@ -124,12 +136,15 @@ def _along(
 
 
 def _delays(recording: Recording, levels: Sequence[str], since: int, until: int) -> Iterator[str]:
-    """Yield the faults, losses and misses between two ticks of the levels that the information passes."""
+    """Yield the faults, losses and misses between two ticks of the levels that the information
+    passes."""
     for fault in recording.ended.get("faults", ()):
         if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
             yield f"fault: {fault['kind']} of {fault['board']}"
     lost = [
-        e["subject"] or e["board"] for e in recording.events if e.get("code") in LOSSES and since <= e["tick"] < until
+        e["subject"] or e["board"]
+        for e in recording.events
+        if e.get("code") in LOSSES and since <= e["tick"] < until
     ]
     yield from (f"{board} was lost" for board in dict.fromkeys(lost))
     for name in levels:

@@ -1,7 +1,8 @@
-"""The response of a recorded run to its operator: from giving a command to the torque that rests on it.
+"""The response of a recorded run to its operator: from giving a command to the torque that rests on
+it.
 
-Causality is measured, not inferred: every command and status carries the serial of the newest operator command that it
-rests on.
+Causality is measured, not inferred: every command and status carries the serial of the newest
+operator command that it rests on.
 """
 
 from __future__ import annotations
@@ -38,10 +39,12 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class AnsweredCommand:
-    """One command, in ticks. `predicted` and `acts` are releases of the cycle whose torque rests on it.
+    """One command, in ticks. `predicted` and `acts` are releases of the cycle whose torque rests on
+    it.
 
-    `acts` is None if no cycle rests on this very command: it was refused, a newer one overtook it, or the run ended
-    first. `wall_ms` is the response by the wall clock, from giving the command to writing the status of that cycle.
+    `acts` is None if no cycle rests on this very command: it was refused, a newer one overtook it,
+    or the run ended first. `wall_ms` is the response by the wall clock, from giving the command to
+    writing the status of that cycle.
     """
 
     serial: int
@@ -57,7 +60,8 @@ class AnsweredCommand:
 
 @dataclass(frozen=True)
 class OperatorResponse:
-    """The response of a run. `tick_ms` is simulated time; `paths` are by level, for every level that was commanded."""
+    """The response of a run. `tick_ms` is simulated time; `paths` are by level, for every level
+    that was commanded."""
 
     tick_ms: float
     lockstep: bool
@@ -76,7 +80,8 @@ class OperatorResponse:
 
     @property
     def beyond(self) -> list[AnsweredCommand]:
-        """The commands whose response exceeded a bound: the longest on the grid, or eq. 3.2 from the release on."""
+        """The commands whose response exceeded a bound: the longest on the grid, or eq. 3.2 from
+        the release on."""
         return [command for command in self.measured if self._is_beyond(command)]
 
     def _is_beyond(self, command: AnsweredCommand) -> bool:
@@ -93,11 +98,13 @@ class OperatorResponse:
 
     @property
     def held(self) -> bool:
-        """Whether no response exceeded a bound and, in lockstep, each came at the predicted tick."""
+        """Whether no response exceeded a bound and, in lockstep, each came at the predicted
+        tick."""
         return not self.beyond and not (self.lockstep and self.off)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the figures of every level that was commanded, ms of simulated time, as plain data."""
+        """Return the figures of every level that was commanded, ms of simulated time, as plain
+        data."""
         return [self._row(level, path) for level, path in self.paths.items()]
 
     def _row(self, level: str, path: CommandPath) -> dict[str, Any]:
@@ -120,9 +127,16 @@ class OperatorResponse:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        commands = [asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None} for c in self.commands]
+        commands = [
+            asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None}
+            for c in self.commands
+        ]
         head = {"lockstep": self.lockstep, "tick_ms": self.tick_ms, "commands": len(self.commands)}
-        figures = {"measured": len(self.measured), "beyond": len(self.beyond), "off_prediction": len(self.off)}
+        figures = {
+            "measured": len(self.measured),
+            "beyond": len(self.beyond),
+            "off_prediction": len(self.off),
+        }
         return {**head, **figures, "levels": self.rows(), "each": commands}
 
     def text(self, width: int | None = None) -> str:
@@ -130,24 +144,44 @@ class OperatorResponse:
         return "\n".join(self._lines(width))
 
     def _lines(self, width: int | None) -> Iterator[str]:
-        yield f"response to {len(self.measured)} operator commands, ms of simulated time: from giving a command, and"
+        yield (
+            f"response to {len(self.measured)} operator commands, ms of simulated time: from giving"
+            " a command, and"
+        )
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
         head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
-        names = ["min", "median", "max", "longest", "max_from_reading", "sum_eq_3_3", "bound_eq_3_2"]
+        names = [
+            "min",
+            "median",
+            "max",
+            "longest",
+            "max_from_reading",
+            "sum_eq_3_3",
+            "bound_eq_3_2",
+        ]
         rows = [
             [
-                *(row["level"], str(row["commands"]), *(decimal(row[f"{name}_ms"], 1) for name in names)),
+                *(
+                    row["level"],
+                    str(row["commands"]),
+                    *(decimal(row[f"{name}_ms"], 1) for name in names),
+                ),
                 *(str(row["beyond"]), str(row["off_prediction"])),
             ]
             for row in self.rows()
         ]
         yield from table(head, rows, width, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
-            yield f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
+            yield (
+                f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
+            )
         for command in self.off:
             late = (command.acts or 0) - command.predicted
-            yield f"command {command.serial} to {command.level}, given at tick {command.given}: {late:+d} ticks"
+            yield (
+                f"command {command.serial} to {command.level}, given at tick {command.given}:"
+                f" {late:+d} ticks"
+            )
 
 
 def response_of(recording: Recording) -> OperatorResponse | None:
@@ -155,7 +189,9 @@ def response_of(recording: Recording) -> OperatorResponse | None:
     config = recording.rack_config
     layout = recording.layout
     found = command_paths(rack_timing(config, layout), layout)
-    paths = {level: path for level, path in found.items() if f"{level}.operator" in recording.mailboxes}
+    paths = {
+        level: path for level, path in found.items() if f"{level}.operator" in recording.mailboxes
+    }
     if not paths:
         return None
     answered = [
@@ -170,13 +206,17 @@ def response_of(recording: Recording) -> OperatorResponse | None:
     return OperatorResponse(layout.clock_ns * 1e-6, lockstep, paths, tuple(answered))
 
 
-def _commands(recording: Recording, level: str, path: CommandPath) -> Iterator[tuple[AnsweredCommand, int]]:
+def _commands(
+    recording: Recording, level: str, path: CommandPath
+) -> Iterator[tuple[AnsweredCommand, int]]:
     """Yield the commands given to a level, each with its time stamp, ns."""
     box = f"{level}.operator"
     status = f"{level}.status"
     # A clock that died while giving a command has given it twice: the first one counts.
     serials, at = np.unique(recording.signal(box, "id"), return_index=True)
-    whats, given, visible, stamps = (recording.signal(box, n)[at] for n in ("what", "tick", "visible_at", "stamp_ns"))
+    whats, given, visible, stamps = (
+        recording.signal(box, n)[at] for n in ("what", "tick", "visible_at", "stamp_ns")
+    )
     orders = recording.signal(status, "order")
     answers = recording.signal(status, "answer")
     refused = set(orders[answers == Answer.REFUSED].tolist())
@@ -195,7 +235,8 @@ def _commands(recording: Recording, level: str, path: CommandPath) -> Iterator[t
 
 
 class _Statuses(NamedTuple):
-    """Statuses of the lowest level, each array of shape (n,): the command that each rests on, its tick, its stamp."""
+    """Statuses of the lowest level, each array of shape (n,): the command that each rests on, its
+    tick, its stamp."""
 
     serial: np.ndarray
     tick: np.ndarray
@@ -203,11 +244,14 @@ class _Statuses(NamedTuple):
 
 
 def _statuses(recording: Recording, lowest: str) -> _Statuses:
-    return _Statuses(*(recording.signal(f"{lowest}.status", name) for name in ("operator", "tick", "stamp_ns")))
+    return _Statuses(
+        *(recording.signal(f"{lowest}.status", name) for name in ("operator", "tick", "stamp_ns"))
+    )
 
 
 def _follow(command: AnsweredCommand, given_ns: int, statuses: _Statuses) -> AnsweredCommand:
-    """Return the command with the first cycle of the lowest level that rests on it, or on a newer one."""
+    """Return the command with the first cycle of the lowest level that rests on it, or on a newer
+    one."""
     serial = statuses.serial
     if command.fate == "refused" or not len(serial) or serial.max() < command.serial:
         return command
@@ -223,14 +267,18 @@ def _figure(values: np.ndarray, of: Callable[[np.ndarray], Any]) -> float | None
 
 
 def show(recording: Recording, folder: Path, as_json: bool) -> bool:
-    """Print the response of a run and write response.json and its pictures into `folder`; return whether it held.
+    """Print the response of a run and write response.json and its pictures into `folder`; return
+    whether it held.
 
     Raises `Failure` if no operator commanded a level.
     """
     response = response_of(recording)
     if response is None:
         why = "no operator commanded a level of its hierarchy"
-        raise Failure(f"{recording.folder}: {why}; see 'rack command', [[command]] and 'rack bench response'", 2)
+        raise Failure(
+            f"{recording.folder}: {why}; see 'rack command', [[command]] and 'rack bench response'",
+            2,
+        )
     folder.mkdir(parents=True, exist_ok=True)
     document = response.document()
     (folder / "response.json").write_text(json.dumps(document, indent=2) + "\n")
@@ -244,7 +292,8 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
 
 
 def plot(response: OperatorResponse, folder: Path) -> list[Path]:
-    """Write response.png and response.svg, a histogram per level with its bounds, into `folder`; return their paths."""
+    """Write response.png and response.svg, a histogram per level with its bounds, into `folder`;
+    return their paths."""
     levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
     paths = paths_of(folder / "response")
     with picture(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:
@@ -252,9 +301,13 @@ def plot(response: OperatorResponse, folder: Path) -> list[Path]:
         for axis, level in zip(axes[:, 0], levels, strict=True):
             _plot_level(axis, response, level)
         time = "simulated time" if response.lockstep else "the wall clock"
-        axes[-1, 0].set_xlabel(f"from giving a command to the torque that rests on it, ms of {time}")
+        axes[-1, 0].set_xlabel(
+            f"from giving a command to the torque that rests on it, ms of {time}"
+        )
         handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small")
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize="small"
+        )
     return paths
 
 
@@ -268,7 +321,12 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
     lines = (
         ((wait + path.sum_eq_3_3) * tick_ms, SUM, "-.", "longest wait to be read + sum, eq. 3.3"),
         (path.longest * tick_ms, GRID, "--", "longest on the grid"),
-        ((wait + path.bound_eq_3_2) * tick_ms, BOUND, "-", "longest wait to be read + bound, eq. 3.2"),
+        (
+            (wait + path.bound_eq_3_2) * tick_ms,
+            BOUND,
+            "-",
+            "longest wait to be read + bound, eq. 3.2",
+        ),
     )
     values = [response.ticks(c) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
     end = max(lines[2][0], *values)

@@ -1,6 +1,8 @@
-"""Changes that make a rack fit its cycles: of every kind the smallest, each tried on the whole rack.
+"""Changes that make a rack fit its cycles: of every kind the smallest, each tried on the whole
+rack.
 
-The paper names two kinds: another processor for the planner, and a longer response time (sections 3.2 and 3.3).
+The paper names two kinds: another processor for the planner, and a longer response time (sections
+3.2 and 3.3).
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
 MAX_CYCLES = 10_000
 """Largest permitted `within_cycles`."""
 MAX_FACTOR = 16
-"""Cycles and plan ages are tried up to this many times as long: beyond, it would be another level."""
+"""Cycles and plan ages are tried up to this many times as long: beyond, it would be another
+level."""
 MAX_CYCLES_TRIED = 400
 """Longer cycles tried for one board; for a long cycle not every tick."""
 MAX_OTHERS = 3
@@ -53,21 +56,33 @@ class Repair:
             found.append(f"{start}{', one of these, cheapest first' if len(changes) > 1 else ''}:")
             found += [f"  {change.text}" for change in changes]
         if self.left:
-            failing = ", ".join(dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left))
-            tried = f"other priorities and cores, cycles and plans up to {MAX_FACTOR} times as long, also of others"
+            failing = ", ".join(
+                dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left)
+            )
+            tried = (
+                f"other priorities and cores, cycles and plans up to {MAX_FACTOR} times as long,"
+                " also of others"
+            )
             found.append(f"no change helps with {failing}; tried: {tried}")
         return found
 
     def document(self) -> dict[str, Any]:
         """Return it as plain data."""
-        return {"steps": [[change.document() for change in changes] for changes in self.steps], "fits": not self.left}
+        return {
+            "steps": [[change.document() for change in changes] for changes in self.steps],
+            "fits": not self.left,
+        }
 
 
 def repair(rack: JudgedConfig) -> Repair:
-    """Return the changes that make a rack fit: for one board, then, with the cheapest of them, for the next."""
+    """Return the changes that make a rack fit: for one board, then, with the cheapest of them, for
+    the next."""
     steps: list[tuple[Change, ...]] = []
     while rack.failing:
-        found = next((changes for board in _failing_boards(rack) if (changes := changes_for(rack, board))), None)
+        found = next(
+            (changes for board in _failing_boards(rack) if (changes := changes_for(rack, board))),
+            None,
+        )
         if found is None:
             break
         steps.append(tuple(found))
@@ -86,9 +101,9 @@ def _failing_boards(rack: JudgedConfig) -> list[str]:
 def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
     """Return the changes that make a board fit, sorted by `Change.cost`: the smallest of each kind.
 
-    Another priority, or a core already in use, costs nothing. Next come a slot and a new core, then older plans and
-    longer cycles, of the board or of one that shares its core, by their factor. If none of these helps alone, moving
-    the planner and lengthening the cycle together may.
+    Another priority, or a core already in use, costs nothing. Next come a slot and a new core, then
+    older plans and longer cycles, of the board or of one that shares its core, by their factor. If
+    none of these helps alone, moving the planner and lengthening the cycle together may.
     """
     kinds = (_other_priority, _board_elsewhere, _planner_elsewhere, _more_cycles, _longer_cycle)
     found = [change for kind in kinds if (change := kind(rack, board)) is not None]
@@ -100,20 +115,26 @@ def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
 
 
 def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
-    """Put the board's executor, or its planner, above another task on its core; the smallest rise that helps."""
+    """Put the board's executor, or its planner, above another task on its core; the smallest rise
+    that helps."""
     table = rack.config.board[board]
     limit = rack.config.clock.priority or HIGHEST + 1
     tried: list[Settings] = []
     for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
         core = rack.timing.cores.get(task)
         own = getattr(table, key)
-        above = {other.priority + 1 for other in rack.timing.tasks if other.core == core and other.name != task}
+        above = {
+            other.priority + 1
+            for other in rack.timing.tasks
+            if other.core == core and other.name != task
+        }
         tried += [{key: priority} for priority in sorted(above) if own < priority < limit]
     return _any(rack, board, tried)
 
 
 def _changes_of_others(rack: JudgedConfig, board: str) -> list[Change]:
-    """Return the cheapest change of each board that shares a core with this one: another core, or a longer cycle."""
+    """Return the cheapest change of each board that shares a core with this one: another core, or a
+    longer cycle."""
     timing = rack.timing
     cores = timing.cores_of(board)
     loads = {task.board: 0.0 for task in timing.tasks}
@@ -123,7 +144,9 @@ def _changes_of_others(rack: JudgedConfig, board: str) -> list[Change]:
     found = []
     for other in sorted(others, key=lambda name: -loads[name])[:MAX_OTHERS]:
         changes = (_task_elsewhere(rack, other, board), _longer_cycle(rack, other, cures=board))
-        found += sorted((change for change in changes if change is not None), key=lambda change: change.cost)[:1]
+        found += sorted(
+            (change for change in changes if change is not None), key=lambda change: change.cost
+        )[:1]
     return found
 
 
@@ -131,29 +154,45 @@ def _more_cycles(rack: JudgedConfig, board: str) -> Change | None:
     level = rack.timing.level(board)
     if level.within_cycles is None:
         return None
-    return _first(rack, board, [{"within_cycles": d} for d in _cycles(level, level.within_cycles + 1)])
+    return _first(
+        rack, board, [{"within_cycles": d} for d in _cycles(level, level.within_cycles + 1)]
+    )
 
 
 def _planner_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
-    """Couple a planner loosely, or move a loose one to another core; if that is not enough, with more cycles."""
+    """Couple a planner loosely, or move a loose one to another core; if that is not enough, with
+    more cycles."""
     level = rack.timing.level(board)
     places = list(_places(rack, board))
     if (change := _any(rack, board, places)) is not None:
         return change
     older = _cycles(level, (level.within_cycles or 0) + 1)
-    found = [_first(rack, board, [{**place, "within_cycles": d} for d in older]) for place in places]
-    return min((change for change in found if change is not None), key=lambda change: change.cost, default=None)
+    found = [
+        _first(rack, board, [{**place, "within_cycles": d} for d in older]) for place in places
+    ]
+    return min(
+        (change for change in found if change is not None),
+        key=lambda change: change.cost,
+        default=None,
+    )
 
 
 def _board_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
-    return _any(rack, board, ({"core": core} for core in _other_cores(rack, rack.config.board[board].core)))
+    return _any(
+        rack, board, ({"core": core} for core in _other_cores(rack, rack.config.board[board].core))
+    )
 
 
 def _task_elsewhere(rack: JudgedConfig, board: str, cures: str) -> Change | None:
     """Move a board, or its loose planner alone, to another used core so that another board fits."""
     table = rack.config.board[board]
     keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
-    return _any(rack, board, ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key))), cures)
+    return _any(
+        rack,
+        board,
+        ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key))),
+        cures,
+    )
 
 
 def _longer_cycle(
@@ -164,15 +203,22 @@ def _longer_cycle(
     timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
     longest = min(MAX_FACTOR * every, LONGEST_EVERY)
-    tried = (_lengthened(timing, board, longer) for longer in range(every + step, longest + 1, step))
-    # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the other levels less well, or
-    # leave plans too few cycles.
-    sound = [{**(place or {}), **settings} for changed, settings in tried if rack.is_sound(changed, board)]
+    tried = (
+        _lengthened(timing, board, longer) for longer in range(every + step, longest + 1, step)
+    )
+    # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the other
+    # levels less well, or leave plans too few cycles.
+    sound = [
+        {**(place or {}), **settings}
+        for changed, settings in tried
+        if rack.is_sound(changed, board)
+    ]
     return _first(rack, board, sound, cures)
 
 
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
-    """Yield settings for each place where the board's planner could be loosely coupled; none without a planner."""
+    """Yield settings for each place where the board's planner could be loosely coupled; none
+    without a planner."""
     table = rack.config.board[board]
     slot = _free_slot(rack) if table.planner_slot is None else table.planner_slot
     if rack.timing.level(board).within_cycles is not None and slot is not None:
@@ -200,44 +246,66 @@ def _lengthened(timing: RackTiming, board: str, every: int) -> tuple[RackTiming,
 
 
 def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
-    """Yield the cores to which a task could move: used ones, the least loaded first, then an unused one.
+    """Yield the cores to which a task could move: used ones, the least loaded first, then an unused
+    one.
 
     A core of a board without a budget is left out: its free time is unknown.
     """
     timing = rack.timing
     used = set(timing.cores.values())
-    unknown = {core for name in timing.boards.keys() - timing.levels.keys() for core in timing.cores_of(name)}
-    yield from sorted(used - unknown - {core}, key=lambda other: (timing.loads.get(other, 0.0), other))
+    unknown = {
+        core
+        for name in timing.boards.keys() - timing.levels.keys()
+        for core in timing.cores_of(name)
+    }
+    yield from sorted(
+        used - unknown - {core}, key=lambda other: (timing.loads.get(other, 0.0), other)
+    )
     yield next(free for free in range(len(used) + 1) if free not in used)
 
 
 def _free_slot(rack: JudgedConfig) -> int | None:
-    taken = {slot for table in rack.config.board.values() for slot in (table.slot, table.planner_slot)}
+    taken = {
+        slot for table in rack.config.board.values() for slot in (table.slot, table.planner_slot)
+    }
     return next((slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken), None)
 
 
-def _attempt(rack: JudgedConfig, board: str, settings: Settings, cures: str | None) -> Change | None:
+def _attempt(
+    rack: JudgedConfig, board: str, settings: Settings, cures: str | None
+) -> Change | None:
     """Return the change of a board if it cures the board, or the board `cures`."""
     mailboxes: dict[str, Protocol] = {}
     if settings.get("coupling") == "loose" and rack.timing.boards[board].is_critical:
         # Between two processors the paper uses time slices or double buffers (section 3.3).
         mailboxes = {f"{board}.plan": "time-slice"}
     after = rack.changed(board, settings, mailboxes)
-    return Change(board, rack, after) if after is not None and after.cures(cures or board, rack) else None
+    return (
+        Change(board, rack, after)
+        if after is not None and after.cures(cures or board, rack)
+        else None
+    )
 
 
-def _any(rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None) -> Change | None:
+def _any(
+    rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None
+) -> Change | None:
     """Return the first change that works, trying one after another."""
-    return next((change for one in tried if (change := _attempt(rack, board, one, cures)) is not None), None)
+    return next(
+        (change for one in tried if (change := _attempt(rack, board, one, cures)) is not None), None
+    )
 
 
-def _first(rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None) -> Change | None:
+def _first(
+    rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None
+) -> Change | None:
     """Return the first change that works, in few attempts; see `first_that`."""
     return first_that(tried, lambda settings: _attempt(rack, board, settings, cures))
 
 
 def first_that(tried: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:
-    """Return the result of `attempt` for the first item that has one, in few attempts; None if none has.
+    """Return the result of `attempt` for the first item that has one, in few attempts; None if none
+    has.
 
     The items must be ordered: all items after one that works also work.
     """

@@ -1,4 +1,5 @@
-"""A forecast as text: the system's response, and tables of levels, verdicts and response times; times in ms."""
+"""A forecast as text: the system's response, and tables of levels, verdicts and response times;
+times in ms."""
 
 from __future__ import annotations
 
@@ -22,7 +23,11 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
     """Yield a forecast as text for people."""
     yield from _prediction_lines(forecast.system)
     if forecast.levels:
-        yield from ("", f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:", "")
+        yield from (
+            "",
+            f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:",
+            "",
+        )
         yield from _levels(forecast.levels, width)
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
@@ -31,7 +36,10 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
         yield from _responses(forecast.responses, width)
         yield ""
-        loads = (f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}" for core, load in forecast.loads.items())
+        loads = (
+            f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
+            for core, load in forecast.loads.items()
+        )
         yield f"load: {', '.join(loads)}"
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
@@ -41,7 +49,8 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
 
 
 def _schedule_lines(forecast: Forecast, width: int | None) -> Iterator[str]:
-    """Yield a line per board of every distinct frame of a static schedule, and those that are late in theirs."""
+    """Yield a line per board of every distinct frame of a static schedule, and those that are late
+    in theirs."""
     if forecast.schedule is None:
         return
     minor, major = forecast.schedule
@@ -74,7 +83,8 @@ def _late_lines(alike: CoreFrames) -> Iterator[str]:
 
 
 def _numbers(frames: Sequence[int], count: int) -> str:
-    """Return the numbers of frames as text, those at equal distances by the first two and the last."""
+    """Return the numbers of frames as text, those at equal distances by the first two and the
+    last."""
     if len(frames) == count:
         return "all"
     first = frames[0]
@@ -83,22 +93,46 @@ def _numbers(frames: Sequence[int], count: int) -> str:
     if len(frames) <= 3:
         return ", ".join(map(str, frames))
     even = all(later - earlier == second - first for earlier, later in pairwise(frames))
-    return f"{first}, {second} ... {last}" if even else f"{first}, {second}, {frames[2]} ... {last}: {len(frames)}"
+    return (
+        f"{first}, {second} ... {last}"
+        if even
+        else f"{first}, {second}, {frames[2]} ... {last}: {len(frames)}"
+    )
 
 
 def _prediction_lines(system: Prediction) -> Iterator[str]:
     if system.levels:
         yield ""
         yield f"system response, {' > '.join(system.levels)}:"
-        yield f"  eq. 3.3 sum of the cycles {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound {system.bound_eq_3_2_ms:g} ms"
-        yield f"  on the clock's grid: a command down {system.command_ms:g} ms, a status up {system.status_ms:g} ms"
+        yield (
+            f"  eq. 3.3 sum of the cycles {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound"
+            f" {system.bound_eq_3_2_ms:g} ms"
+        )
+        yield (
+            f"  on the clock's grid: a command down {system.command_ms:g} ms, a status up"
+            f" {system.status_ms:g} ms"
+        )
     for level, plan_ms in system.plan_ms.items():
         yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"
 
 
 def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
     """Yield a line per level: its cycle, its parts, and the residual for its planner."""
-    head = ["level", "coupling", "R_i", "t_exec", "t_comm", "R", "W", "C", "t_residual", "t_plan", "P", "U", "d"]
+    head = [
+        "level",
+        "coupling",
+        "R_i",
+        "t_exec",
+        "t_comm",
+        "R",
+        "W",
+        "C",
+        "t_residual",
+        "t_plan",
+        "P",
+        "U",
+        "d",
+    ]
     rows = _merged([_level_row(level) for level in levels], 0)
     yield from table([*head, "d R_i"], rows, width, ("C", "R", "W", "U", "P", "d"))
 
@@ -106,14 +140,25 @@ def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
 def _verdicts(verdicts: Iterable[EquationVerdict], width: int | None) -> Iterator[str]:
     """Yield a line per verdict: both sides, the margin, whether it holds."""
     head = ["eq.", "of", "left", "", "right", "margin", "", "meaning"]
-    yield from table(head, _merged([_verdict_row(verdict) for verdict in verdicts], 1), width, ("meaning", "margin"))
+    yield from table(
+        head,
+        _merged([_verdict_row(verdict) for verdict in verdicts], 1),
+        width,
+        ("meaning", "margin"),
+    )
 
 
 def _responses(responses: Iterable[TaskResponse], width: int | None) -> Iterator[str]:
-    """Yield a line per task, core by core: its cost, its blocking, its response and its deadline."""
+    """Yield a line per task, core by core: its cost, its blocking, its response and its
+    deadline."""
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
-    yield from table(head, _merged([_response_row(response) for response in ordered], 1), width, ("FIFO", "margin"))
+    yield from table(
+        head,
+        _merged([_response_row(response) for response in ordered], 1),
+        width,
+        ("FIFO", "margin"),
+    )
 
 
 def _inboxes(inboxes: Sequence[Mapping[str, Any]], width: int | None) -> Iterator[str]:
@@ -123,7 +168,11 @@ def _inboxes(inboxes: Sequence[Mapping[str, Any]], width: int | None) -> Iterato
         [
             *(inbox["task"], spanned([name.partition(".")[0] for name in inbox["mailboxes"]])),
             *(ms(inbox["cycle_cost_ns"]), f"{inbox['load']:.3f}", ms(inbox["longest_ns"])),
-            *("-" if inbox["waiting"] is None else str(inbox["waiting"]), str(inbox["depth"]), _result(inbox["fits"])),
+            *(
+                "-" if inbox["waiting"] is None else str(inbox["waiting"]),
+                str(inbox["depth"]),
+                _result(inbox["fits"]),
+            ),
         ]
         for inbox in inboxes
     ]
@@ -131,7 +180,8 @@ def _inboxes(inboxes: Sequence[Mapping[str, Any]], width: int | None) -> Iterato
 
 
 def _merged(rows: Sequence[Sequence[str]], named: int) -> list[list[str]]:
-    """Return the rows, those that differ only in the name, in column `named`, as one: a board a joint fills no page."""
+    """Return the rows, those that differ only in the name, in column `named`, as one: a board a
+    joint fills no page."""
     names: dict[tuple[str, ...], list[str]] = {}
     for row in rows:
         names.setdefault((*row[:named], *row[named + 1 :]), []).append(row[named])
@@ -139,8 +189,19 @@ def _merged(rows: Sequence[Sequence[str]], named: int) -> list[list[str]]:
 
 
 def _level_row(level: LevelTiming) -> list[str]:
-    own = (level.cycle_ns, level.execution_ns, level.communication_ns, level.read_ns, level.write_ns, level.exchange_ns)
-    plan = (level.planning_ns, level.plan_ns, level.update_ns if level.plan_ns is not None else None)
+    own = (
+        level.cycle_ns,
+        level.execution_ns,
+        level.communication_ns,
+        level.read_ns,
+        level.write_ns,
+        level.exchange_ns,
+    )
+    plan = (
+        level.planning_ns,
+        level.plan_ns,
+        level.update_ns if level.plan_ns is not None else None,
+    )
     cycles = "-" if level.within_cycles is None else str(level.within_cycles)
     times = [ms(time) for time in (*own, level.residual_ns, *plan)]
     return [level.board, level.coupling, *times, cycles, ms(level.slice_ns)]
@@ -150,7 +211,16 @@ def _verdict_row(verdict: EquationVerdict) -> list[str]:
     sides = (verdict.left, verdict.right, verdict.margin)
     result = _result(verdict.holds)
     left, right, margin = (ms(side) if verdict.unit == "ns" else f"{side:.3g}" for side in sides)
-    return [verdict.equation, verdict.subject, left, verdict.sign, right, margin, result, verdict.meaning]
+    return [
+        verdict.equation,
+        verdict.subject,
+        left,
+        verdict.sign,
+        right,
+        margin,
+        result,
+        verdict.meaning,
+    ]
 
 
 def _response_row(response: TaskResponse) -> list[str]:
@@ -158,7 +228,13 @@ def _response_row(response: TaskResponse) -> list[str]:
     margin = None if found is None else response.deadline_ns - found
     times = (response.job_ns, response.blocking_ns, found, response.deadline_ns, margin)
     priority = str(response.priority or "-")
-    return [str(response.core), response.task, priority, *(ms(time) for time in times), _result(response.holds)]
+    return [
+        str(response.core),
+        response.task,
+        priority,
+        *(ms(time) for time in times),
+        _result(response.holds),
+    ]
 
 
 def _result(holds: bool) -> str:

@@ -1,4 +1,5 @@
-"""The first view of one run or several: the blueprint of all views, the place of the eye, the config as a document."""
+"""The first view of one run or several: the blueprint of all views, the place of the eye, the
+config as a document."""
 
 from __future__ import annotations
 
@@ -43,7 +44,9 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=SIM_TIME, play_state="following" if live else "paused"),
+        rrb.TimePanel(
+            state="collapsed", timeline=SIM_TIME, play_state="following" if live else "paused"
+        ),
         auto_views=False,
         auto_layout=False,
     )
@@ -52,7 +55,8 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 def together(racks: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view of several racks, by name: all at once, and in further tabs each by itself.
 
-    All at once are a column for each rack, its cell above what its levels do, and below them the log of all.
+    All at once are a column for each rack, its cell above what its levels do, and below them the
+    log of all.
     """
     columns = rrb.Horizontal(*(views.column(name) for name, views in racks.items()))
     logs = [f"{path(LOG)}/**", *(views.all(LOG) for views in racks.values())]
@@ -64,12 +68,16 @@ def together(racks: Mapping[str, RackViews]) -> rrb.Container:
 class RackViews:
     """The views of one rack: its cell in 3D, curves, lanes, log. Its entities are below `root`."""
 
-    def __init__(self, layout: Layout, config: RackConfig, cell: Cell | None, root: Sequence[str] = ()) -> None:
+    def __init__(
+        self, layout: Layout, config: RackConfig, cell: Cell | None, root: Sequence[str] = ()
+    ) -> None:
         self._layout = layout
         self._config = config
         self._cell = cell
         self._root = root
-        has_arm = cell is not None and any(mailbox.message in DRIVING for mailbox in layout.mailboxes)
+        has_arm = cell is not None and any(
+            mailbox.message in DRIVING for mailbox in layout.mailboxes
+        )
         self._hand = None if cell is None else cell.hand
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
 
@@ -86,9 +94,17 @@ class RackViews:
         doing = lanes_view("levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)])
         below = rrb.Horizontal(doing, self._graph(), column_shares=[3, 2])
         cell = self._cell
-        left = below if cell is None else rrb.Vertical(self._scene(cell, "cell"), below, row_shares=[11, 9])
+        left = (
+            below
+            if cell is None
+            else rrb.Vertical(self._scene(cell, "cell"), below, row_shares=[11, 9])
+        )
         right = rrb.Vertical(
-            self._fingers(self._hand) if self._hand is not None else self._arm() if self._joints else self._signals(),
+            self._fingers(self._hand)
+            if self._hand is not None
+            else self._arm()
+            if self._joints
+            else self._signals(),
             lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
             rrb.Horizontal(self._load(), self._ages(), self._log(), column_shares=[3, 3, 4]),
             row_shares=[4, 5, 3],
@@ -98,16 +114,23 @@ class RackViews:
     def column(self, name: str) -> rrb.Container | rrb.View:
         """Return the cell, if there is one, above what the levels do."""
         levels = lanes_view(f"{name}: levels", [self.all(LEVELS)])
-        return levels if self._cell is None else rrb.Vertical(self._scene(self._cell, name), levels, row_shares=[5, 4])
+        return (
+            levels
+            if self._cell is None
+            else rrb.Vertical(self._scene(self._cell, name), levels, row_shares=[5, 4])
+        )
 
     def _scene(self, cell: Cell, name: str) -> rrb.View:
         """Return the view of the cell."""
         shown = [self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)]
         eye = eye_on(cell)
-        return rrb.Spatial3DView(origin=self.path(CELL), contents=shown, name=name, eye_controls=eye, line_grid=False)
+        return rrb.Spatial3DView(
+            origin=self.path(CELL), contents=shown, name=name, eye_controls=eye, line_grid=False
+        )
 
     def _arm(self) -> rrb.Container:
-        """Return a view of all joints for each quantity, and in a second tab one of each joint with its limits."""
+        """Return a view of all joints for each quantity, and in a second tab one of each joint with
+        its limits."""
         views = [
             rrb.Tabs(
                 _curves(
@@ -115,7 +138,10 @@ class RackViews:
                     [self.path(JOINTS, name, quantity) for name in self._joints],
                     legend=quantity == "torque",
                 ),
-                rrb.Grid(*(self._joint(name, quantity) for name in self._joints), name="by joint, with limits"),
+                rrb.Grid(
+                    *(self._joint(name, quantity) for name in self._joints),
+                    name="by joint, with limits",
+                ),
             )
             for quantity in QUANTITIES
         ]
@@ -128,7 +154,10 @@ class RackViews:
         cell = self._cell
         if cell is None or cell.wrist is None:
             return []
-        task = [[self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit] for unit in ("N", "N m")]
+        task = [
+            [self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit]
+            for unit in ("N", "N m")
+        ]
         return [
             _curves("force wanted and exerted, N", task[0]),
             _curves("torque wanted and exerted, N m", task[1]),
@@ -136,16 +165,22 @@ class RackViews:
         ]
 
     def _fingers(self, hand: Hand) -> rrb.Container:
-        """Return a view of every finger for tensions, joints and forces, each kind in a tab, and one of all tips."""
+        """Return a view of every finger for tensions, joints and forces, each kind in a tab, and
+        one of all tips."""
         tabs = [
             rrb.Grid(
-                *(_curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)], legend=False) for finger in hand.names),
+                *(
+                    _curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)], legend=False)
+                    for finger in hand.names
+                ),
                 grid_columns=2,
                 name=kind,
             )
             for kind, unit in BY_FINGER.items()
         ]
-        return rrb.Horizontal(rrb.Tabs(*tabs, active_tab=0), _curves("force on the tips, N", [self.path(*TIPS)]))
+        return rrb.Horizontal(
+            rrb.Tabs(*tabs, active_tab=0), _curves("force on the tips, N", [self.path(*TIPS)])
+        )
 
     def _joint(self, name: str, quantity: str) -> rrb.View:
         shown = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
@@ -167,7 +202,9 @@ class RackViews:
         plans = [self.path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
         sampled = [self.all(timing.AGES), *(f"- {plan}" for plan in plans)]
         return rrb.Tabs(
-            _curves("age of messages read, ms", sampled, legend=False), _curves("plans", plans), self._signals()
+            _curves("age of messages read, ms", sampled, legend=False),
+            _curves("plans", plans),
+            self._signals(),
         )
 
     def _log(self) -> rrb.Container:
@@ -188,7 +225,9 @@ class RackViews:
 def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
     axis = rrb.TimeAxis(link="LinkToGlobal")
     shown = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
-    return rrb.TimeSeriesView(origin="/", contents=contents, name=name, axis_x=axis, plot_legend=shown)
+    return rrb.TimeSeriesView(
+        origin="/", contents=contents, name=name, axis_x=axis, plot_legend=shown
+    )
 
 
 def eye_on(cell: Cell) -> rrb.EyeControls3D:
@@ -205,7 +244,9 @@ def eye_on(cell: Cell) -> rrb.EyeControls3D:
     centre = (low + high) / 2
     radius = float(np.linalg.norm(high - low)) / 2
     position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
-    return rrb.EyeControls3D(position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1))
+    return rrb.EyeControls3D(
+        position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)
+    )
 
 
 def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout) -> None:

@@ -1,4 +1,5 @@
-"""The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; pushes; path and goals."""
+"""The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; pushes;
+path and goals."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ WAYPOINTS = (CELL, "way_points")
 GOALS = (CELL, "goals")
 CURRENT_GOAL = (CELL, "current_goal")
 STEP_RAD = 0.03
-"""A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this length."""
+"""A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this
+length."""
 POINT_M = 0.008
 LINE_M = 0.003
 PUSHES = (CELL, "pushes")
@@ -61,7 +63,9 @@ def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -
         shape = shape_of(model, geom)
         if shape is not None:
             entity = _entity(model, geom, shown[geom] or not any(shown.values()))
-            stream.static(entity, shape, stream.within(frame_of(model, int(model.geom_bodyid[geom]))))
+            stream.static(
+                entity, shape, stream.within(frame_of(model, int(model.geom_bodyid[geom])))
+            )
     for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
         pose = rr.Transform3D(
             translation=data.xpos[body],
@@ -79,7 +83,8 @@ def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
 
 
 class Poses:
-    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path of the tool."""
+    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path
+    of the tool."""
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
@@ -88,7 +93,9 @@ class Poses:
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
         self._sampled = Sampled(clock_ns)
-        stream.static(TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD))
+        stream.static(
+            TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD)
+        )
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
@@ -109,7 +116,10 @@ class Poses:
         for row, state in enumerate(block.messages["state"][chosen]):
             mujoco.mj_setState(model, data, np.ascontiguousarray(state), STATE)
             mujoco.mj_kinematics(model, data)
-            positions[row, : len(bodies)], quaternions[row, : len(bodies)] = data.xpos[bodies], data.xquat[bodies]
+            positions[row, : len(bodies)], quaternions[row, : len(bodies)] = (
+                data.xpos[bodies],
+                data.xquat[bodies],
+            )
             for at, contact in enumerate(self._contacts, len(bodies)):
                 positions[row, at], quaternions[row, at] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
@@ -138,7 +148,9 @@ class Pushes:
         data = self._data
         bodies = self._cell.bodies
         for row in self._sampled.rows(block.ticks):
-            mujoco.mj_setState(model, data, np.ascontiguousarray(block.messages["state"][row]), STATE)
+            mujoco.mj_setState(
+                model, data, np.ascontiguousarray(block.messages["state"][row]), STATE
+            )
             forces = data.xfrc_applied[bodies, :3]
             pushed = forces.any(axis=1)
             if self._is_empty and not pushed.any():
@@ -146,13 +158,17 @@ class Pushes:
             self._is_empty = not pushed.any()
             mujoco.mj_kinematics(model, data)
             arrows = rr.Arrows3D(
-                origins=data.xipos[bodies][pushed], vectors=PUSH_M * forces[pushed], radii=PUSH_RADIUS_M, colors=[FORCE]
+                origins=data.xipos[bodies][pushed],
+                vectors=PUSH_M * forces[pushed],
+                radii=PUSH_RADIUS_M,
+                colors=[FORCE],
             )
             self._stream.at(*block.when(row), PUSHES, arrows)
 
 
 class PlannedPath:
-    """Writes `MOVE_PLAN`s as a line of the tool point with its way points, from the tick at which they are visible."""
+    """Writes `MOVE_PLAN`s as a line of the tool point with its way points, from the tick at which
+    they are visible."""
 
     def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream, self._cell, self._data = stream, cell, cell.start()
@@ -165,13 +181,17 @@ class PlannedPath:
             plan = block.messages[row]
             tick = int(block.rows["visible_at"][row])
             moves = plan["kind"] == SegmentKind.PATH and not plan["error"]
-            corners = plan["waypoints"][: plan["count"]] if moves else np.empty((0, len(self._cell.qpos)))
+            corners = (
+                plan["waypoints"][: plan["count"]] if moves else np.empty((0, len(self._cell.qpos)))
+            )
             line = [self._tool(joints) for joints in in_pieces(corners)]
             points = [self._tool(joints) for joints in corners]
             stamp_ns = int(block.stamps_ns[row])
             strips = rr.LineStrips3D([line] if line else [], radii=LINE_M, colors=[PLANNED])
             self._stream.at(tick, stamp_ns, PATH, strips)
-            self._stream.at(tick, stamp_ns, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
+            self._stream.at(
+                tick, stamp_ns, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED])
+            )
 
     def _tool(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the position of the tool at joint positions, (3,), m."""
@@ -184,13 +204,19 @@ def in_pieces(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the points of a joint path, (points, joints), with no piece longer than `STEP_RAD`."""
     if len(corners) < 2:
         return corners
-    counts = [max(1, int(np.ceil(np.abs(step).max() / STEP_RAD))) for step in np.diff(corners, axis=0)]
-    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(corners, corners[1:], counts, strict=False)]
+    counts = [
+        max(1, int(np.ceil(np.abs(step).max() / STEP_RAD))) for step in np.diff(corners, axis=0)
+    ]
+    pieces = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(corners, corners[1:], counts, strict=False)
+    ]
     return np.concatenate((*pieces, corners[-1:]))
 
 
 class Goals:
-    """Writes the places where a `TASK_PLAN` puts its objects down, and the goal of the current move."""
+    """Writes the places where a `TASK_PLAN` puts its objects down, and the goal of the current
+    move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream
@@ -206,7 +232,9 @@ class Goals:
         for row in self._plans.rows(block.messages["id"]):
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
-            self._moves |= {int(move["id"]): (move["position"].tolist(), self._name(move)) for move in moves}
+            self._moves |= {
+                int(move["id"]): (move["position"].tolist(), self._name(move)) for move in moves
+            }
             ends = [move for move in moves if move["verb"] == Verb.RELEASE]
             points = rr.Points3D(
                 [move["position"] for move in ends],
@@ -215,7 +243,9 @@ class Goals:
                 labels=[self._object(move) for move in ends],
                 show_labels=False,
             )
-            self._stream.at(int(block.rows["visible_at"][row]), int(block.stamps_ns[row]), GOALS, points)
+            self._stream.at(
+                int(block.rows["visible_at"][row]), int(block.stamps_ns[row]), GOALS, points
+            )
 
     def write_status(self, block: RowBlock) -> None:
         """Write the goal of the move that each `MOVE_STATUS` names."""

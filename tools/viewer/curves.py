@@ -23,9 +23,12 @@ _COMMANDED = {"position": "target", "velocity": "target_velocity"}
 
 
 class Joints:
-    """Writes the status of what drives the arm: measured and commanded, limits, tracking error and gripper."""
+    """Writes the status of what drives the arm: measured and commanded, limits, tracking error and
+    gripper."""
 
-    def __init__(self, stream: Stream, names: tuple[str, ...], cell: Cell, has_gripper: bool) -> None:
+    def __init__(
+        self, stream: Stream, names: tuple[str, ...], cell: Cell, has_gripper: bool
+    ) -> None:
         self._stream = stream
         self._names = names
         self._has_gripper = has_gripper
@@ -39,7 +42,9 @@ class Joints:
             for quantity, unit in QUANTITIES.items():
                 _style(stream, (JOINTS, name, quantity), at, unit)
                 limits = (JOINTS, name, quantity, "limits")
-                style_curves(stream, limits, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
+                style_curves(
+                    stream, limits, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0]
+                )
         labels = [f"{name}, mrad" for name in names]
         style_curves(stream, (ERROR,), labels, [of_joint(at) for at in range(len(names))])
         if has_gripper:
@@ -54,7 +59,11 @@ class Joints:
             measured = messages[quantity]
             commanded = messages[_COMMANDED[quantity]] if quantity in _COMMANDED else None
             for at, name in enumerate(self._names):
-                curves = measured[:, at] if commanded is None else np.column_stack((commanded[:, at], measured[:, at]))
+                curves = (
+                    measured[:, at]
+                    if commanded is None
+                    else np.column_stack((commanded[:, at], measured[:, at]))
+                )
                 self._stream.scalars((JOINTS, name, quantity), times, curves)
         self._write_limits(block)
         self._stream.scalars((ERROR,), times, (messages["position"] - messages["target"]) * 1e3)
@@ -67,7 +76,9 @@ class Joints:
         times = block.times_of([0, -1])
         for quantity, limits in self._limits.items():
             for at, name in enumerate(self._names):
-                self._stream.scalars((JOINTS, name, quantity, "limits"), times, np.tile(limits[at], (2, 1)))
+                self._stream.scalars(
+                    (JOINTS, name, quantity, "limits"), times, np.tile(limits[at], (2, 1))
+                )
 
 
 def _style(stream: Stream, entity: tuple[str, str, str], at: int, unit: str) -> None:
@@ -81,7 +92,8 @@ def _style(stream: Stream, entity: tuple[str, str, str], at: int, unit: str) -> 
 
 
 class Fields:
-    """Writes every numeric field of a mailbox: a user's own messages show without any configuration."""
+    """Writes every numeric field of a mailbox: a user's own messages show without any
+    configuration."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream = stream
@@ -97,7 +109,9 @@ class Fields:
         """Write all rows."""
         for field in self._fields:
             values = block.messages[field.name].astype(float)
-            self._stream.scalars(self._lanes[field.name], block.times, values.reshape(len(values), -1))
+            self._stream.scalars(
+                self._lanes[field.name], block.times, values.reshape(len(values), -1)
+            )
 
 
 def is_curve(field: FieldSpec) -> bool:

@@ -1,4 +1,5 @@
-"""Forces of contacts: an arrow at each place where they are sensed, and curves of what is wanted and exerted."""
+"""Forces of contacts: an arrow at each place where they are sensed, and curves of what is wanted
+and exerted."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ CONTACT = "contact"
 ARROW_COLOUR = (0, 230, 255)
 LONGEST_M = 1.0
 TOOL_SHAFT_M = 0.014
-"""Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show beyond the tool."""
+"""Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show
+beyond the tool."""
 TIP_M = 0.02
 TIP_SHAFT_M = 0.003
 """Length of an arrow at a fingertip for 1 N, and its radius."""
@@ -51,7 +53,8 @@ class ContactPlace(NamedTuple):
 
 
 def contacts_of(cell: Cell) -> list[ContactPlace]:
-    """Return the places where a cell's forces are sensed: the tool on a wrist sensor, the tips of a hand."""
+    """Return the places where a cell's forces are sensed: the tool on a wrist sensor, the tips of a
+    hand."""
     if cell.hand is not None:
         tips = zip(cell.hand.names, cell.hand.tips, strict=True)
         return [ContactPlace(name, int(tip), cell.tool) for name, tip in tips]
@@ -87,7 +90,8 @@ class ContactArrows:
 
 
 class TaskForces:
-    """Writes `FORCE_STATUS`es: what the tool exerts along each axis of the task frame, and what is wanted of it."""
+    """Writes `FORCE_STATUS`es: what the tool exerts along each axis of the task frame, and what is
+    wanted of it."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream

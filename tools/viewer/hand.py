@@ -19,20 +19,32 @@ TIPS = (HAND, "tip_forces")
 
 
 class HandCurves:
-    """Writes `HAND_STATUS`es: a finger's joints, tensions as sensed and as commanded, and the force on its tip."""
+    """Writes `HAND_STATUS`es: a finger's joints, tensions as sensed and as commanded, and the force
+    on its tip."""
 
     def __init__(self, stream: Stream, names: tuple[str, ...], hand: Hand) -> None:
         """Show the joints `names` of a hand."""
         self._stream = stream
-        self._fingers = {name: np.flatnonzero(hand.fingers[at]) for at, name in enumerate(hand.names)}
+        self._fingers = {
+            name: np.flatnonzero(hand.fingers[at]) for at, name in enumerate(hand.names)
+        }
         for finger, joints in self._fingers.items():
             own = [names[joint] for joint in joints]
             colours = [of_joint(at) for at in range(len(own))]
             rows = ("flexor", "extensor")
-            pairs = [f"{name} {row}{what}, N" for what in (" commanded", "") for row in rows for name in own]
+            pairs = [
+                f"{name} {row}{what}, N"
+                for what in (" commanded", "")
+                for row in rows
+                for name in own
+            ]
             style_curves(stream, (HAND, finger, JOINTS), [f"{name}, rad" for name in own], colours)
             # The lower ones are wider: they show on both sides where the two agree.
-            shades = [*[COMMANDED] * (2 * len(own)), *colours, *(dimmed(colour) for colour in colours)]
+            shades = [
+                *[COMMANDED] * (2 * len(own)),
+                *colours,
+                *(dimmed(colour) for colour in colours),
+            ]
             widths = [2.5] * (2 * len(own)) + [1.0] * (2 * len(own))
             style_curves(stream, (HAND, finger, TENSIONS), pairs, shades, widths)
             axes = [f"{axis}, N" for axis in "xyz"]
@@ -47,7 +59,9 @@ class HandCurves:
         for at, (finger, joints) in enumerate(self._fingers.items()):
             self._stream.scalars((HAND, finger, JOINTS), times, messages["position"][:, joints])
             tensions = [
-                messages[field][:, row][:, joints] for field in ("wanted", "tension") for row in (FLEXOR, EXTENSOR)
+                messages[field][:, row][:, joints]
+                for field in ("wanted", "tension")
+                for row in (FLEXOR, EXTENSOR)
             ]
             self._stream.scalars((HAND, finger, TENSIONS), times, np.hstack(tensions))
             self._stream.scalars((HAND, finger, FORCES), times, messages["force"][:, at])

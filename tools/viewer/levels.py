@@ -1,4 +1,5 @@
-"""The levels: state, command and move of each as lanes, errors as log lines, and all of them as a graph."""
+"""The levels: state, command and move of each as lanes, errors as log lines, and all of them as a
+graph."""
 
 from __future__ import annotations
 
@@ -32,9 +33,14 @@ class ValueLane:
     """Writes a value of a level's messages as a lane: its name, from where it changes."""
 
     def __init__(
-        self, stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
+        self,
+        stream: Stream,
+        lane: tuple[str, str],
+        fields: str | list[str],
+        name: Callable[[Any], str],
     ) -> None:
-        """Take the value of one field, or the tuple of several; `lane` is the board and what its lane shows."""
+        """Take the value of one field, or the tuple of several; `lane` is the board and what its
+        lane shows."""
         self._stream = stream
         self._lane = (LEVELS, *lane)
         self._changes = Changes()
@@ -104,7 +110,10 @@ class FiredRows:
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream, self._board = stream, mailbox.name.partition(".")[0]
         self._lane = ValueLane(
-            stream, (self._board, "row"), FIRED, lambda row: f"{row[1]} {row[2].decode('ascii', 'replace')}"
+            stream,
+            (self._board, "row"),
+            FIRED,
+            lambda row: f"{row[1]} {row[2].decode('ascii', 'replace')}",
         )
         self._changes = Changes()
 
@@ -113,7 +122,9 @@ class FiredRows:
         self._lane.write(block)
         rows = block.messages[FIRED]
         for at in self._changes.rows(rows):
-            table, row, fired, state = (part.decode() if isinstance(part, bytes) else part for part in rows[at].item())
+            table, row, fired, state = (
+                part.decode() if isinstance(part, bytes) else part for part in rows[at].item()
+            )
             text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"
             level = "INFO" if row else "ERROR"
             self._stream.say(*block.when(at), "rows", text, level)
@@ -122,7 +133,8 @@ class FiredRows:
 class Hierarchy:
     """Writes the tasks as nodes of a graph, coloured by state, whenever a state changes.
 
-    Levels are above each other, other boards to the left. Edges go down the levels, and from planners with plans.
+    Levels are above each other, other boards to the left. Edges go down the levels, and from
+    planners with plans.
     """
 
     def __init__(self, stream: Stream, layout: Layout, rack: RackTiming) -> None:
@@ -186,7 +198,8 @@ def _names(rows: np.ndarray) -> np.ndarray:
 
 
 def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
-    """Return the places of the tasks: levels in rows, their planners to the right, other boards to the left.
+    """Return the places of the tasks: levels in rows, their planners to the right, other boards to
+    the left.
 
     Boards of the same level are next to each other, in several rows if they are many.
     """
@@ -200,6 +213,9 @@ def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]
     others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in placed]
     placed |= {board: (-1, row) for row, board in enumerate(others)}
     return {
-        task.name: ((placed[task.board][0] + (task.role == "planner")) * COLUMN, placed[task.board][1] * ROW)
+        task.name: (
+            (placed[task.board][0] + (task.role == "planner")) * COLUMN,
+            placed[task.board][1] * ROW,
+        )
         for task in layout.tasks
     }

@@ -1,4 +1,5 @@
-"""Recorded runs of several racks as one recording for the viewer: each below its name, all on one time line."""
+"""Recorded runs of several racks as one recording for the viewer: each below its name, all on one
+time line."""
 
 from __future__ import annotations
 
@@ -14,11 +15,14 @@ from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Stream, Timelines, new_recording
 
 
-def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None] = lambda part: None) -> None:
+def write_merged(
+    placed: Sequence[RackPlace], file: Path, show: Callable[[float], None] = lambda part: None
+) -> None:
     """Write one recording of all these racks; `show` gets the part that is done, 0 to 1.
 
     The notes on the times of racks are in its log. Of a single rack it is that rack's run.rrd.
-    Raises `Failure` for a recording that cannot be read, and `RuntimeError` when the file cannot be written.
+    Raises `Failure` for a recording that cannot be read, and `RuntimeError` when the file cannot be
+    written.
     """
     ran = {}
     for place in placed:
@@ -26,7 +30,9 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
         ran[place.own.rack] = Ran.of(run.whole_layout, run.config, run.folder)
     name = ", ".join(ran)
     roots: dict[str, tuple[str, ...]] = {rack: (rack,) if len(ran) > 1 else () for rack in ran}
-    views = {rack: RackViews(of.layout, of.config, of.cell, roots[rack]) for rack, of in ran.items()}
+    views = {
+        rack: RackViews(of.layout, of.config, of.cell, roots[rack]) for rack, of in ran.items()
+    }
     view = blueprint(together(views) if len(views) > 1 else views[name].everything())
     launches = "-".join(str(place.own.launch.created_ns) for place in placed)
     recording = new_recording(name, f"{name}-{launches}", file, view)
@@ -45,7 +51,9 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
     recording.disconnect()
 
 
-def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
+def _blocks(
+    recording: Recording, last: int, block: int
+) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
     """Yield the rows of all rings, by ring, up to a tick, and that tick, block by block."""
     layout = recording.whole_layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
@@ -53,11 +61,16 @@ def _blocks(recording: Recording, last: int, block: int) -> Iterator[tuple[int, 
     done = dict.fromkeys(rings, 0)
     for begin in range(0, last, block):
         tick = min(last, begin + block)
-        # The last block has all that is left: what clock and operator wrote after the last cycle, too.
+        # The last block has all that is left: what clock and operator wrote after the last cycle,
+        # too.
         ends = {
-            name: int(np.searchsorted(rows["tick"], tick)) if tick < last else len(rows) for name, rows in rings.items()
+            name: int(np.searchsorted(rows["tick"], tick)) if tick < last else len(rows)
+            for name, rows in rings.items()
         }
-        yield tick, {name: rings[name][done[name] : end] for name, end in ends.items() if end > done[name]}
+        yield (
+            tick,
+            {name: rings[name][done[name] : end] for name, end in ends.items() if end > done[name]},
+        )
         done = ends
 
 

@@ -1,4 +1,5 @@
-"""Pictures of a recording without a screen: `python -m rack.tools.viewer.pictures RUN/run.rrd OUT.png --at 7.5`."""
+"""Pictures of a recording without a screen: `python -m rack.tools.viewer.pictures RUN/run.rrd
+OUT.png --at 7.5`."""
 
 from __future__ import annotations
 
@@ -30,7 +31,14 @@ QUIET_LEVELS = ("INFO", "DEBUG", "TRACE")
 SOFTWARE = "Software rasterizer"
 """The viewer's remark where there is no graphics card; it draws all the same."""
 PACKAGES = (
-    *("mesa-vulkan-drivers", "libvulkan1", "libgl1-mesa-dri", "libegl1", "libxkbcommon0", "libxkbcommon-x11-0"),
+    *(
+        "mesa-vulkan-drivers",
+        "libvulkan1",
+        "libgl1-mesa-dri",
+        "libegl1",
+        "libxkbcommon0",
+        "libxkbcommon-x11-0",
+    ),
     *("libx11-xcb1", "libxcursor1", "libxi6", "libxrandr2"),
 )
 """Debian's packages for drawing without a graphics card; .ci/run installs them."""
@@ -59,12 +67,15 @@ class Screen:
         return {view.name: view.view_id for view in self._client.get_state().views}
 
     def look(self, at_s: float, view: str | None = None) -> Look:
-        """Return the picture at a simulated time, s, once it no longer changes: all views, or the one of that name.
+        """Return the picture at a simulated time, s, once it no longer changes: all views, or the
+        one of that name.
 
         Raises `KeyError` when there is no such view.
         """
         shown = None if view is None else self.views[view]
-        self._client.set_time(SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused")
+        self._client.set_time(
+            SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused"
+        )
         drawn = b""
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
@@ -85,7 +96,8 @@ class Screen:
 
 @contextmanager
 def opened(recording: Path) -> Iterator[Screen]:
-    """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the graphics libraries."""
+    """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the
+    graphics libraries."""
     port = free_port()
     # Not by `ViewerClient.spawn`: that viewer would listen on every network.
     window = ViewerWindow(headless=True, port=port)
@@ -124,15 +136,23 @@ def packages_text() -> str:
     asked = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
     found = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
     missing = [name for name in PACKAGES if f"{name} install ok installed" not in found]
-    return f"missing packages: apt-get install {' '.join(missing)}" if missing else "no package for it is missing"
+    return (
+        f"missing packages: apt-get install {' '.join(missing)}"
+        if missing
+        else "no package for it is missing"
+    )
 
 
 def main() -> int:
     """Save one picture; return 1 if the viewer complained of anything."""
-    parser = argparse.ArgumentParser(prog="python -m rack.tools.viewer.pictures", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m rack.tools.viewer.pictures", description=__doc__
+    )
     parser.add_argument("recording", type=Path, help="a run.rrd")
     parser.add_argument("out", type=Path, help="PNG file to write")
-    parser.add_argument("--at", type=float, required=True, metavar="S", help="simulated time to look at, s")
+    parser.add_argument(
+        "--at", type=float, required=True, metavar="S", help="simulated time to look at, s"
+    )
     parser.add_argument("--view", metavar="NAME", help="one view alone, as its title says")
     given = parser.parse_args()
     try:

@@ -12,15 +12,22 @@ from rack.tools.viewer.stream import TICK
 
 
 class Rows(NamedTuple):
-    """Rows of one entity in the order of ticks: `ticks` (rows,), `values` one list or array a row."""
+    """Rows of one entity in the order of ticks: `ticks` (rows,), `values` one list or array a
+    row."""
 
     ticks: np.ndarray
     values: np.ndarray
 
 
 def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
-    """Return one component of an entity; curves are (rows, curves). Raises `KeyError` when the file has none."""
-    chunks = RrdReader(str(file)).stream().filter(content=entity, has_timeline=TICK, components=component).to_chunks()
+    """Return one component of an entity; curves are (rows, curves). Raises `KeyError` when the file
+    has none."""
+    chunks = (
+        RrdReader(str(file))
+        .stream()
+        .filter(content=entity, has_timeline=TICK, components=component)
+        .to_chunks()
+    )
     if not chunks:
         raise KeyError(f"{file}: no {component} of '{entity}'")
     batches = [chunk.to_record_batch() for chunk in chunks]

@@ -36,7 +36,11 @@ def xyzw(quaternions: Floats) -> Floats:
 
 def _solid(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
     """Return orientation and colour of a solid geom."""
-    return {"quaternions": [xyzw(model.geom_quat[geom])], "colors": [colour(model, geom)], "fill_mode": "solid"}
+    return {
+        "quaternions": [xyzw(model.geom_quat[geom])],
+        "colors": [colour(model, geom)],
+        "fill_mode": "solid",
+    }
 
 
 def _centred(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
@@ -66,7 +70,9 @@ def _capsule(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     radius, half, _ = model.geom_size[geom]
     # MuJoCo's capsule is centred; rerun's begins at its origin.
     begin = placed(model, geom, np.array([[0.0, 0.0, -half]]))
-    return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **_solid(model, geom))
+    return rr.Capsules3D(
+        lengths=[2 * half], radii=[radius], translations=begin, **_solid(model, geom)
+    )
 
 
 def _plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
@@ -96,7 +102,9 @@ def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     return _surface(model, geom, np.column_stack((x.ravel(), y.ravel(), z)), corners.reshape(-1, 3))
 
 
-def _surface(model: mujoco.MjModel, geom: int, vertices: Floats, triangles: NDArray[np.integer]) -> rr.AsComponents:
+def _surface(
+    model: mujoco.MjModel, geom: int, vertices: Floats, triangles: NDArray[np.integer]
+) -> rr.AsComponents:
     # Flat shading: every triangle has corners of its own, so that an edge stays an edge.
     corners = placed(model, geom, vertices)[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

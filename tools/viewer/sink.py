@@ -1,4 +1,5 @@
-"""The recorder's rows as a recording for the viewer: taken as they are drained, written in blocks."""
+"""The recorder's rows as a recording for the viewer: taken as they are drained, written in
+blocks."""
 
 from __future__ import annotations
 
@@ -57,17 +58,20 @@ BLOCK_S = 1.0
 
 
 PART_S = 180.0
-"""Simulated time in one file. Until a file is finished, its index is in memory: 0.65 MB a second of the NASREM rack."""
+"""Simulated time in one file. Until a file is finished, its index is in memory: 0.65 MB a second of
+the NASREM rack."""
 
 
 def next_file(folder: Path) -> Path:
-    """Return the file to write: run.rrd, then run-2.rrd and so on; a restarted recorder overwrites none."""
+    """Return the file to write: run.rrd, then run-2.rrd and so on; a restarted recorder overwrites
+    none."""
     names = chain([FILE], (f"run-{part}.rrd" for part in count(2)))
     return next(folder / name for name in names if not (folder / name).is_file())
 
 
 class Ran(NamedTuple):
-    """What a view needs to know of a rack before its first row: its layout, its config, its cell, its event log."""
+    """What a view needs to know of a rack before its first row: its layout, its config, its cell,
+    its event log."""
 
     layout: Layout
     text: str
@@ -108,7 +112,8 @@ class RackWriter:
             ]
             for task in layout.tasks
         }
-        # The mailboxes of operators and host boards, and queues, have no age: they are not written periodically.
+        # The mailboxes of operators and host boards, and queues, have no age: they are not written
+        # periodically.
         periodic = [box for box in layout.timed if box.writer != CLOCK and box.protocol != "queue"]
         self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
         for mailbox, age in self._ages.items():
@@ -120,7 +125,8 @@ class RackWriter:
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
     def write(self, taken: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]) -> None:
-        """Write the rows of all rings, each (rows,), by ring: everything before `tick`. `lost` counts rows by ring."""
+        """Write the rows of all rings, each (rows,), by ring: everything before `tick`. `lost`
+        counts rows by ring."""
         if (fastest := taken.get(self._fastest)) is not None:
             self._times.learn(fastest["tick"], fastest["start_ns"])
         for ring, rows in taken.items():
@@ -139,7 +145,8 @@ class RackWriter:
 
 
 class ViewSink:
-    """Writes run.rrd of one rack into `folder`, a long run in parts; with a port, also serves it to a viewer.
+    """Writes run.rrd of one rack into `folder`, a long run in parts; with a port, also serves it to
+    a viewer.
 
     The server of a viewer cannot change files: what it shows live is one part, however long.
     """
@@ -148,7 +155,9 @@ class ViewSink:
         layout = segment.layout
         launch = segment.launch
         ran = Ran.of(layout, segment.config, folder)
-        view = blueprint(RackViews(layout, ran.config, ran.cell).everything(), live=port is not None)
+        view = blueprint(
+            RackViews(layout, ran.config, ran.cell).everything(), live=port is not None
+        )
         run = f"{folder.name}-{launch.created_ns}"
         recording = new_recording(folder.name, run, next_file(folder), view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
@@ -167,7 +176,8 @@ class ViewSink:
             self._waiting[ring].append(rows)
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write a block if one is full; everything before `tick` has been taken. `lost` counts rows by ring.
+        """Write a block if one is full; everything before `tick` has been taken. `lost` counts rows
+        by ring.
 
         Raises `RuntimeError` when the file cannot be written.
         """
@@ -188,7 +198,9 @@ class ViewSink:
         self._written = tick
         waiting = self._waiting
         self._waiting = defaultdict(list)
-        self._writer.write({ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost)
+        self._writer.write(
+            {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost
+        )
         self._load.advance(tick)
 
 
@@ -197,8 +209,11 @@ def block_of(layout: Layout) -> int:
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
-def _parts_of(stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None) -> dict[str, list[ViewPart]]:
-    """Return the parts of the view by mailbox: chosen by message types, so that any rack has a view."""
+def _parts_of(
+    stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None
+) -> dict[str, list[ViewPart]]:
+    """Return the parts of the view by mailbox: chosen by message types, so that any rack has a
+    view."""
     parts: dict[str, list[ViewPart]] = defaultdict(list)
     for mailbox in layout.mailboxes:
         parts[mailbox.name] += _of_any(stream, mailbox)
@@ -215,7 +230,11 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     parts: list[ViewPart] = []
     if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
         parts.append(Activity(stream, mailbox).write)
-    elif mailbox.name.endswith(".command") and "id" in names and mailbox.message not in (*STREAMED, *STREAMED_DOWN):
+    elif (
+        mailbox.name.endswith(".command")
+        and "id" in names
+        and mailbox.message not in (*STREAMED, *STREAMED_DOWN)
+    ):
         parts.append(ValueLane(stream, (board, port), "id", command_name).write)
     if names.issuperset(FIRED):
         parts.append(FiredRows(stream, mailbox).write)
@@ -225,12 +244,20 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         parts.append(ValueLane(stream, (board, "request"), "current", request_name).write)
     if mailbox.message == SERVER_STATUS.name:
         parts.append(ValueLane(stream, (board, "mode"), "mode", mode_name).write)
-    if mailbox.message not in (*SHOWN_IN_3D, *DRIVING, JOINT_TORQUE.name, JOINT_STATUS.name, HAND_STATUS.name):
+    if mailbox.message not in (
+        *SHOWN_IN_3D,
+        *DRIVING,
+        JOINT_TORQUE.name,
+        JOINT_STATUS.name,
+        HAND_STATUS.name,
+    ):
         parts.append(Fields(stream, mailbox).write)
     return parts
 
 
-def _of_arm(stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals) -> list[ViewPart]:
+def _of_arm(
+    stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals
+) -> list[ViewPart]:
     robot = config.robot
     assert robot is not None, "there is an arm"
     match mailbox.message:

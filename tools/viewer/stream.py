@@ -1,6 +1,8 @@
-"""The recording for the viewer, as a stream: to a file always, and to a viewer on this machine if one is wanted.
+"""The recording for the viewer, as a stream: to a file always, and to a viewer on this machine if
+one is wanted.
 
-Its rows have three timelines: simulated time, tick, wall clock. They come in blocks, of one mailbox or one task.
+Its rows have three timelines: simulated time, tick, wall clock. They come in blocks, of one mailbox
+or one task.
 """
 
 from __future__ import annotations
@@ -55,13 +57,16 @@ class Timelines:
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
     def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
-        """Return the times of rows released at `ticks`, `within_ns` of simulated time later, stamped `stamps_ns`."""
+        """Return the times of rows released at `ticks`, `within_ns` of simulated time later,
+        stamped `stamps_ns`."""
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
         released = placed.times_ns(ticks, 0) // placed.line.clock_ns
         return RowTimes(placed.times_ns(ticks, within_ns), released, placed.wall_ns(stamps_ns))
 
-    def columns(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> list[rr.TimeColumn]:
+    def columns(
+        self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0
+    ) -> list[rr.TimeColumn]:
         """Return the same times as columns."""
         found = self.times(ticks, stamps_ns, within_ns)
         return [
@@ -80,7 +85,9 @@ class Timelines:
         """Return approximately when ticks happened, CLOCK_MONOTONIC, ns."""
         # Relative to the newest, so that the 53 bits of a float suffice.
         last = self._stamps[-1]
-        return np.asarray(last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64))
+        return np.asarray(
+            last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64)
+        )
 
     def monotonic(self, time_ns: int) -> int:
         """Return a CLOCK_REALTIME stamp as CLOCK_MONOTONIC."""
@@ -90,8 +97,8 @@ class Timelines:
 class RowBlock:
     """Rows of one ring, oldest first, with their times.
 
-    Rows of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`, those of a trace the fields of
-    `rack.backplane.trace.RECORD`.
+    Rows of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`, those of a
+    trace the fields of `rack.backplane.trace.RECORD`.
     """
 
     def __init__(self, rows: np.ndarray, stamp: str, timelines: Timelines) -> None:
@@ -130,7 +137,8 @@ class Changes:
         self._last: np.ndarray | None = None
 
     def rows(self, values: np.ndarray) -> Ints:
-        """Return the indices of the rows that differ from the row before; shape of `values` (rows,) or structured."""
+        """Return the indices of the rows that differ from the row before; shape of `values` (rows,)
+        or structured."""
         before = values[:1] if self._last is None else self._last
         changed = values != np.concatenate((before, values[:-1]))
         changed[0] |= self._last is None
@@ -143,7 +151,8 @@ SHOWN_S = 0.02
 
 
 class Sampled:
-    """Finds the rows of consecutive blocks that are drawn: the first of every 20 ms of simulated time."""
+    """Finds the rows of consecutive blocks that are drawn: the first of every 20 ms of simulated
+    time."""
 
     def __init__(self, clock_ns: int) -> None:
         self._every = max(1, round(SHOWN_S * 1e9 / clock_ns))
@@ -160,7 +169,8 @@ class Sampled:
 def new_recording(
     name: str, run: str, file: Path, blueprint: rrb.Blueprint, port: int | None = None
 ) -> rr.RecordingStream:
-    """Return a recording to be written into a file, and served on a port of this machine, if one is given.
+    """Return a recording to be written into a file, and served on a port of this machine, if one is
+    given.
 
     Files of one `run` are shown as one recording.
     """
@@ -184,13 +194,16 @@ class Stream:
     All of them are below `root`. `flush` raises `RuntimeError` once the file cannot be written.
     """
 
-    def __init__(self, recording: rr.RecordingStream, times: Timelines, root: Sequence[str] = ()) -> None:
+    def __init__(
+        self, recording: rr.RecordingStream, times: Timelines, root: Sequence[str] = ()
+    ) -> None:
         self._recording = recording
         self.times = times
         self._root = root
 
     def frame(self, name: str) -> str:
-        """Return the name of a coordinate frame: frames are known to all entities of a recording."""
+        """Return the name of a coordinate frame: frames are known to all entities of a
+        recording."""
         return "/".join((*self._root, name))
 
     def within(self, frame: str) -> rr.CoordinateFrame:
@@ -204,24 +217,33 @@ class Stream:
         """Log what holds at all times."""
         self._recording.log(self._path(entity), *archetypes, static=True)
 
-    def columns(self, entity: Sequence[str], times: list[rr.TimeColumn], columns: rr.ComponentColumnList) -> None:
+    def columns(
+        self, entity: Sequence[str], times: list[rr.TimeColumn], columns: rr.ComponentColumnList
+    ) -> None:
         """Send a block of rows."""
         self._recording.send_columns(self._path(entity), times, columns)
 
-    def scalars(self, entity: Sequence[str], times: list[rr.TimeColumn], values: np.ndarray) -> None:
+    def scalars(
+        self, entity: Sequence[str], times: list[rr.TimeColumn], values: np.ndarray
+    ) -> None:
         """Send a block of curves, shape (rows,) or (rows, curves)."""
         self.columns(entity, times, rr.Scalars.columns(scalars=values))
 
-    def at(self, tick: int, stamp_ns: int, entity: Sequence[str], archetype: rr.AsComponents) -> None:
+    def at(
+        self, tick: int, stamp_ns: int, entity: Sequence[str], archetype: rr.AsComponents
+    ) -> None:
         """Log a single item, at a tick and a time of CLOCK_MONOTONIC."""
         found = self.times.times(np.array([tick]), np.array([stamp_ns]))
-        self._recording.set_time(SIM_TIME, duration=np.timedelta64(int(found.simulated_ns[0]), "ns"))
+        self._recording.set_time(
+            SIM_TIME, duration=np.timedelta64(int(found.simulated_ns[0]), "ns")
+        )
         self._recording.set_time(TICK, sequence=int(found.ticks[0]))
         self._recording.set_time(WALL, timestamp=np.datetime64(int(found.wall_ns[0]), "ns"))
         self._recording.log(self._path(entity), archetype)
 
     def say(self, tick: int, stamp_ns: int, source: str, text: str, level: str) -> None:
-        """Write a line to the log, under its source; of a rack among several it begins with the rack's name."""
+        """Write a line to the log, under its source; of a rack among several it begins with the
+        rack's name."""
         line = rr.TextLog(": ".join((*self._root, text)), level=level)
         self.at(tick, stamp_ns, (LOG, source), line)
 

@@ -81,14 +81,18 @@ def dimmed(colour: Colour) -> Colour:
     return (*colour[:3], 110)
 
 
-def style_lane(stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour], quiet: Sequence[str] = ()) -> None:
+def style_lane(
+    stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour], quiet: Sequence[str] = ()
+) -> None:
     """Set the colours of a lane's states, and their labels except for the `quiet` ones.
 
     The viewer picks a colour for any other state.
     """
     names = list(colours)
     labels = [" " if name in quiet else name for name in names]
-    stream.static(entity, rr.StateConfiguration(values=names, labels=labels, colors=list(colours.values())))
+    stream.static(
+        entity, rr.StateConfiguration(values=names, labels=labels, colors=list(colours.values()))
+    )
 
 
 def style_curves(
@@ -98,11 +102,14 @@ def style_curves(
     colours: Sequence[Colour] | None = None,
     widths: Sequence[float] | None = None,
 ) -> None:
-    """Set names, colours and widths of an entity's curves; without colours the viewer picks them."""
+    """Set names, colours and widths of an entity's curves; without colours the viewer picks
+    them."""
     stream.static(entity, rr.SeriesLines(names=names, colors=colours, widths=widths))
 
 
-def write_spans(stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]) -> None:
+def write_spans(
+    stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]
+) -> None:
     """Write the states that begin at `times`; each lasts until the next, and "" is none."""
     stream.columns(entity, times, rr.StateChange.columns(state=states))
 
@@ -113,9 +120,12 @@ def write_span(stream: Stream, tick: int, stamp_ns: int, entity: Sequence[str], 
 
 
 def lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
-    """Return a view of lanes: of the whole run, or of `around_s` before and after the time cursor."""
+    """Return a view of lanes: of the whole run, or of `around_s` before and after the time
+    cursor."""
     axis = rrb.TimeAxis(link="LinkToGlobal")
     if around_s is not None:
-        begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=at) for at in (-around_s, around_s))
+        begin, end = (
+            rrb.TimeRangeBoundary.cursor_relative(seconds=at) for at in (-around_s, around_s)
+        )
         axis = rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=begin, end=end))
     return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)

@@ -1,11 +1,18 @@
-"""The timing of a rack in the view: lanes and curves of every task, from its trace, and the ages of messages."""
+"""The timing of a rack in the view: lanes and curves of every task, from its trace, and the ages of
+messages."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
-from rack.levels.timing.trace_times import execution_ns, is_missed, lateness_ns, newest_visible, response_ns
+from rack.levels.timing.trace_times import (
+    execution_ns,
+    is_missed,
+    lateness_ns,
+    newest_visible,
+    response_ns,
+)
 from rack.tools.viewer.levels import LEVELS
 from rack.tools.viewer.stream import Ints, RowBlock, Stream
 from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_curves, style_lane, write_spans
@@ -23,15 +30,20 @@ SPAN_S = 0.25
 class CycleLanes:
     """Writes trace records as spans: read, process or plan, write, wait. Missed cycles are red.
 
-    In real time a span is where it was on the wall clock, scaled to simulated time. In lockstep, where simulated time
-    stands still meanwhile, it begins at its tick and is cut at the end of its time slice.
+    In real time a span is where it was on the wall clock, scaled to simulated time. In lockstep,
+    where simulated time stands still meanwhile, it begins at its tick and is cut at the end of its
+    time slice.
     """
 
     def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
         self._stream = stream
         self._speed = speed
         self._lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
-        self._last_ns = task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS) if lockstep else None
+        self._last_ns = (
+            task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS)
+            if lockstep
+            else None
+        )
         self._work = "process" if task.role == "executor" else "plan"
         style_lane(stream, self._lane, PHASES, quiet=["wait"])
 
@@ -51,9 +63,11 @@ class CycleLanes:
 
 
 class Load:
-    """Writes trace records as curves: lateness, execution and deadline in ms, and the used part of the time slice.
+    """Writes trace records as curves: lateness, execution and deadline in ms, and the used part of
+    the time slice.
 
-    In lockstep a tick lasts as long as its tasks take: there is only execution, without anything to compare it with.
+    In lockstep a tick lasts as long as its tasks take: there is only execution, without anything to
+    compare it with.
     """
 
     def __init__(self, stream: Stream, task: TaskSpec, period_ns: int, is_lockstep: bool) -> None:
@@ -61,14 +75,21 @@ class Load:
         self._task = task.name
         self._is_lockstep = is_lockstep
         self._slice_ns = task.every * task.within_cycles * period_ns
-        curves = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
+        curves = [
+            f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")
+        ]
         style_curves(stream, (TIMES, task.name), curves, [of_joint(1), of_joint(0), LIMIT])
         style_curves(stream, (LOAD, task.name), [f"{task.name}, %"])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle; 100 % is the deadline."""
         rows = block.rows
-        curves = np.column_stack((lateness_ns(rows), execution_ns(rows), np.full(len(rows), self._slice_ns))) * 1e-6
+        curves = (
+            np.column_stack(
+                (lateness_ns(rows), execution_ns(rows), np.full(len(rows), self._slice_ns))
+            )
+            * 1e-6
+        )
         if self._is_lockstep:
             curves[:, [0, 2]] = np.nan
         self._stream.scalars((TIMES, self._task), block.times, curves)
@@ -108,21 +129,32 @@ class Misses:
         ticks = moments[order] * self._span
         states = np.array([MISSED] * len(spans) + [""] * len(ends))[order]
         times = self._stream.times
-        write_spans(self._stream, self._lane, times.columns(ticks, times.stamps_of(ticks)), states.tolist())
+        write_spans(
+            self._stream, self._lane, times.columns(ticks, times.stamps_of(ticks)), states.tolist()
+        )
 
     def _log(self, ticks: np.ndarray, stamp_ns: int) -> None:
-        which = f"tick {ticks[0]}" if len(ticks) == 1 else f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
-        self._stream.say(int(ticks[0]), stamp_ns, "misses", f"missed: {self._task}: {which}", "WARN")
+        which = (
+            f"tick {ticks[0]}"
+            if len(ticks) == 1
+            else f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
+        )
+        self._stream.say(
+            int(ticks[0]), stamp_ns, "misses", f"missed: {self._task}: {which}", "WARN"
+        )
 
 
 class Age:
-    """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is visible then."""
+    """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is
+    visible then."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec, layout: Layout) -> None:
         self._stream = stream
         self._lane = (AGES, mailbox.name)
         own = TickGrid(mailbox.every, mailbox.phase)
-        self._releases = min([layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own)
+        self._releases = min(
+            [layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own
+        )
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)
         self._upto = -1
@@ -134,7 +166,8 @@ class Age:
         self._made = np.concatenate((self._made, block.ticks))
 
     def advance(self, tick: int) -> None:
-        """Write the ages at all releases before `tick`; every message visible before it has been taken."""
+        """Write the ages at all releases before `tick`; every message visible before it has been
+        taken."""
         releases = np.arange(self._releases.since(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)
         newest = newest_visible(releases, self._visible_at)

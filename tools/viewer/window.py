@@ -1,4 +1,5 @@
-"""The viewer's window: a separate process, which may be closed at any time and outlives the command that opened it."""
+"""The viewer's window: a separate process, which may be closed at any time and outlives the command
+that opened it."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ PANIC = "panicked at "
 
 
 class ViewerWindow:
-    """A viewer that shows a recording's files or a recorder's stream; with a `port` it accepts commands there.
+    """A viewer that shows a recording's files or a recorder's stream; with a `port` it accepts
+    commands there.
 
     Raises `Failure` when none is installed, or there is no screen and it is not `headless`.
     """
@@ -26,7 +28,8 @@ class ViewerWindow:
     def __init__(self, *sources: str, headless: bool = False, port: int | None = None) -> None:
         if not (headless or has_screen()):
             raise Failure(
-                f"no screen: DISPLAY and WAYLAND_DISPLAY are not set; on a machine with one: rerun {' '.join(sources)}"
+                "no screen: DISPLAY and WAYLAND_DISPLAY are not set; on a machine with one: rerun"
+                f" {' '.join(sources)}"
             )
         # A file, not a pipe: nobody reads it while the viewer is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window

@@ -1,7 +1,9 @@
-"""The rules that the tables of a config keep between them, a file a subject: functions from the wiring to mistakes.
+"""The rules that the tables of a config keep between them, a file a subject: functions from the
+wiring to mistakes.
 
-All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes are already reported.
-Faults and commands, which may come live too, have rules of their own in `faults` and `commands`.
+All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes
+are already reported. Faults and commands, which may come live too, have rules of their own in
+`faults` and `commands`.
 """
 
 from __future__ import annotations

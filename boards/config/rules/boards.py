@@ -1,4 +1,5 @@
-"""Boards and host boards: names, neighbours, planners and slots; their rates, the clock, and a static schedule."""
+"""Boards and host boards: names, neighbours, planners and slots; their rates, the clock, and a
+static schedule."""
 
 from __future__ import annotations
 
@@ -9,7 +10,13 @@ from graphlib import CycleError, TopologicalSorter
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import ClockError
 from rack.boards.config.mistakes import repeated
-from rack.boards.config.schema import LONGEST_EVERY, SHORTEST_MS, BoardConfig, RackConfig, ScheduleConfig
+from rack.boards.config.schema import (
+    LONGEST_EVERY,
+    SHORTEST_MS,
+    BoardConfig,
+    RackConfig,
+    ScheduleConfig,
+)
 from rack.boards.config.timing import PLANNER_BUDGET, frames
 from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake
@@ -43,10 +50,14 @@ def hosts(wiring: Wiring) -> Iterator[Mistake]:
         yield from _neighbours(f"{place}.below", host.below, known, "board")
 
 
-def _neighbours(place: str, names: Sequence[str], boards: Sequence[str], what: str) -> Iterator[Mistake]:
+def _neighbours(
+    place: str, names: Sequence[str], boards: Sequence[str], what: str
+) -> Iterator[Mistake]:
     for name in names:
         if name not in boards:
-            yield Mistake(place, name, f"no {what} has this name; boards: {', '.join(boards) or 'none'}")
+            yield Mistake(
+                place, name, f"no {what} has this name; boards: {', '.join(boards) or 'none'}"
+            )
     yield from repeated(place, names)
 
 
@@ -60,22 +71,35 @@ def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
     has_planner = board.planner is not None
     is_loose = board.coupling == "loose"
     if has_planner != (board.coupling != "none"):
-        permitted = '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
+        permitted = (
+            '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
+        )
         yield Mistake(f"{place}.coupling", board.coupling, f"permitted: {permitted}")
     if is_loose and board.planner_slot is None:
-        yield Mistake(f"{place}.planner_slot", None, "missing; a loosely coupled planner has its own board")
+        yield Mistake(
+            f"{place}.planner_slot", None, "missing; a loosely coupled planner has its own board"
+        )
     for key in ("planner_slot", "planner_core"):
         if not is_loose and getattr(board, key) is not None:
-            yield Mistake(f"{place}.{key}", getattr(board, key), 'only for a planner with coupling = "loose"')
+            yield Mistake(
+                f"{place}.{key}", getattr(board, key), 'only for a planner with coupling = "loose"'
+            )
     if board.coupling == "tight" and board.planner_priority >= max(board.priority, 1):
-        why = f"must be below the executor's priority, {board.priority}, with a tightly coupled planner"
+        why = (
+            f"must be below the executor's priority, {board.priority}, with a tightly coupled"
+            " planner"
+        )
         yield Mistake(f"{place}.planner_priority", board.planner_priority, why)
     if not has_planner:
         # Otherwise such a time would be ignored silently.
         for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
             for key in keys:
                 if value := getattr(getattr(board, table), key, None):
-                    yield Mistake(f"{place}.{table}.{key}", value, "the board has no planner; remove it, or add one")
+                    yield Mistake(
+                        f"{place}.{table}.{key}",
+                        value,
+                        "the board has no planner; remove it, or add one",
+                    )
 
 
 def circles(wiring: Wiring) -> Iterator[Mistake]:
@@ -83,7 +107,9 @@ def circles(wiring: Wiring) -> Iterator[Mistake]:
     config = wiring.config
     links = list(config.links())
     try:
-        TopologicalSorter({name: [upper for upper, lower in links if lower == name] for name in config.board}).prepare()
+        TopologicalSorter(
+            {name: [upper for upper, lower in links if lower == name] for name in config.board}
+        ).prepare()
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
@@ -97,9 +123,14 @@ def circles(wiring: Wiring) -> Iterator[Mistake]:
 
 
 def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
-    """Return board and key of every table that puts one board above another, and the end of a hierarchy without it."""
+    """Return board and key of every table that puts one board above another, and the end of a
+    hierarchy without it."""
     tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
-    return [(board, key, end) for board, key, end, other in tables if other in getattr(config.board[board], key)]
+    return [
+        (board, key, end)
+        for board, key, end, other in tables
+        if other in getattr(config.board[board], key)
+    ]
 
 
 def slots(wiring: Wiring) -> Iterator[Mistake]:
@@ -118,7 +149,11 @@ def ends(wiring: Wiring) -> Iterator[Mistake]:
     """Check that no more than one board ends the run."""
     ending = [name for name, board in wiring.config.board.items() if board.ends_run]
     for name in ending[1:]:
-        yield Mistake(f"board.{name}.ends_run", True, f"only one board can end the run; '{ending[0]}' already does")
+        yield Mistake(
+            f"board.{name}.ends_run",
+            True,
+            f"only one board can end the run; '{ending[0]}' already does",
+        )
 
 
 LONGEST_MAJOR = 10_000
@@ -132,15 +167,22 @@ def clock(wiring: Wiring) -> Iterator[Mistake]:
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
         yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
     if clock.mode == "lockstep" and clock.speed != 1.0:
-        yield Mistake("clock.speed", clock.speed, 'lockstep runs as fast as it can; speed needs mode = "realtime"')
+        yield Mistake(
+            "clock.speed",
+            clock.speed,
+            'lockstep runs as fast as it can; speed needs mode = "realtime"',
+        )
     tick_ms = clock.period_ms / clock.speed
     if tick_ms < SHORTEST_MS:
-        why = f"a tick would take {tick_ms:g} ms of real time; permitted: {SHORTEST_MS:g} ms or more"
+        why = (
+            f"a tick would take {tick_ms:g} ms of real time; permitted: {SHORTEST_MS:g} ms or more"
+        )
         yield Mistake("clock.speed", clock.speed, why)
 
 
 def rates(wiring: Wiring) -> Iterator[Mistake]:
-    """Check that the period of each board is given once, is on the clock's grid, and is not too long."""
+    """Check that the period of each board is given once, is on the clock's grid, and is not too
+    long."""
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
@@ -155,14 +197,19 @@ def rates(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(place, None, str(error))
             continue
         if every > LONGEST_EVERY:
-            yield Mistake(place, board.rate_hz, f"a cycle would take {every} ticks; permitted: up to {LONGEST_EVERY}")
+            yield Mistake(
+                place,
+                board.rate_hz,
+                f"a cycle would take {every} ticks; permitted: up to {LONGEST_EVERY}",
+            )
         if board.phase >= every:
             why = f"must be less than the board's period; permitted: 0 to {every - 1} ticks"
             yield Mistake(f"board.{name}.phase", board.phase, why)
 
 
 def polling(wiring: Wiring) -> Iterator[Mistake]:
-    """Refuse a board that busy-waits on a shared core: at a real-time priority it would starve the others."""
+    """Refuse a board that busy-waits on a shared core: at a real-time priority it would starve the
+    others."""
     config = wiring.config
     cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.tasks()}
     for name, board in config.board.items():
@@ -184,7 +231,10 @@ def _frames(table: ScheduleConfig, clock_ns: int) -> Iterator[Mistake]:
     tick_ms = clock_ns * 1e-6
     minor, major = frames(table, clock_ns)
     if minor < 1 or abs(minor * tick_ms - table.minor_ms) > 1e-6 * tick_ms:
-        why = f"not a whole number of ticks of {tick_ms:g} ms; nearest: {_nearest(table.minor_ms, tick_ms)} ms"
+        why = (
+            f"not a whole number of ticks of {tick_ms:g} ms; nearest:"
+            f" {_nearest(table.minor_ms, tick_ms)} ms"
+        )
         yield Mistake("schedule.minor_ms", table.minor_ms, why)
     elif major % minor or not major or abs(major * tick_ms - table.major_ms) > 1e-6 * tick_ms:
         near = _nearest(table.major_ms, table.minor_ms)
@@ -204,7 +254,9 @@ def _nearest(value: float, step: float) -> str:
 def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
     clock_ns = wiring.config.clock_ns
     (minor, major), tick_ms = frames(table, clock_ns), clock_ns * 1e-6
-    fitting = [minor * number for number in range(1, major // minor + 1) if major % (minor * number) == 0]
+    fitting = [
+        minor * number for number in range(1, major // minor + 1) if major % (minor * number) == 0
+    ]
     for name, every in wiring.every.items():
         if every in fitting:
             continue
@@ -213,11 +265,13 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
         below = [cycle for cycle in fitting if cycle < every]
         above = [cycle for cycle in fitting if cycle > every]
         rates = " or ".join(
-            f"{cycle * tick_ms:g} ms, {f'{1e3 / (cycle * tick_ms):g} Hz' if key == 'rate_hz' else f'every {cycle}'}"
+            f"{cycle * tick_ms:g} ms,"
+            f" {f'{1e3 / (cycle * tick_ms):g} Hz' if key == 'rate_hz' else f'every {cycle}'}"
             for cycle in (*below[-1:], *above[:1])
         )
         why = (
-            f"a cycle of {every * tick_ms:g} ms does not fit the schedule, a multiple of the minor frame, "
-            f"{table.minor_ms:g} ms, that divides the major one, {table.major_ms:g} ms; nearest: {rates}"
+            f"a cycle of {every * tick_ms:g} ms does not fit the schedule, a multiple of the minor"
+            f" frame, {table.minor_ms:g} ms, that divides the major one, {table.major_ms:g} ms;"
+            f" nearest: {rates}"
         )
         yield Mistake(f"board.{name}.{key}", getattr(board, key), why)

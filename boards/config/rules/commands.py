@@ -20,7 +20,8 @@ from rack.levels.operator import NAMED, Commands, Goal, goal_names, listed
 def command_mistakes(
     commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, broken: Collection[str] = ()
 ) -> list[Mistake]:
-    """Return every mistake in commands, given with their places in a config; a live command has an empty place.
+    """Return every mistake in commands, given with their places in a config; a live command has an
+    empty place.
 
     Commands for `broken` boards, which have mistakes of their own, are not checked.
     """
@@ -28,7 +29,11 @@ def command_mistakes(
     checked = [(place, command) for place, command in given if command.level not in broken]
     found = [mistake for place, command in checked for mistake in _mistakes(place, command, config)]
     if len(given) > OPERATOR_ENTRIES:
-        found.append(Mistake("command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"))
+        found.append(
+            Mistake(
+                "command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"
+            )
+        )
     return found
 
 
@@ -52,7 +57,9 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         yield from _joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
         if getattr(command, key) is not None and not any(getattr(command, key)):
-            yield Mistake(at(key), list(getattr(command, key)), "all zero; its length must not be zero")
+            yield Mistake(
+                at(key), list(getattr(command, key)), "all zero; its length must not be zero"
+            )
 
 
 def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
@@ -67,7 +74,9 @@ def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> 
         why = "missing" if not given else f"several given: {goal_names(given)}"
         yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(wanted)}")
     elif given[0] not in wanted:
-        yield Mistake(at(_key(given[0])), None, f"not a goal for {what}; permitted: {goal_names(wanted)}")
+        yield Mistake(
+            at(_key(given[0])), None, f"not a goal for {what}; permitted: {goal_names(wanted)}"
+        )
     elif command.position is None and given[0] in (Goal.POSE, Goal.DIRECTION):
         yield Mistake(at("position"), None, "missing; tool position, m")
     elif command.quaternion is not None and command.direction is not None:
@@ -88,11 +97,17 @@ def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mi
         return
     board = config.board[command.level]
     try:
-        known = find_class(board.executor, Executor).wording(command.said, board.params, config.scene)
+        known = find_class(board.executor, Executor).wording(
+            command.said, board.params, config.scene
+        )
     except LevelError:
         return  # reported elsewhere
     if command.name not in known:
-        yield Mistake(place, command.name, f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}")
+        yield Mistake(
+            place,
+            command.name,
+            f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}",
+        )
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:
@@ -101,7 +116,10 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
         yield Mistake(place, list(joints), "the rack has no arm")
         return
     if len(joints) != len(robot.joints):
-        why = f"{len(joints)} values; permitted: {len(robot.joints)}, one per joint: {', '.join(robot.joints)}"
+        why = (
+            f"{len(joints)} values; permitted: {len(robot.joints)}, one per joint:"
+            f" {', '.join(robot.joints)}"
+        )
         yield Mistake(place, list(joints), why)
         return
     try:
@@ -110,4 +128,6 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
         return  # reported elsewhere
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
-            yield Mistake(place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad")
+            yield Mistake(
+                place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad"
+            )

@@ -30,12 +30,15 @@ def fault_mistakes(
 ) -> list[Mistake]:
     """Return every mistake in faults, given with their places.
 
-    Without a layout, rules that need one are skipped. Boards in `unspecified` have mistakes of their own.
+    Without a layout, rules that need one are skipped. Boards in `unspecified` have mistakes of
+    their own.
     """
     rules = [FaultRules(place, fault, config, layout, unspecified) for place, fault in faults]
     found = [mistake for rule in rules for mistake in rule.mistakes()]
     if len(rules) > FAULT_ENTRIES:
-        found.append(Mistake("fault", len(rules), f"too many faults for one run; permitted: {FAULT_ENTRIES}"))
+        found.append(
+            Mistake("fault", len(rules), f"too many faults for one run; permitted: {FAULT_ENTRIES}")
+        )
     return found
 
 
@@ -78,11 +81,16 @@ class FaultRules:
         for keys in (("tick", "at", "when"), ("for", "cycles")):
             given = [key for key in keys if self._value(key) is not None]
             for key in given[1:]:
-                yield self._mistake(key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}")
+                yield self._mistake(
+                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
+                )
 
     def _of_kind(self, kind: Kind) -> Iterator[Mistake]:
         if kind.realtime and self.config.clock.mode == "lockstep":
-            why = f"{kind.name} needs real time: in lockstep time waits for every task; run without --lockstep"
+            why = (
+                f"{kind.name} needs real time: in lockstep time waits for every task; run without"
+                " --lockstep"
+            )
             yield self._mistake("kind", why)
         for key in ("for", "cycles") if kind.once else ():
             if self._value(key) is not None:
@@ -92,10 +100,14 @@ class FaultRules:
                 yield self._mistake(key, f"{kind.name} strikes as the board starts; remove it")
         if self.fault.phase and not kind.within_tick:
             takers = _listed(other.name for other in KINDS if other.within_tick)
-            yield self._mistake("phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}")
+            yield self._mistake(
+                "phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}"
+            )
         if self.fault.mailbox is not None and not kind.takes_mailbox:
             takers = _listed(other.name for other in KINDS if other.takes_mailbox)
-            yield self._mistake("mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}")
+            yield self._mistake(
+                "mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}"
+            )
         yield from self._parameters(kind)
 
     def _parameters(self, kind: Kind) -> Iterator[Mistake]:
@@ -110,19 +122,26 @@ class FaultRules:
             if parameter.default is None and parameter.name not in self.fault.parameters:
                 yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
 
-    def _target(self, kind: Kind, tasks: Mapping[str, Role], driving: Mapping[str, Steps]) -> Iterator[Mistake]:
+    def _target(
+        self, kind: Kind, tasks: Mapping[str, Role], driving: Mapping[str, Steps]
+    ) -> Iterator[Mistake]:
         """Check that the task can be struck by such a fault."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
             yield self._mistake(
-                "board", "external: the rack has no process to strike; permitted: boards that it starts"
+                "board",
+                "external: the rack has no process to strike; permitted: boards that it starts",
             )
         elif board == CLOCK:
             if "clock" not in kind.tasks:
                 kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
-                yield self._mistake("board", f"{kind.name} cannot strike the clock; kinds that can: {kinds}")
+                yield self._mistake(
+                    "board", f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
+                )
         elif kind.tasks == ("clock",):
-            yield self._mistake("board", f'{kind.name} strikes only the clock; permitted: "{CLOCK}"')
+            yield self._mistake(
+                "board", f'{kind.name} strikes only the clock; permitted: "{CLOCK}"'
+            )
         elif tasks[board] not in kind.tasks:
             role = kind.tasks[0]
             fitting = _listed(name for name, other in tasks.items() if other == role)
@@ -131,7 +150,8 @@ class FaultRules:
             able = [name for name, steps in driving.items() if isinstance(kind.step, steps)]
             if board not in able:
                 yield self._mistake(
-                    "board", f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}"
+                    "board",
+                    f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}",
                 )
         elif kind.takes_mailbox and self.layout is not None:
             yield from self._mailboxes(kind, self.layout)
@@ -139,28 +159,43 @@ class FaultRules:
     def _mailboxes(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
         every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
         # The position of a queue's reader is not written through a port.
-        written = {name: m for name, m in every.items() if kind.where == "bus" or not is_position(m)}
+        written = {
+            name: m for name, m in every.items() if kind.where == "bus" or not is_position(m)
+        }
         wanted = self.fault.mailbox
         struck = [m for m in written.values() if wanted in (None, m.name)]
         if wanted is not None and wanted not in written:
-            yield self._mistake("mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}")
+            yield self._mistake(
+                "mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}"
+            )
         elif kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
-            why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike: {kind.not_queued}"
+            why = (
+                f"'{struck[0].name}' is a queue, which {kind.name} does not strike:"
+                f" {kind.not_queued}"
+            )
             yield self._mistake("mailbox", why)
-        elif kind.where == "bus" and wanted is None and not any(m.readers for m in written.values()):
-            yield self._mistake("mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader")
+        elif (
+            kind.where == "bus" and wanted is None and not any(m.readers for m in written.values())
+        ):
+            yield self._mistake(
+                "mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader"
+            )
         elif kind.where == "lock":
             locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
             if wanted not in locked if wanted is not None else not locked:
                 why = (
-                    f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use it: {_listed(locked)}"
+                    f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use"
+                    f" it: {_listed(locked)}"
                 )
                 yield self._mistake("mailbox", why)
 
     def _driving(self) -> dict[str, Steps]:
-        """Return the classes of steps that can strike each board's hardware, by board; of a missing class any."""
+        """Return the classes of steps that can strike each board's hardware, by board; of a missing
+        class any."""
         found = executors(self.config).items()
-        return {name: (object,) if executor is None else executor.faults for name, executor in found}
+        return {
+            name: (object,) if executor is None else executor.faults for name, executor in found
+        }
 
     def _value(self, key: str) -> object:
         return self.fault.lasts if key == "for" else getattr(self.fault, key)

@@ -1,4 +1,5 @@
-"""`[adapter.lan]`: what is exchanged with other racks, and how safely; where mistakes of its board are shown.
+"""`[adapter.lan]`: what is exchanged with other racks, and how safely; where mistakes of its board
+are shown.
 
 The table makes a board, `lan`, which is checked like any other. A user knows it as `adapter.lan`.
 """
@@ -39,11 +40,19 @@ def lan(wiring: Wiring) -> Iterator[Mistake]:
     table = wiring.config.adapter.lan
     for name, board in config.board.items():
         if board.executor == LAN_ADAPTER and (table is None or name != LAN):
-            yield Mistake(f"board.{name}.executor", board.executor, f"permitted: [{PLACE}], which makes its board")
+            yield Mistake(
+                f"board.{name}.executor",
+                board.executor,
+                f"permitted: [{PLACE}], which makes its board",
+            )
     if table is None:
         return
     if is_taken(config):
-        yield Mistake(ITSELF, None, f"[{PLACE}] makes the board of this name; rename the board, or leave one out")
+        yield Mistake(
+            ITSELF,
+            None,
+            f"[{PLACE}] makes the board of this name; rename the board, or leave one out",
+        )
         return
     yield from _names(table, config.name)
     for key, entries in (("export", table.exports), ("import", table.imports)):
@@ -52,28 +61,48 @@ def lan(wiring: Wiring) -> Iterator[Mistake]:
     if config.clock.mode == "realtime":
         yield from _priority(config, table)
         if config.protocol.strict:
-            why = "what other racks send makes a run depend on timing, refused by protocol.strict = true"
+            why = (
+                "what other racks send makes a run depend on timing, refused by protocol.strict ="
+                " true"
+            )
             yield Mistake(PLACE, None, f'{why}; permitted: clock.mode = "lockstep"')
 
 
 def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
-    """Check names of racks and ports: none twice, none of this rack, none that the adapter itself needs."""
-    taken = {STATUS: "its status", **{peer_port(other): f"what it knows of rack '{other}'" for other in table.racks}}
+    """Check names of racks and ports: none twice, none of this rack, none that the adapter itself
+    needs."""
+    taken = {
+        STATUS: "its status",
+        **{peer_port(other): f"what it knows of rack '{other}'" for other in table.racks},
+    }
     for port, entry in table.imports.items():
         place = f"{PLACE}.import.{port}"
         if port in taken:
-            yield Mistake(place, None, f"the adapter writes {taken[port]} under this name; rename the port")
+            yield Mistake(
+                place, None, f"the adapter writes {taken[port]} under this name; rename the port"
+            )
         if entry.rack == rack:
-            yield Mistake(f"{place}.from", entry.source, "a mailbox of this rack itself: levels here read it directly")
+            yield Mistake(
+                f"{place}.from",
+                entry.source,
+                "a mailbox of this rack itself: levels here read it directly",
+            )
     for key, entries in (("export", table.exports), ("import", table.imports)):
         for source, count in repeats(entry.source for entry in entries.values()):
             ports = ", ".join(port for port, entry in entries.items() if entry.source == source)
-            yield Mistake(f"{PLACE}.{key}", source, f"listed {count} times: {ports}; any number of levels may read")
+            yield Mistake(
+                f"{PLACE}.{key}",
+                source,
+                f"listed {count} times: {ports}; any number of levels may read",
+            )
     if rack in table.peers:
         yield Mistake(f"{PLACE}.peers", rack, "the name of this rack itself")
     for port, _ in repeats(map(peer_port, table.racks)):
         alike = [other for other in table.racks if peer_port(other) == port]
-        why = f"these names differ in '-' and '_' alone, so their mailboxes {LAN}.{port} are one; rename a rack"
+        why = (
+            f"these names differ in '-' and '_' alone, so their mailboxes {LAN}.{port} are one;"
+            " rename a rack"
+        )
         yield Mistake(f"{PLACE}.peers", alike, why)
 
 
@@ -87,17 +116,27 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, table: LanConfig) -> I
     if isinstance(entry, ImportConfig):
         least_ms = (every + 1) * cycle_ns * 1e-6
         if entry.max_age_ms < least_ms:
-            why = f"between two exchanges it gets as old as one of them and a cycle of the adapter, {least_ms:g} ms"
+            why = (
+                "between two exchanges it gets as old as one of them and a cycle of the adapter,"
+                f" {least_ms:g} ms"
+            )
             yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, f"{why}; permitted: no less")
 
 
 def _priority(config: RackConfig, table: LanConfig) -> Iterator[Mistake]:
-    """Require a priority above the neighbours', if there are real-time ones: else others lose sight of this rack."""
+    """Require a priority above the neighbours', if there are real-time ones: else others lose sight
+    of this rack."""
     others = [place for place in config.tasks() if place.core == table.core and place.board != LAN]
-    above = [f"{place.name} {place.priority}" for place in others if place.priority >= max(1, table.priority)]
+    above = [
+        f"{place.name} {place.priority}"
+        for place in others
+        if place.priority >= max(1, table.priority)
+    ]
     if above:
         why = f"must be above that of the other boards on core {table.core}, {', '.join(above)}"
-        yield Mistake(f"{PLACE}.priority", table.priority, f"{why}: else they keep it from its signs of life")
+        yield Mistake(
+            f"{PLACE}.priority", table.priority, f"{why}: else they keep it from its signs of life"
+        )
 
 
 def entries(wiring: Wiring) -> Iterator[Mistake]:
@@ -158,20 +197,34 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
         if why := _why_not(endpoint, table, connects=key.startswith("connect")):
             yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
     if table.has_tls and table.certificates is None:
-        yield Mistake(f"{PLACE}.certificates", None, "missing; TLS needs them: see rack lan certificates --help")
+        yield Mistake(
+            f"{PLACE}.certificates",
+            None,
+            "missing; TLS needs them: see rack lan certificates --help",
+        )
     if table.has_tls and table.exports and not table.racks:
-        yield Mistake(f"{PLACE}.peers", None, "missing; with TLS only racks that it names may import from this one")
+        yield Mistake(
+            f"{PLACE}.peers",
+            None,
+            "missing; with TLS only racks that it names may import from this one",
+        )
 
 
 def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
     if endpoint.has_tls and connects and ":" in endpoint.host:
-        return "zenoh checks no certificate for an address of IPv6; permitted: a host name, or an address of IPv4"
+        return (
+            "zenoh checks no certificate for an address of IPv6; permitted: a host name, or an"
+            " address of IPv4"
+        )
     if not endpoint.has_tls and table.has_tls:
-        return "without TLS, which others have: who comes here is not known; permitted: all with TLS, or none"
+        return (
+            "without TLS, which others have: who comes here is not known; permitted: all with TLS,"
+            " or none"
+        )
     if not endpoint.has_tls and not endpoint.is_loopback and not table.insecure:
         return (
-            "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an address of loopback, or "
-            f"by name, {PLACE}.insecure = true"
+            "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an"
+            f" address of loopback, or by name, {PLACE}.insecure = true"
         )
     return ""
 
@@ -185,19 +238,33 @@ def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
         # The file first: a long path is cut short.
-        yield Mistake(f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}")
+        yield Mistake(
+            f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}"
+        )
 
 
 def network_notes(config: RackConfig) -> list[str]:
-    """Return what a launch says of the network: endpoints without TLS that others can reach, certificates that end."""
+    """Return what a launch says of the network: endpoints without TLS that others can reach,
+    certificates that end."""
     table = config.adapter.lan
     if table is None:
         return []
-    far = [str(endpoint) for _, endpoint in table.endpoints if not (endpoint.has_tls or endpoint.is_loopback)]
+    far = [
+        str(endpoint)
+        for _, endpoint in table.endpoints
+        if not (endpoint.has_tls or endpoint.is_loopback)
+    ]
     may = "read and forge" if table.certificates is None else "read"
-    notes = [f"without TLS: whoever reaches {', '.join(far)} may {may} what is exchanged"] if far else []
+    notes = (
+        [f"without TLS: whoever reaches {', '.join(far)} may {may} what is exchanged"]
+        if far
+        else []
+    )
     if table.certificates is not None and table.has_tls:
         expires = Credentials(Path(table.certificates), config.name).expires
         if expires - datetime.now(UTC) < SOON:
-            notes.append(f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC: the other racks are lost then")
+            notes.append(
+                f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC: the other racks are lost"
+                " then"
+            )
     return notes

@@ -22,7 +22,8 @@ MAX_SEGMENT_BYTES = 2**30
 
 
 def params(wiring: Wiring) -> Iterator[Mistake]:
-    """Check each board's parameters against the declarations of its executor's and planner's classes."""
+    """Check each board's parameters against the declarations of its executor's and planner's
+    classes."""
     for table, kind in wiring.params:
         tables, _, board = table.partition(".")
         given = getattr(wiring.config, tables)[board].params
@@ -59,7 +60,10 @@ def memory(layout: Layout) -> Iterator[Mistake]:
     size = AddressMap(layout).size
     if size > MAX_SEGMENT_BYTES:
         box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
-        why = f"{box.depth} messages are kept for its slowest reader, so the segment needs {size} bytes"
+        why = (
+            f"{box.depth} messages are kept for its slowest reader, so the segment needs {size}"
+            " bytes"
+        )
         advice = f"permitted: {MAX_SEGMENT_BYTES}; shorten cycles or within_cycles"
         yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
 
@@ -69,7 +73,9 @@ def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Iterator
     for ports in wiring.tasks:
         if issubclass(ports.kind, Executor):
             board = wiring.config.board[ports.task]
-            above, below = ([contexts[other] for other in others] for others in (board.above, board.below))
+            above, below = (
+                [contexts[other] for other in others] for others in (board.above, board.below)
+            )
             for key, value, why in ports.kind.misfits(contexts[ports.task], above, below):
                 yield Mistake(f"board.{ports.task}.{key}", value, why)
 
@@ -102,7 +108,9 @@ def robot(wiring: Wiring) -> Iterator[Mistake]:
     for key in ("home", "velocity", "acceleration", "jerk", "torque", "position"):
         values = getattr(robot, key)
         if values is not None and len(values) != joints:
-            yield Mistake(f"robot.{key}", values, f"{len(values)} values; permitted: {joints}, one per joint")
+            yield Mistake(
+                f"robot.{key}", values, f"{len(values)} values; permitted: {joints}, one per joint"
+            )
     for key, values in robot.sensors:
         if isinstance(values, tuple) and len(values) != joints:
             why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
@@ -111,7 +119,8 @@ def robot(wiring: Wiring) -> Iterator[Mistake]:
 
 
 def cell(wiring: Wiring) -> Iterator[Mistake]:
-    """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only names are checked."""
+    """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only
+    names are checked."""
     config = wiring.config
     found = ""
     if config.robot is None:

@@ -7,7 +7,15 @@ from collections.abc import Iterator
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.boards.config.schema import LAN
-from rack.boards.config.wiring import TaskPorts, Wiring, class_key, key_of, reference, rewired, table_of
+from rack.boards.config.wiring import (
+    TaskPorts,
+    Wiring,
+    class_key,
+    key_of,
+    reference,
+    rewired,
+    table_of,
+)
 from rack.boards.errors import Mistake
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.bus_adapter import BusAdapter
@@ -21,7 +29,9 @@ def ports(wiring: Wiring) -> Iterator[Mistake]:
     for place in (*config.tasks(), *config.hosts()):
         table = table_of(place)
         if place in wiring.missing:
-            yield Mistake(f"{table}.{class_key(place)}", reference(config, place), wiring.missing[place])
+            yield Mistake(
+                f"{table}.{class_key(place)}", reference(config, place), wiring.missing[place]
+            )
         else:
             yield from _connected(wiring, table, wiring.ports[place])
 
@@ -37,13 +47,17 @@ def _connected(wiring: Wiring, table: str, ports: TaskPorts) -> Iterator[Mistake
         if port not in ports.kind.inputs:
             key = f"{key_of(ports.place)}.{port}"
             yield Mistake(f"{table}.{key}", given, f"the {role} has no such port; ports: {inputs}")
-    for port, entry, key, given, mailboxes, _ in (found for found in ports.connections if not found.fits):
+    for port, entry, key, given, mailboxes, _ in (
+        found for found in ports.connections if not found.fits
+    ):
         if mailboxes:
             why = f"port '{port}' of the {role} reads one mailbox, not {len(mailboxes)}"
             yield Mistake(f"{table}.{key}", given, why)
         else:
             start = entry.source.partition(".")[0]
-            yield Mistake(f"{table}.{start}", None, f"missing; port '{port}' of the {role} needs it")
+            yield Mistake(
+                f"{table}.{start}", None, f"missing; port '{port}' of the {role} needs it"
+            )
 
 
 def writers(wiring: Wiring) -> Iterator[Mistake]:
@@ -63,8 +77,15 @@ def reads(wiring: Wiring) -> Iterator[Mistake]:
             wanted = ports.inputs[port].type
             if not wiring.is_known(mailbox):
                 yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
-            elif ports.is_whole and (found := wiring.type_of(mailbox)) is not None and found != wanted:
-                why = f"carries {found.name} {found.version}; the port needs {wanted.name} {wanted.version}"
+            elif (
+                ports.is_whole
+                and (found := wiring.type_of(mailbox)) is not None
+                and found != wanted
+            ):
+                why = (
+                    f"carries {found.name} {found.version}; the port needs {wanted.name}"
+                    f" {wanted.version}"
+                )
                 yield Mistake(place, mailbox, why)
 
 
@@ -79,7 +100,9 @@ def sides(wiring: Wiring) -> Iterator[Mistake]:
     """Check that only bus adapters read mailboxes of the other side."""
     for task in wiring.ports.values():
         for port, mailbox in task.sources:
-            if mailbox.partition(".")[0] not in wiring.unknown and (why := _reason(wiring, task, mailbox)):
+            if mailbox.partition(".")[0] not in wiring.unknown and (
+                why := _reason(wiring, task, mailbox)
+            ):
                 yield Mistake(task.wired_at(port), mailbox, why)
 
 
@@ -95,7 +118,10 @@ def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
         return f"it is on the {'host' if is_of_host else 'real-time'} side; {PASS_IT}"
     writer = source.partition(".")[0]
     same = "host" if is_host else "real-time"
-    return f"a bus adapter joins the two sides; '{writer}' and '{task.place.board}' are both on the {same} side"
+    return (
+        f"a bus adapter joins the two sides; '{writer}' and '{task.place.board}' are both on the"
+        f" {same} side"
+    )
 
 
 NOT_OPERATED = {
@@ -133,10 +159,16 @@ def exchange(wiring: Wiring) -> Iterator[Mistake]:
         for port, entry in ports.exchange.items():
             place = f"board.{ports.task}.exchange.{port}"
             if port not in ports.inputs:
-                yield Mistake(place, None, f"no such port of the executor; ports: {', '.join(ports.inputs) or 'none'}")
+                yield Mistake(
+                    place,
+                    None,
+                    f"no such port of the executor; ports: {', '.join(ports.inputs) or 'none'}",
+                )
             if entry.asynchronous and entry.every > 1:
                 yield Mistake(
-                    f"{place}.every", entry.every, "an asynchronous port is read in every cycle; permitted: 1"
+                    f"{place}.every",
+                    entry.every,
+                    "an asynchronous port is read in every cycle; permitted: 1",
                 )
             elif entry.phase >= entry.every:
                 why = f"must be less than every; permitted: 0 to {entry.every - 1} cycles"
@@ -147,25 +179,33 @@ def exchange(wiring: Wiring) -> Iterator[Mistake]:
 
 
 def operated(wiring: Wiring) -> Iterator[Mistake]:
-    """Check that only the clock writes operators' mailboxes, never waits, and never finds one full."""
+    """Check that only the clock writes operators' mailboxes, never waits, and never finds one
+    full."""
     for mailbox in wiring.operated:
         if mailbox in wiring.writers:
             first = wiring.writers[mailbox][0].task
-            yield Mistake(f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox")
+            yield Mistake(
+                f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox"
+            )
         given = wiring.config.protocol.mailbox.get(mailbox)
         if why := NOT_OPERATED.get(given or ""):
-            yield Mistake(f"protocol.mailbox.{mailbox}", given, f"{why}; permitted: time-slice, double-buffer")
+            yield Mistake(
+                f"protocol.mailbox.{mailbox}", given, f"{why}; permitted: time-slice, double-buffer"
+            )
 
 
 def mailboxes(wiring: Wiring) -> Iterator[Mistake]:
     """Check that the mailboxes exist whose protocol the config gives."""
     for mailbox in wiring.config.protocol.mailbox:
         if not wiring.is_known(mailbox):
-            yield Mistake(f"protocol.mailbox.{mailbox}", None, f"no such mailbox; mailboxes: {wiring.names()}")
+            yield Mistake(
+                f"protocol.mailbox.{mailbox}", None, f"no such mailbox; mailboxes: {wiring.names()}"
+            )
 
 
 def queues(wiring: Wiring) -> Iterator[Mistake]:
-    """Check which mailboxes are queues, their readers and their depths, if the two sides are apart."""
+    """Check which mailboxes are queues, their readers and their depths, if the two sides are
+    apart."""
     if any(sides(wiring)):
         return
     table = wiring.config.protocol
@@ -178,7 +218,9 @@ def queues(wiring: Wiring) -> Iterator[Mistake]:
             yield from _queue(wiring, mailbox)
     for mailbox, depth in table.depth.items():
         if not wiring.is_known(mailbox):
-            yield Mistake(f"protocol.depth.{mailbox}", depth, f"no such mailbox; mailboxes: {wiring.names()}")
+            yield Mistake(
+                f"protocol.depth.{mailbox}", depth, f"no such mailbox; mailboxes: {wiring.names()}"
+            )
         elif wiring.protocol(mailbox) != "queue":
             queues = [name for name in wiring.writers if wiring.protocol(name) == "queue"]
             why = f"not a queue: it holds one message; queues: {', '.join(queues) or 'none'}"
@@ -186,18 +228,32 @@ def queues(wiring: Wiring) -> Iterator[Mistake]:
 
 
 def _queue(wiring: Wiring, mailbox: str) -> Iterator[Mistake]:
-    """Check one queue: exactly one port reads it, and its reader's position has a name of its own."""
+    """Check one queue: exactly one port reads it, and its reader's position has a name of its
+    own."""
     if taken_name(mailbox) in wiring.writers:
-        why = f"the reader of the queue '{mailbox}' writes its position under this name; rename the port"
+        why = (
+            f"the reader of the queue '{mailbox}' writes its position under this name; rename the"
+            " port"
+        )
         yield Mistake(f"mailbox {taken_name(mailbox)}", None, why)
-    reading = [(task.task, port) for task, port in wiring.reading.get(mailbox, ()) if task.place.role != "host"]
+    reading = [
+        (task.task, port)
+        for task, port in wiring.reading.get(mailbox, ())
+        if task.place.role != "host"
+    ]
     readers = [f"{task} ({port})" for task, port in reading]
     exports = [port for task, port in reading if task == LAN]
     if wiring.config.adapter.lan is not None and exports:
-        why = "a queue gives each message once, to its one reader here; permitted: mailboxes that hold one message"
+        why = (
+            "a queue gives each message once, to its one reader here; permitted: mailboxes that"
+            " hold one message"
+        )
         yield Mistake(f"adapter.lan.export.{exports[0]}.from", mailbox, why)
     elif len(readers) > 1:
-        why = f"a queue gives each message once, so it has one reader, not {len(readers)}: {', '.join(readers)}"
+        why = (
+            f"a queue gives each message once, so it has one reader, not {len(readers)}:"
+            f" {', '.join(readers)}"
+        )
         yield Mistake(f"mailbox {mailbox}", None, why)
     elif not readers and not wiring.unknown:
         why = "no task reads this queue, so it would fill and stay full; permitted: one reader"
@@ -209,8 +265,13 @@ def asynchronous(wiring: Wiring) -> Iterator[Mistake]:
     for ports in wiring.tasks:
         for port, mailbox in ports.sources:
             why = {
-                "queue": f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false",
-                "interrupt": f"the messages of '{mailbox}' interrupt the board as they come already; permitted: false",
+                "queue": (
+                    f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false"
+                ),
+                "interrupt": (
+                    f"the messages of '{mailbox}' interrupt the board as they come already;"
+                    " permitted: false"
+                ),
             }.get(wiring.protocol(mailbox))
             if port in ports.exchange and ports.exchange[port].asynchronous and why is not None:
                 yield Mistake(f"board.{ports.task}.exchange.{port}.asynchronous", True, why)
@@ -225,6 +286,9 @@ def interrupts(wiring: Wiring) -> Iterator[Mistake]:
         if mailbox in wiring.of_host:
             why = "it is on the host side, where nothing is interrupted; permitted: no entry"
         elif wiring.is_of_network(mailbox):
-            why = "the network adapter writes it as messages come in; permitted: time-slice, double-buffer"
+            why = (
+                "the network adapter writes it as messages come in; permitted: time-slice,"
+                " double-buffer"
+            )
         if why:
             yield Mistake(f"protocol.mailbox.{mailbox}", given, why)

@@ -1,7 +1,9 @@
-"""Stand-in for the driver of your motion controller: six to seven drives with encoders, brakes and a time-out.
+"""Stand-in for the driver of your motion controller: six to seven drives with encoders, brakes and
+a time-out.
 
-Replace this file with calls of your fieldbus library. What the real drives do by themselves, this one computes: it
-integrates the arm's equation of motion, and engages the brakes when no torque has come for two cycles.
+Replace this file with calls of your fieldbus library. What the real drives do by themselves, this
+one computes: it integrates the arm's equation of motion, and engages the brakes when no torque has
+come for two cycles.
 """
 
 from __future__ import annotations

@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 class HardwareArm(Arm):
     """Passes torques down to the drives and samples up."""
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         self.drives = Drives(cell, clock_ns * 1e-9, self.patience)
 

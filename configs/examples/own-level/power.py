@@ -2,7 +2,12 @@ from rack.backplane.message import Field, State, status
 from rack.levels.level import Executor, Input
 from rack.levels.messages import SERVO_STATUS
 
-POWER = status("power_status", 1, Field("power", "f8", "W", "mechanical power"), Field("energy", "f8", "J", "spent"))
+POWER = status(
+    "power_status",
+    1,
+    Field("power", "f8", "W", "mechanical power"),
+    Field("energy", "f8", "J", "spent"),
+)
 
 
 class PowerMeter(Executor):

@@ -1,4 +1,5 @@
-"""A control modification of one's own: it limits what the servo law may add to the load, so that the arm gives way."""
+"""A control modification of one's own: it limits what the servo law may add to the load, so that
+the arm gives way."""
 
 from __future__ import annotations
 
@@ -12,18 +13,23 @@ from rack.levels.tables import Positive, Table, read_params
 class GentleParams(Table):
     """What `params` of the modification may hold."""
 
-    part: Positive = Field(0.2, le=1.0, description="part of each joint's torque limit that may be added to its load")
+    part: Positive = Field(
+        0.2, le=1.0, description="part of each joint's torque limit that may be added to its load"
+    )
 
 
 class Gentle(Modification):
-    """Carries the arm's weight and motion in full, and corrects errors with part of the torque only."""
+    """Carries the arm's weight and motion in full, and corrects errors with part of the torque
+    only."""
 
     hook = Hook.AFTER
     params = GentleParams
 
     def __init__(self, context: LawContext) -> None:
         super().__init__(context)
-        self.most = read_params(GentleParams, context.params).part * context.torque  # (joints,), N m
+        self.most = (
+            read_params(GentleParams, context.params).part * context.torque
+        )  # (joints,), N m
 
     def modify(self, sample: LawSample) -> None:
         """Limit the law's torque."""

@@ -1,4 +1,5 @@
-"""A planner of one's own for the primitive level: trapezoids of speed in place of jerk-limited trajectories."""
+"""A planner of one's own for the primitive level: trapezoids of speed in place of jerk-limited
+trajectories."""
 
 from __future__ import annotations
 
@@ -14,12 +15,14 @@ from rack.levels.primitive.segment import read_segment, window
 from rack.levels.robot.cell import build_cell
 
 SHARE = 0.7
-"""Part of each joint's acceleration that a trapezoid uses: its corners ask for more than the model can follow."""
+"""Part of each joint's acceleration that a trapezoid uses: its corners ask for more than the model
+can follow."""
 SAMPLE_RAD = 0.02
 
 
 class TrapezoidPlanner(Planner):
-    """Accelerates, cruises and brakes along the path: between stops, with one speed and one acceleration."""
+    """Accelerates, cruises and brakes along the path: between stops, with one speed and one
+    acceleration."""
 
     inputs = {
         "command": Input(MOVE_COMMAND, "above.command"),
@@ -35,7 +38,9 @@ class TrapezoidPlanner(Planner):
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether the executor wants a trajectory that has not been made."""
         status = read.status.value
-        return status.wants in window(read.command.value) and (status.wants, status.begin) != self.made
+        return (
+            status.wants in window(read.command.value) and (status.wants, status.begin) != self.made
+        )
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
         """Time the wanted segment, or give the reason why it cannot be timed."""
@@ -56,11 +61,16 @@ class TrapezoidPlanner(Planner):
         published = tick + (self.context.within_cycles + 1) * self.context.every
         write.earliest = max(published * self.context.tick_s, status.ends) + write.duration
 
-    def sections(self, path: BlendedPath, begin: float) -> list[tuple[float, float, float, float, float]]:
-        """Return start in s, then s, ds, dds and jerk of the path parameter per section; the last is the end."""
+    def sections(
+        self, path: BlendedPath, begin: float
+    ) -> list[tuple[float, float, float, float, float]]:
+        """Return start in s, then s, ds, dds and jerk of the path parameter per section; the last
+        is the end."""
         found = []
         start_s = 0.0
-        for first, last in pairwise([begin, *(stop for stop in path.stops if begin < stop < path.length), path.length]):
+        for first, last in pairwise(
+            [begin, *(stop for stop in path.stops if begin < stop < path.length), path.length]
+        ):
             speed, acceleration = self.limits_of(path, first, last)
             speed = min(speed, np.sqrt(acceleration * (last - first)))
             ramp_s = speed / acceleration
@@ -73,12 +83,17 @@ class TrapezoidPlanner(Planner):
         return [*found, (start_s, path.length, 0.0, 0.0, 0.0)]
 
     def limits_of(self, path: BlendedPath, first: float, last: float) -> tuple[float, float]:
-        """Return the speed, rad/s, and acceleration, rad/s2, that every joint keeps between two path parameters."""
+        """Return the speed, rad/s, and acceleration, rad/s2, that every joint keeps between two
+        path parameters."""
         speeds = []
         accelerations = []
         for s in np.linspace(first, last, 2 + int((last - first) / SAMPLE_RAD)):
             _, slope, curvature = (np.abs(values) for values in path.evaluate(s))
             speeds.append((self.limits.velocity / np.maximum(slope, 1e-9)).min())
-            speeds.append(np.sqrt(0.5 * SHARE * self.limits.acceleration / np.maximum(curvature, 1e-9)).min())
-            accelerations.append((0.5 * SHARE * self.limits.acceleration / np.maximum(slope, 1e-9)).min())
+            speeds.append(
+                np.sqrt(0.5 * SHARE * self.limits.acceleration / np.maximum(curvature, 1e-9)).min()
+            )
+            accelerations.append(
+                (0.5 * SHARE * self.limits.acceleration / np.maximum(slope, 1e-9)).min()
+            )
         return float(min(speeds)), float(min(accelerations))

@@ -23,7 +23,8 @@ class Gains(Table):
 
 
 class PdServo(Executor):
-    """Drives every joint towards its newest set point; gains are scaled by the inertia of each joint."""
+    """Drives every joint towards its newest set point; gains are scaled by the inertia of each
+    joint."""
 
     inputs = {
         "command": Input(JOINT_SET_POINT, "above.command"),
@@ -59,10 +60,15 @@ class PdServo(Executor):
         slip = self.target_velocity - sensed.velocity
         load = Payload(read.plan.value.payload_mass, read.plan.value.payload_offset)
         inertia, gravity = self.dynamics.terms(sensed.position, self.rest, load)
-        torque = inertia.diagonal() * (self.gains.stiffness * error + self.gains.damping * slip) + gravity
+        torque = (
+            inertia.diagonal() * (self.gains.stiffness * error + self.gains.damping * slip)
+            + gravity
+        )
         if self.grip is not None and read.command.is_new:
             self.grip.take(command)
-        force = 0.0 if self.grip is None else self.grip.force(sensed.opening, sensed.opening_velocity)
+        force = (
+            0.0 if self.grip is None else self.grip.force(sensed.opening, sensed.opening_velocity)
+        )
         self.arm.drive(torque, force)
         status = write.status
         status.echo = command.id

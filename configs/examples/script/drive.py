@@ -20,11 +20,14 @@ SHOWN = {"command", "detection", "reaction", "recovery", "end"}
 
 
 def main(seconds: float | None = None) -> int:
-    """Run the rack to the end of its task, or for `seconds` of simulated time; return an exit status."""
+    """Run the rack to the end of its task, or for `seconds` of simulated time; return an exit
+    status."""
     with Rack.from_file("nasrem", SETTINGS) as rack:
         rack.command("task", "hold", tick=2600)
         rack.command("task", "resume", tick=3000)
-        servo = open_observer(rack.segment, "servo.status")  # the newest message of any mailbox, at no board's cost
+        servo = open_observer(
+            rack.segment, "servo.status"
+        )  # the newest message of any mailbox, at no board's cost
         rack.start(seconds)
         seen = 0
         while rack.watch(timeout_s=0.5):

@@ -1,4 +1,5 @@
-"""Task levels of several racks that work together: one that takes its actions as orders, and one that gives them."""
+"""Task levels of several racks that work together: one that takes its actions as orders, and one
+that gives them."""
 
 from rack.levels.systems.cell.coordinator import Coordinator
 from rack.levels.systems.cell.executor import OrderedTaskExecutor
@@ -7,5 +8,12 @@ from rack.levels.systems.cell.planner import OrderedTaskPlanner
 from rack.levels.systems.cell.program import CellProgram
 from rack.levels.systems.cell.sharing_executor import SharingServoExecutor
 
-__all__ = ["CELL_ORDER", "CELL_REPORT", "CellProgram", "Coordinator", "OrderedTaskExecutor", "OrderedTaskPlanner"]
+__all__ = [
+    "CELL_ORDER",
+    "CELL_REPORT",
+    "CellProgram",
+    "Coordinator",
+    "OrderedTaskExecutor",
+    "OrderedTaskPlanner",
+]
 __all__ += ["SharingServoExecutor"]

@@ -54,7 +54,8 @@ def copy_action(source: Message, target: Message) -> None:
 
 
 def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> AnyAction:
-    """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not suit arm or scene."""
+    """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not
+    suit arm or scene."""
     table = _table(message) | ({"by": message.by} if message.by else {})
     (action,) = read_program({"action": [table]}, robot, scene).action
     return action
@@ -68,10 +69,22 @@ def _table(message: Message) -> dict[str, Any]:
     if what == OrderAction.TRANSFER:
         turn = {"yaw": message.yaw} if message.turned else {}
         place = message.position.tolist()
-        return {"do": "transfer", "object": message.object, "to": place, "lift": message.lift, **turn}
+        return {
+            "do": "transfer",
+            "object": message.object,
+            "to": place,
+            "lift": message.lift,
+            **turn,
+        }
     if what != OrderAction.GOTO or goal not in (Goal.JOINTS, Goal.POSE, Goal.DIRECTION):
-        raise ProgramError(f"action {what} with goal {goal} is not known; permitted: transfer, goto, home")
+        raise ProgramError(
+            f"action {what} with goal {goal} is not known; permitted: transfer, goto, home"
+        )
     if goal == Goal.JOINTS:
         return {"do": "goto", "joints": message.joints[: message.count].tolist()}
     turned = "quaternion" if goal == Goal.POSE else "direction"
-    return {"do": "goto", "position": message.position.tolist(), turned: getattr(message, turned).tolist()}
+    return {
+        "do": "goto",
+        "position": message.position.tolist(),
+        turned: getattr(message, turned).tolist(),
+    }

@@ -1,11 +1,14 @@
-"""The coordinator's part of the agreement on each step; the arms' part is `rack.levels.systems.cell.taken`.
+"""The coordinator's part of the agreement on each step; the arms' part is
+`rack.levels.systems.cell.taken`.
 
-A step is asked of all its arms. Once each has answered POSSIBLE, all are told to do it; if one refuses, all are ended.
-An answer holds until it says otherwise, so the step begins everywhere or nowhere, however long messages take. An answer
-with a time may come too late to be acted on: then all are cancelled, and asked again.
+A step is asked of all its arms. Once each has answered POSSIBLE, all are told to do it; if one
+refuses, all are ended. An answer holds until it says otherwise, so the step begins everywhere or
+nowhere, however long messages take. An answer with a time may come too late to be acted on: then
+all are cancelled, and asked again.
 
-The id of an order names step and attempt. From what the arms report, a coordinator that remembers nothing, after a new
-launch of its rack, knows which step is under way, and whether it had been begun.
+The id of an order names step and attempt. From what the arms report, a coordinator that remembers
+nothing, after a new launch of its rack, knows which step is under way, and whether it had been
+begun.
 """
 
 from __future__ import annotations
@@ -35,11 +38,14 @@ class ArmAnswer(NamedTuple):
     response: Response = Response.NONE
     error: int = 0
     reason: str = ""
-    until: float = 0.0  # simulated time of the coordinator's rack up to which POSSIBLE holds, s; 0: any time
+    until: float = (
+        0.0  # simulated time of the coordinator's rack up to which POSSIBLE holds, s; 0: any time
+    )
 
 
 class Agreement:
-    """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each step."""
+    """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each
+    step."""
 
     def __init__(self, program: int, steps: Sequence[Collection[str]], margin_s: float) -> None:
         """`margin_s`: time in which an order reaches its arm."""
@@ -80,7 +86,9 @@ class Agreement:
     @property
     def partners(self) -> Collection[str]:
         """The arms of the present step; none before the first and after the last one."""
-        return self._steps[self.step] if self.phase in VERBS and self.step < len(self._steps) else ()
+        return (
+            self._steps[self.step] if self.phase in VERBS and self.step < len(self._steps) else ()
+        )
 
     def verb(self, arm: str) -> OrderVerb:
         """Return what to say to an arm."""
@@ -158,7 +166,11 @@ class Agreement:
         begun = [arm for arm, response in said.items() if response is not Response.CANCELLED]
         self.attempt += 1
         if begun:
-            self.end(Error.GIVEN_UP, f"step {self.step}: {begun[0]} had begun when it was cancelled", now_s)
+            self.end(
+                Error.GIVEN_UP,
+                f"step {self.step}: {begun[0]} had begun when it was cancelled",
+                now_s,
+            )
         elif self.attempt == MAX_ATTEMPTS:
             why = f"step {self.step}: {MAX_ATTEMPTS} promises expired before all arms had answered"
             self.end(Error.TOO_LATE, why, now_s)
@@ -166,7 +178,11 @@ class Agreement:
             self.phase = Phase.ASKING
 
     def _ends_by(
-        self, said: Mapping[str, Response], kinds: Collection[Response], answers: Mapping[str, ArmAnswer], now_s: float
+        self,
+        said: Mapping[str, Response],
+        kinds: Collection[Response],
+        answers: Mapping[str, ArmAnswer],
+        now_s: float,
     ) -> bool:
         """End the program if an arm has given one of these answers; return whether it has."""
         arm = next((arm for arm, response in said.items() if response in kinds), None)

@@ -13,7 +13,14 @@ from rack.levels.messages import TASK_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.systems.cell.actions import write_action
 from rack.levels.systems.cell.agreement import Agreement, ArmAnswer
-from rack.levels.systems.cell.messages import CELL_ORDER, CELL_PROGRESS, CELL_REPORT, OrderVerb, Phase, Response
+from rack.levels.systems.cell.messages import (
+    CELL_ORDER,
+    CELL_PROGRESS,
+    CELL_REPORT,
+    OrderVerb,
+    Phase,
+    Response,
+)
 from rack.levels.systems.cell.params import CoordinatorParams
 from rack.levels.systems.cell.program import CellProgram
 from rack.levels.tables import read_params
@@ -22,15 +29,16 @@ from rack.levels.tables import read_params
 class Coordinator(Executor):
     """Has each step of its program carried out by all its arms, or by none.
 
-    While an arm is lost, or an operator holds this level, the arms rest on their paths. `by` is the simulated time of
-    this rack: it begins anew with each launch.
+    While an arm is lost, or an operator holds this level, the arms rest on their paths. `by` is the
+    simulated time of this rack: it begins anew with each launch.
     """
 
     inputs = {
         "last_progress": Input(CELL_PROGRESS, "own.progress"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    # The progress first: a board killed before it has written its orders writes them when it is back.
+    # The progress first: a board killed before it has written its orders writes them when it is
+    # back.
     outputs = {"progress": CELL_PROGRESS, "status": TASK_STATUS}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = CoordinatorParams
@@ -95,7 +103,9 @@ class Coordinator(Executor):
             self._agreement.recall(read.last_progress.value)
             self._moves = read.last_progress.value.moves
 
-    def _go_on(self, readings: Mapping[str, Reading], answers: Mapping[str, ArmAnswer], now_s: float) -> None:
+    def _go_on(
+        self, readings: Mapping[str, Reading], answers: Mapping[str, ArmAnswer], now_s: float
+    ) -> None:
         agreement = self._agreement
         if not self._steps:
             return
@@ -109,7 +119,11 @@ class Coordinator(Executor):
     def _moves_of_step(self, readings: Mapping[str, Reading]) -> tuple[int, int]:
         """Return how many moves of the present step are done, of how many."""
         reports = [readings[arm].value for arm in self._agreement.partners]
-        mine = [r for r in reports if (r.program, r.echo) == (self._agreement.program, self._agreement.order)]
+        mine = [
+            r
+            for r in reports
+            if (r.program, r.echo) == (self._agreement.program, self._agreement.order)
+        ]
         return sum(r.moves_done for r in mine), sum(r.moves for r in mine)
 
     def _reason_to_hold(self, readings: Mapping[str, Reading]) -> str:
@@ -118,7 +132,9 @@ class Coordinator(Executor):
             return self._operated.keeps(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
             return ""
-        lost = next((arm for arm, reading in readings.items() if reading.is_there and reading.is_lost), "")
+        lost = next(
+            (arm for arm, reading in readings.items() if reading.is_there and reading.is_lost), ""
+        )
         return f"{lost} is lost: the program waits until it is back" if lost else ""
 
     def _reason_to_wait(self, readings: Mapping[str, Reading]) -> str:
@@ -133,11 +149,18 @@ class Coordinator(Executor):
         return f"{waiting[0]}: {readings[waiting[0]].value.reason}" if waiting else ""
 
     def _check_progress(self, readings: Mapping[str, Reading], waits: str, tick: int) -> None:
-        """End the program when nothing has happened for too long, unless an operator keeps it from going on."""
+        """End the program when nothing has happened for too long, unless an operator keeps it from
+        going on."""
         agreement = self._agreement
         reports = [reading.value for reading in readings.values()]
-        operated = self._operated.standing is not Operation.NONE or any(report.operated for report in reports)
-        stage = (agreement.phase, agreement.order, *((r.echo, r.response, r.moves_done, r.moves) for r in reports))
+        operated = self._operated.standing is not Operation.NONE or any(
+            report.operated for report in reports
+        )
+        stage = (
+            agreement.phase,
+            agreement.order,
+            *((r.echo, r.response, r.moves_done, r.moves) for r in reports),
+        )
         if operated or stage != self._stage or not self._steps:
             self._stage = stage
             self._moved_at = tick
@@ -165,11 +188,15 @@ class Coordinator(Executor):
             status.state = State.HOLDING
         is_over = agreement.phase is Phase.OVER
         status.error = agreement.error if is_over else Error.NONE
-        status.reason = agreement.reason if is_over else waits if status.state == State.HOLDING else ""
+        status.reason = (
+            agreement.reason if is_over else waits if status.state == State.HOLDING else ""
+        )
         status.action = agreement.step
         status.actions = len(self._steps)
         done, moves = self._moves_of_step(readings)
-        fill_counts(status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves))
+        fill_counts(
+            status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves)
+        )
         if self._operated.standing is Operation.HOLD:
             self._operated.done()
         self._operated.report(status)

@@ -1,4 +1,5 @@
-"""The executor of an ordered task level: takes its actions from a coordinator, one order at a time."""
+"""The executor of an ordered task level: takes its actions from a coordinator, one order at a
+time."""
 
 from __future__ import annotations
 
@@ -32,8 +33,8 @@ NUMBERED = re.compile(r"^(task\.)?action( 0|\[0\]|\.0)[:,.]? ?")
 class OrderedTaskExecutor(TaskExecutor):
     """Answers what it is asked, and does what it has answered to be possible.
 
-    While its orders are lost it holds the arm on its path. It ends its run when the coordinator says so, or when that
-    stays away for `stalled_s`.
+    While its orders are lost it holds the arm on its path. It ends its run when the coordinator
+    says so, or when that stays away for `stalled_s`.
     """
 
     inputs = {
@@ -50,7 +51,9 @@ class OrderedTaskExecutor(TaskExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._table = read_params(OrderedTaskParams, context.params)
-        self._source = f"rack '{self._table.coordinator}'" if self._table.coordinator else "the coordinator"
+        self._source = (
+            f"rack '{self._table.coordinator}'" if self._table.coordinator else "the coordinator"
+        )
         self._taken = TakenOrder()
         self._begun = 0  # request whose plan is followed; 0: none
         self._orders_begun = self._orders_done = 0
@@ -71,7 +74,11 @@ class OrderedTaskExecutor(TaskExecutor):
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
             return MadePorts(is_whole=False)
-        peer = {"peer": Input(PEER, f"lan.{peer_port(table.coordinator)}")} if table.coordinator else {}
+        peer = (
+            {"peer": Input(PEER, f"lan.{peer_port(table.coordinator)}")}
+            if table.coordinator
+            else {}
+        )
         return MadePorts({"order": Input(CELL_ORDER, table.orders), **peer})
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
@@ -152,7 +159,10 @@ class OrderedTaskExecutor(TaskExecutor):
             taken.fail(Error.UNREACHABLE, bare(str(error)))
             return
         if action.by is not None and action.by - ahead_s <= now_s:
-            taken.fail(Error.TOO_LATE, f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already")
+            taken.fail(
+                Error.TOO_LATE,
+                f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already",
+            )
             return
         request.program = taken.program
         request.order = taken.order
@@ -187,7 +197,8 @@ class OrderedTaskExecutor(TaskExecutor):
         return ""
 
     def _begin(self, read: Ports, request: Message, tick: int) -> None:
-        """Begin with the plan that was promised; have it planned anew if the world has changed since."""
+        """Begin with the plan that was promised; have it planned anew if the world has changed
+        since."""
         if not self._actions:
             self._take_action(request)
         strays = float(np.abs(read.status.value.start - request.start).max()) > MAX_STRAY_RAD
@@ -285,7 +296,11 @@ class OrderedTaskExecutor(TaskExecutor):
     def _fill_times(self, plan: Message, request: Message, report: Message) -> None:
         """Report the earliest end, and how long a promise holds, in the coordinator's time."""
         report.earliest = report.until = 0.0
-        if plan.id == request.id and self._taken.response in (Response.POSSIBLE, Response.DOING, Response.REFUSED):
+        if plan.id == request.id and self._taken.response in (
+            Response.POSSIBLE,
+            Response.DOING,
+            Response.REFUSED,
+        ):
             report.earliest = plan.earliest
         if self._taken.response is Response.POSSIBLE and request.by:
             report.until = request.begin + request.ahead + request.by - plan.earliest

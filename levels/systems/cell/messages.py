@@ -1,7 +1,7 @@
 """Orders for a task level from another rack, and its reports: one mailbox each way for every arm.
 
-Both racks must have the same layout of them, whatever their arms: no symbolic sizes. Each message says all there is to
-know, so that those that are lost, or overtaken by a newer one, are not missed.
+Both racks must have the same layout of them, whatever their arms: no symbolic sizes. Each message
+says all there is to know, so that those that are lost, or overtaken by a newer one, are not missed.
 """
 
 from __future__ import annotations
@@ -64,7 +64,13 @@ ACTION_FIELDS = (
     Field("action", "u1", OrderAction, "what to do"),
     Field("object", f"S{OBJECT_BYTES}", "ASCII", "object of a transfer"),
     Field("goal", "u1", Goal, "form of a goto's goal: joints, pose or direction"),
-    Field("position", "f8", "m", "where a transfer takes the object's origin, or a goto the tool", (3,)),
+    Field(
+        "position",
+        "f8",
+        "m",
+        "where a transfer takes the object's origin, or a goto the tool",
+        (3,),
+    ),
     Field("turned", "u1", "1", "1: a transfer turns the object to `yaw`; 0: any turn"),
     Field("yaw", "f8", "rad", "turn of the object's x axis about the vertical"),
     Field("lift", "f8", "m", "height of a transfer's straight motions"),
@@ -82,7 +88,12 @@ CELL_ORDER = command(
     Field("program", "u4", "1", "checksum of the program that the order is of"),
     Field("what", "u1", OrderVerb, "ask, do, cancel: all of the order `id`; end"),
     Field("hold", "u1", "1", "1: the arm rests on its path while it does an order"),
-    Field("reason", "S120", "ASCII", "with `hold` why; with END why the program failed, empty: it is done"),
+    Field(
+        "reason",
+        "S120",
+        "ASCII",
+        "with `hold` why; with END why the program failed, empty: it is done",
+    ),
     *ACTION_FIELDS,
 )
 
@@ -90,12 +101,32 @@ CELL_REPORT = status(
     "cell_report",
     1,
     Field("program", "u4", "1", "as in the order that is echoed"),
-    Field("response", "u1", Response, "the answer to it; `reason`: of a refusal or failure, else of waiting"),
-    Field("earliest", "f8", "s", "earliest end, simulated time of the rack that gave the order; 0: not known"),
-    Field("until", "f8", "s", "in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time"),
+    Field(
+        "response",
+        "u1",
+        Response,
+        "the answer to it; `reason`: of a refusal or failure, else of waiting",
+    ),
+    Field(
+        "earliest",
+        "f8",
+        "s",
+        "earliest end, simulated time of the rack that gave the order; 0: not known",
+    ),
+    Field(
+        "until",
+        "f8",
+        "s",
+        "in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
+    ),
     Field("moves_done", "u2", "1", "elemental moves of the order done"),
     Field("moves", "u2", "1", "elemental moves of the order; 0 before it begins"),
-    Field("halted", "u1", "1", "1: moves were withdrawn, the arm is held until it begins another order"),
+    Field(
+        "halted",
+        "u1",
+        "1",
+        "1: moves were withdrawn, the arm is held until it begins another order",
+    ),
     OPERATED,
     errors=Error,
 )
@@ -107,8 +138,15 @@ CELL_REQUEST = MessageType(
         Field("id", "u4", "1", "serial of the plan wanted; 0: none yet"),
         Field("program", "u4", "1", "as in the order that it serves"),
         Field("order", "u4", "1", "that order"),
-        Field("begin", "f8", "s", "simulated time at which it must be possible to begin; 0: at once"),
-        Field("ahead", "f8", "s", "simulated time of the rack that gave the order, in which `by` is, less that here"),
+        Field(
+            "begin", "f8", "s", "simulated time at which it must be possible to begin; 0: at once"
+        ),
+        Field(
+            "ahead",
+            "f8",
+            "s",
+            "simulated time of the rack that gave the order, in which `by` is, less that here",
+        ),
         Field("revision", "u4", "1", "of the world model then"),
         Field("start", "f8", "rad", "where the arm rested then", ("joints",)),
         *ACTION_FIELDS,

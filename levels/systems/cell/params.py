@@ -18,11 +18,17 @@ class OrderedTaskParams(TaskParams):
     """From where a task level takes its orders, and for how long it keeps a promise."""
 
     coordinator: RackName = Field(
-        "", description="rack that gives the orders over the network; empty: a board of this rack gives them"
+        "",
+        description=(
+            "rack that gives the orders over the network; empty: a board of this rack gives them"
+        ),
     )
     orders: Mailbox = Field("lan.orders", description="mailbox with the orders")
     decision: Positive = Field(
-        5.0, description="time between an answer and the order to do it, for which a promised time holds, s"
+        5.0,
+        description=(
+            "time between an answer and the order to do it, for which a promised time holds, s"
+        ),
     )
 
 
@@ -30,13 +36,21 @@ class CoordinatorParams(Table):
     """The arms that a coordinator orders about, and how long it waits for them."""
 
     arms: dict[ArmName, Mailbox] = Field(
-        min_length=1, description="mailbox with an arm's report, by the arm's name; its orders are in order_<name>"
+        min_length=1,
+        description=(
+            "mailbox with an arm's report, by the arm's name; its orders are in order_<name>"
+        ),
     )
     stalled_s: Positive = Field(
         180.0,
-        description="time without any progress after which the program ends, unless an operator holds it; longer than "
-        "an arm's, s",
+        description=(
+            "time without any progress after which the program ends, unless an operator holds it;"
+            " longer than an arm's, s"
+        ),
     )
     farewell_s: Positive = Field(
-        10.0, description="time that the arms have to come to rest and to confirm the end of the program, s"
+        10.0,
+        description=(
+            "time that the arms have to come to rest and to confirm the end of the program, s"
+        ),
     )

@@ -1,4 +1,5 @@
-"""The planner of an ordered task level: one order as elemental moves, or the reason why it cannot be done."""
+"""The planner of an ordered task level: one order as elemental moves, or the reason why it cannot
+be done."""
 
 from __future__ import annotations
 
@@ -48,4 +49,6 @@ class OrderedTaskPlanner(TaskPlanner):
     def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
         super()._promise(moves, visible_s, write)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
-        write.earliest = finish_times(unhurried, visible_s, self._periods, self._needs)[-1] + self._ahead_s
+        write.earliest = (
+            finish_times(unhurried, visible_s, self._periods, self._needs)[-1] + self._ahead_s
+        )

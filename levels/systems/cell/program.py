@@ -1,4 +1,5 @@
-"""The program of a coordinator, `[task]`: steps, each with what one or more arms do in it at the same time."""
+"""The program of a coordinator, `[task]`: steps, each with what one or more arms do in it at the
+same time."""
 
 from __future__ import annotations
 
@@ -41,9 +42,12 @@ ArmAction = Annotated[ArmTransfer | ArmGoto | ArmHome, Field(discriminator="do")
 
 
 class CellStep(Table):
-    """`[[task.step]]`: actions that begin together, once every arm has answered that it can do its own by its time."""
+    """`[[task.step]]`: actions that begin together, once every arm has answered that it can do its
+    own by its time."""
 
-    do: tuple[ArmAction, ...] = Field(description="actions, one for each arm that has a part in the step")
+    do: tuple[ArmAction, ...] = Field(
+        description="actions, one for each arm that has a part in the step"
+    )
 
     @property
     def actions(self) -> dict[str, ArmTransfer | ArmGoto | ArmHome]:
@@ -54,16 +58,20 @@ class CellStep(Table):
 class CellProgram(Program):
     """A program for several arms: steps, each begun when the one before it is done."""
 
-    step: tuple[CellStep, ...] = Field((), max_length=MAX_STEPS, description="steps, done in their order")
+    step: tuple[CellStep, ...] = Field(
+        (), max_length=MAX_STEPS, description="steps, done in their order"
+    )
 
     @property
     def checksum(self) -> int:
         """A number that two different programs hardly share, above 0."""
         return zlib.crc32(self.model_dump_json().encode()) or 1
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
-        """Yield key, value and reason of steps without actions or with two for an arm, times that do not rise, and what
-        is too long for an order.
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterator[tuple[str, Any, str]]:
+        """Yield key, value and reason of steps without actions or with two for an arm, times that
+        do not rise, and what is too long for an order.
         """
         latest = 0.0
         for k, step in enumerate(self.step):
@@ -73,17 +81,37 @@ class CellProgram(Program):
             for n, action in enumerate(step.do):
                 place = f"step[{k}].do[{n}]"
                 if action.arm in arms:
-                    yield f"{place}.arm", action.arm, "has another action in this step; permitted: one action per arm"
+                    yield (
+                        f"{place}.arm",
+                        action.arm,
+                        "has another action in this step; permitted: one action per arm",
+                    )
                 if action.by is not None and action.by <= latest:
-                    yield f"{place}.by", action.by, f"an earlier step has {latest:g}; permitted: later than that"
+                    yield (
+                        f"{place}.by",
+                        action.by,
+                        f"an earlier step has {latest:g}; permitted: later than that",
+                    )
                 yield from _too_long(place, action)
                 arms.add(action.arm)
             latest = max([latest, *(action.by for action in step.do if action.by is not None)])
 
 
-def _too_long(place: str, action: ArmTransfer | ArmGoto | ArmHome) -> Iterator[tuple[str, Any, str]]:
+def _too_long(
+    place: str, action: ArmTransfer | ArmGoto | ArmHome
+) -> Iterator[tuple[str, Any, str]]:
     """Yield what does not fit into an order."""
-    if isinstance(action, ArmTransfer) and not (action.object.isascii() and len(action.object) <= OBJECT_BYTES):
-        yield f"{place}.object", action.object, f"permitted in an order: at most {OBJECT_BYTES} ASCII characters"
+    if isinstance(action, ArmTransfer) and not (
+        action.object.isascii() and len(action.object) <= OBJECT_BYTES
+    ):
+        yield (
+            f"{place}.object",
+            action.object,
+            f"permitted in an order: at most {OBJECT_BYTES} ASCII characters",
+        )
     if isinstance(action, ArmGoto) and len(action.joints or ()) > MAX_JOINTS:
-        yield f"{place}.joints", list(action.joints or ()), f"permitted in an order: at most {MAX_JOINTS} joints"
+        yield (
+            f"{place}.joints",
+            list(action.joints or ()),
+            f"permitted in an order: at most {MAX_JOINTS} joints",
+        )

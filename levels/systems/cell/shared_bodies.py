@@ -1,15 +1,17 @@
-"""Bodies that several racks simulate: each rack has a copy of its own, and one of them at a time moves the body.
+"""Bodies that several racks simulate: each rack has a copy of its own, and one of them at a time
+moves the body.
 
-All that passes between the simulations is a mailbox, `servo.shared`, up to 50 times a second. A body belongs to the
-rack whose gripper has begun to touch it last: that rack's simulation moves it, and the copies of the others stay where
-it reports the body to be. To begin to touch is to claim, with the next number. Of two claims the one with the greater
-number stands, of two equal ones that of the rack whose name comes last: all racks that have read the same messages
-agree. A body that nobody has touched yet moves in every simulation by itself.
+All that passes between the simulations is a mailbox, `servo.shared`, up to 50 times a second. A
+body belongs to the rack whose gripper has begun to touch it last: that rack's simulation moves it,
+and the copies of the others stay where it reports the body to be. To begin to touch is to claim,
+with the next number. Of two claims the one with the greater number stands, of two equal ones that
+of the rack whose name comes last: all racks that have read the same messages agree. A body that
+nobody has touched yet moves in every simulation by itself.
 
-Modelled: one body in one place, carried by one arm after the other. Not modelled: forces between arms of two racks, on
-each other or through a body that both touch; the program keeps the arms apart. A copy is as late as the messages, and
-where none come any more it stays where it is. A rack that is launched anew takes over what the others know, its own
-claims of before included.
+Modelled: one body in one place, carried by one arm after the other. Not modelled: forces between
+arms of two racks, on each other or through a body that both touch; the program keeps the arms
+apart. A copy is as late as the messages, and where none come any more it stays where it is. A rack
+that is launched anew takes over what the others know, its own claims of before included.
 """
 
 from __future__ import annotations
@@ -33,10 +35,22 @@ SHARED_BODY = MessageType(
     1,
     (
         Field("name", f"S{NAME_BYTES}", "ASCII", "body, by its name in the model; empty: none"),
-        Field("claim", "u4", "1", "number of the claim that stands, as far as this rack knows; 0: none yet"),
-        Field("owner", f"S{NAME_BYTES}", "ASCII", "rack whose claim that is: its simulation moves the body"),
+        Field(
+            "claim",
+            "u4",
+            "1",
+            "number of the claim that stands, as far as this rack knows; 0: none yet",
+        ),
+        Field(
+            "owner",
+            f"S{NAME_BYTES}",
+            "ASCII",
+            "rack whose claim that is: its simulation moves the body",
+        ),
         Field("touched", "u1", "1", "1: the gripper of this rack touches it"),
-        Field("position", "f8", "m", "body origin in this rack's simulation", (3,), (0.0, FARTHEST_M)),
+        Field(
+            "position", "f8", "m", "body origin in this rack's simulation", (3,), (0.0, FARTHEST_M)
+        ),
         Field("quaternion", "f8", "1", "body orientation, likewise", (4,), (0.999, 1.001)),
     ),
 )
@@ -80,7 +94,8 @@ class SharedBody:
         self.is_touched = touches
 
     def hear(self, message: Message) -> Array | None:
-        """Take what another rack says; return where the body is, (7,), m and quaternion; None: nothing new.
+        """Take what another rack says; return where the body is, (7,), m and quaternion; None:
+        nothing new.
 
         What counts is a greater claim, whoever reports it, and after that the word of the owner.
         """

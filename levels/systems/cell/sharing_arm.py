@@ -1,4 +1,5 @@
-"""The simulated arm in a cell whose bodies other simulations may move: see `rack.levels.systems.cell.shared_bodies`."""
+"""The simulated arm in a cell whose bodies other simulations may move: see
+`rack.levels.systems.cell.shared_bodies`."""
 
 from __future__ import annotations
 
@@ -17,12 +18,15 @@ MOTION = 6
 
 
 class SharingArm(SimulatedArm):
-    """Keeps copies of objects where it is told, between MuJoCo's ticks; within one they are bodies like others.
+    """Keeps copies of objects where it is told, between MuJoCo's ticks; within one they are bodies
+    like others.
 
     Rows are those of the world model.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         self._kept: dict[int, Array] = {}  # row of a copy: where it stays, (7,)
         self._in_hand = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)

@@ -11,7 +11,12 @@ from rack.levels.arm.arm import find_arm
 from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.servo.control import ServoParams
 from rack.levels.servo.executor import ServoExecutor
-from rack.levels.systems.cell.shared_bodies import MOST_SHARED, NAME_BYTES, SHARED_BODIES, SharedBody
+from rack.levels.systems.cell.shared_bodies import (
+    MOST_SHARED,
+    NAME_BYTES,
+    SHARED_BODIES,
+    SharedBody,
+)
 from rack.levels.systems.cell.sharing_arm import SharingArm
 
 SHARED = Output(SHARED_BODIES, cycles=8)
@@ -22,7 +27,9 @@ class SharingServoParams(ServoParams):
     """`[board.servo.params]` of a servo level that shares objects."""
 
     shared: tuple[str, ...] = Field(
-        min_length=1, max_length=MOST_SHARED, description="objects of the scene that arms of other racks move too"
+        min_length=1,
+        max_length=MOST_SHARED,
+        description="objects of the scene that arms of other racks move too",
     )
     arm: str = Field(
         "rack.levels.systems.cell.sharing_arm:SharingArm",
@@ -34,13 +41,15 @@ class SharingServoParams(ServoParams):
     def _shares(cls, reference: str) -> str:
         if not issubclass(find_arm(reference), SharingArm):
             raise ValueError(
-                "the arm shares no objects; permitted: rack.levels.systems.cell.sharing_arm:SharingArm and subclasses"
+                "the arm shares no objects; permitted:"
+                " rack.levels.systems.cell.sharing_arm:SharingArm and subclasses"
             )
         return reference
 
 
 class SharingServoExecutor(ServoExecutor):
-    """Claims the shared objects that its gripper touches, and places those that other arms have: see `SharedBody`.
+    """Claims the shared objects that its gripper touches, and places those that other arms have:
+    see `SharedBody`.
 
     After a restart of its board it continues from its own last message.
     """
@@ -58,23 +67,38 @@ class SharingServoExecutor(ServoExecutor):
         super().__init__(context)
         names = cast(SharingServoParams, self.given).shared
         rack = context.rack.encode()
-        self._shared = {context.scene.objects.index(name): SharedBody(name.encode(), rack) for name in names}
+        self._shared = {
+            context.scene.objects.index(name): SharedBody(name.encode(), rack) for name in names
+        }
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield shared bodies that are no objects or named twice, besides what any servo level finds."""
+        """Yield shared bodies that are no objects or named twice, besides what any servo level
+        finds."""
         names = context.params["shared"]
         scene = context.scene
         for name in dict.fromkeys(names):
             if name not in scene.objects:
-                kind = "an obstacle, which moves by itself" if name in scene.obstacles else "not in the scene"
-                yield "params.shared", name, f"{kind}; objects: {', '.join(scene.objects) or 'none'}"
+                kind = (
+                    "an obstacle, which moves by itself"
+                    if name in scene.obstacles
+                    else "not in the scene"
+                )
+                yield (
+                    "params.shared",
+                    name,
+                    f"{kind}; objects: {', '.join(scene.objects) or 'none'}",
+                )
             elif names.count(name) > 1:
                 yield "params.shared", name, "named twice"
             elif len(name) > NAME_BYTES or not name.isascii():
-                yield "params.shared", name, f"no name for a message; permitted: ASCII, at most {NAME_BYTES} characters"
+                yield (
+                    "params.shared",
+                    name,
+                    f"no name for a message; permitted: ASCII, at most {NAME_BYTES} characters",
+                )
         yield from super().misfits(context, above, below)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:

@@ -1,11 +1,12 @@
 """The order that an arm has taken up, and its answer: the arm's part of the agreement on each step.
 
-The other part is `rack.levels.systems.cell.agreement`. Both exchange whole states, never events, so a lost message only
-delays. What makes the arms begin together, or not at all:
+The other part is `rack.levels.systems.cell.agreement`. Both exchange whole states, never events, so
+a lost message only delays. What makes the arms begin together, or not at all:
 
-- An answer of an order is final: POSSIBLE turns into DOING by DO alone, into CANCELLED by CANCEL or another order.
-- An arm begins nothing that it has not answered to be possible. After a new launch of its rack, which knows of no
-  promise, it fails what it is asked to do.
+- An answer of an order is final: POSSIBLE turns into DOING by DO alone, into CANCELLED by CANCEL or
+  another order.
+- An arm begins nothing that it has not answered to be possible. After a new launch of its rack,
+  which knows of no promise, it fails what it is asked to do.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ class TakenOrder:
         """Begin without an order, or with that of a `CELL_REPORT`, after a restart of the board."""
         self.program = self.order = 0
         self.response = Response.NONE
-        self.error, self.reason = Error.NONE, ""  # of a refusal, a failure, or a program that ends early
+        self.error, self.reason = (
+            Error.NONE,
+            "",
+        )  # of a refusal, a failure, or a program that ends early
         self.stops = False  # under way, and to be broken off
         if report is not None and report.echo:
             self.program = report.program
@@ -52,7 +56,8 @@ class TakenOrder:
         return self.response is Response.DOING
 
     def hear(self, program: int, order: int, what: int, reason: str = "") -> None:
-        """Follow what the newest message says of an order: an `OrderVerb`, and why a program ends early."""
+        """Follow what the newest message says of an order: an `OrderVerb`, and why a program ends
+        early."""
         if not order or what not in TAKEN or self.response is Response.ENDED:
             return
         is_same = (program, order) == (self.program, self.order)

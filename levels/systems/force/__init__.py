@@ -1,4 +1,5 @@
-"""Control of contact forces: the wrist sensor's wrench, hybrid motion/force control, and a server of both.
+"""Control of contact forces: the wrist sensor's wrench, hybrid motion/force control, and a server
+of both.
 
 Names are imported on first use: tools that read the messages need not wait for the levels.
 """

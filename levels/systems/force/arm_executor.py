@@ -1,4 +1,5 @@
-"""The executor of a board of an arm with a wrist sensor: an `ArmExecutor` that measures contacts and limits them."""
+"""The executor of a board of an arm with a wrist sensor: an `ArmExecutor` that measures contacts
+and limits them."""
 
 from __future__ import annotations
 
@@ -24,25 +25,32 @@ KINDS = ((Alarm.FORCE_LIMIT, "force", "N"), (Alarm.MOMENT_LIMIT, "torque", "N m"
 
 
 class ForceArmParams(ArmParams):
-    """`[board.<name>.params]`: the arm, and its reactions to faults of sensors and motors and to strong contacts."""
+    """`[board.<name>.params]`: the arm, and its reactions to faults of sensors and motors and to
+    strong contacts."""
 
     on_force_limit: Reacting = Field(
         "brake",
-        description="reaction to a contact beyond the limits: ramp to rest and hold, or ramp and brake, or brake",
+        description=(
+            "reaction to a contact beyond the limits: ramp to rest and hold, or ramp and brake, or"
+            " brake"
+        ),
     )
 
 
 class ForceArmExecutor(WristLevel, ArmExecutor):
-    """Writes the wrench of the contact in every cycle; stops the arm when it is beyond `[robot.wrist]` most_*.
+    """Writes the wrench of the contact in every cycle; stops the arm when it is beyond
+    `[robot.wrist]` most_*.
 
-    A contact stops the arm for as long as it is too strong and for `retry` longer; after `patience` the fault is
-    latched, as others are. Brakes let the arm spring back a little; an arm that holds keeps pressing. A sensor at the
-    end of its range counts as beyond: what it senses is not known. What a gripper holds counts as contact.
+    A contact stops the arm for as long as it is too strong and for `retry` longer; after `patience`
+    the fault is latched, as others are. Brakes let the arm spring back a little; an arm that holds
+    keeps pressing. A sensor at the end of its range counts as beyond: what it senses is not known.
+    What a gripper holds counts as contact.
 
-    Weight and inertia of the tool are taken off, by the acceleration that the joints' velocities show or, where
-    encoders are coarse, by that of the set points. At the limits of acceleration a tool of 1.1 kg would otherwise seem
-    to be pushed by 7 N; with the first, at 1 kHz, by 0.2 N, with the second by 2.3 N at most, where dry friction
-    changes sign. (With encoders of 1 mrad that is 2.6 N; their velocities would make 10 N of noise.)
+    Weight and inertia of the tool are taken off, by the acceleration that the joints' velocities
+    show or, where encoders are coarse, by that of the set points. At the limits of acceleration a
+    tool of 1.1 kg would otherwise seem to be pushed by 7 N; with the first, at 1 kHz, by 0.2 N,
+    with the second by 2.3 N at most, where dry friction changes sign. (With encoders of 1 mrad that
+    is 2.6 N; their velocities would make 10 N of noise.)
     """
 
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
@@ -57,7 +65,9 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         self._on_limit = Reaction[params.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
         self._exact = self.cell.encoders.exact
-        self._before = np.zeros(len(self.cell.dof))  # (joints,), rad/s: velocities at the tick before
+        self._before = np.zeros(
+            len(self.cell.dof)
+        )  # (joints,), rad/s: velocities at the tick before
         self._since: int | None = None  # that tick; None: not known
         self._exceeded = 0  # cycles in which the contact was beyond the limits
 
@@ -70,7 +80,9 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     def self_test(self) -> None:
         """Raise `LevelError` for a class of arms that has no wrist sensor."""
         if self.arm.feel() is None:
-            raise LevelError(f"params.arm: class '{type(self.arm).__name__}' gives no sample of a wrist sensor")
+            raise LevelError(
+                f"params.arm: class '{type(self.arm).__name__}' gives no sample of a wrist sensor"
+            )
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
@@ -84,8 +96,14 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         raw = self.arm.feel()
         velocity = self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
-        passed_s = self.context.tick_s * (self.context.every if self._since is None else tick - self._since)
-        known = self._since is not None and not self.sensors.faulty and (self._exact or not self.abandoned)
+        passed_s = self.context.tick_s * (
+            self.context.every if self._since is None else tick - self._since
+        )
+        known = (
+            self._since is not None
+            and not self.sensors.faulty
+            and (self._exact or not self.abandoned)
+        )
         gained = velocity - self._before if known else np.zeros(len(velocity))
         self.contact.take(raw, self.sensors.state, gained / passed_s)
         self._before[:], self._since = velocity, tick
@@ -102,9 +120,13 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         contact = self.contact
         if contact.saturated:
             found = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
-            self._stop(found, "contact too strong: the wrist sensor is at the end of its range", tick)
+            self._stop(
+                found, "contact too strong: the wrist sensor is at the end of its range", tick
+            )
             return
-        for part, most, (alarm, what, unit) in zip((slice(0, 3), slice(3, 6)), self._most, KINDS, strict=True):
+        for part, most, (alarm, what, unit) in zip(
+            (slice(0, 3), slice(3, 6)), self._most, KINDS, strict=True
+        ):
             strength = norm(contact.wrench[part])
             if strength > most:
                 text = f"contact too strong: {what} of {strength:.3g} {unit}; permitted: {most:g}"
@@ -120,7 +142,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         self._before[:], self._since = self._velocity, self.arm.tick
 
     def terms(self) -> Terms:
-        """Return the equation of motion at the sensed state, with what the gripper holds, and with the contact."""
+        """Return the equation of motion at the sensed state, with what the gripper holds, and with
+        the contact."""
         terms = super().terms()
         terms.bias[:] -= self.contact.torque
         return terms

@@ -1,13 +1,16 @@
-"""A client of a server of force and motion, on the host side: its calls, besides those of `Motions`.
+"""A client of a server of force and motion, on the host side: its calls, besides those of
+`Motions`.
 
     comply("wipe")                what follows is done with the axes of force of [task.contact.wipe]
     comply("wipe", wrench={"z": 20.0})       the same with another force
     guard("touch")                the next of its wrenches ends the motion under way
     free()                        motion alone, without guards
-    wrench(), mode()              of the tool on the surroundings, N, N m, by axis; what the server does
+    wrench(), mode()              of the tool on the surroundings, N, N m, by axis; what the
+                                  server does
 
-A guard that ends a request ends itself with it: `end_of(request)` is GUARDED. Calls that wait give the server its sign
-of life; a program that makes none for longer than the server's `silence` is lost to it.
+A guard that ends a request ends itself with it: `end_of(request)` is GUARDED. Calls that wait give
+the server its sign of life; a program that makes none for longer than the server's `silence` is
+lost to it.
 """
 
 from __future__ import annotations
@@ -31,7 +34,8 @@ SIGN_S = 0.1
 
 
 class ForceMotions(Motions):
-    """Requests for forces and motions as calls. A call raises `LevelError` at once for a contact that is impossible."""
+    """Requests for forces and motions as calls. A call raises `LevelError` at once for a contact
+    that is impossible."""
 
     calls = (*Motions.calls, "comply", "guard", "free", "wrench", "mode")
 
@@ -45,7 +49,9 @@ class ForceMotions(Motions):
         """Make axes ones of force, at rest; done when their forces are as wanted."""
         wanted = self._wanted("comply", contact, changes)
         if not wanted.selected.any():
-            raise LevelError(f"comply: contact '{contact}' has no axis of force; free() ends compliance")
+            raise LevelError(
+                f"comply: contact '{contact}' has no axis of force; free() ends compliance"
+            )
         fields = wanted._asdict()
         del fields["guard"]
         return self._request(kind=MotionKind.COMPLY, **fields)
@@ -64,7 +70,9 @@ class ForceMotions(Motions):
     def wrench(self) -> Mapping[str, float]:
         """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""
         values = self._bus.read("motion").value.wrench
-        return {name: round(float(value), 3) for name, value in zip(AXIS_NAMES, values, strict=True)}
+        return {
+            name: round(float(value), 3) for name, value in zip(AXIS_NAMES, values, strict=True)
+        }
 
     def mode(self) -> Mode:
         """Return what the server does."""
@@ -79,13 +87,17 @@ class ForceMotions(Motions):
         contact = self._program.contact.get(name)
         known = ", ".join(self._program.contact)
         if contact is None:
-            raise LevelError(f"{call}: contact '{name}' is not in [task.contact]; permitted: {known or 'none'}")
+            raise LevelError(
+                f"{call}: contact '{name}' is not in [task.contact]; permitted: {known or 'none'}"
+            )
         try:
             changed = ContactConfig(**{**contact.model_dump(), **changes})
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])
-            raise LevelError(f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}") from error
+            raise LevelError(
+                f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}"
+            ) from error
         if reason := self._program.objection(changed, self._robot):
             raise LevelError(f"{call}: contact '{name}': {reason}")
         return self._program.wanted(changed)

@@ -1,4 +1,5 @@
-"""What a level of hybrid control makes of a `COMPLIANCE` and of the contact: axes of force, guards, reasons to rest."""
+"""What a level of hybrid control makes of a `COMPLIANCE` and of the contact: axes of force, guards,
+reasons to rest."""
 
 from __future__ import annotations
 
@@ -26,7 +27,10 @@ class ComplianceWatch:
         self._most = most
         self._oldest = OLDEST_CYCLES * every
         self.task: ForceTask | None = None  # axes of force; None: there are none
-        self.struck, self.axis = 0, -1  # id of the newest command whose guard was struck, and its axis
+        self.struck, self.axis = (
+            0,
+            -1,
+        )  # id of the newest command whose guard was struck, and its axis
         self.sensed = -1  # tick of the newest wrench; -1: none yet
         self.felt = np.zeros(AXES)  # (6,), N, N m: of the contact on the tool, in the task frame
         self.rests = False  # the motion must end
@@ -47,7 +51,9 @@ class ComplianceWatch:
         self.reason = ""
         self.sensed = wrench.value.tick if wrench.is_there else -1
         reason = objection(compliance) if compliance.active else ""
-        rotation = rotation_of(compliance.frame) if compliance.frame.any() and not reason else np.eye(3)
+        rotation = (
+            rotation_of(compliance.frame) if compliance.frame.any() and not reason else np.eye(3)
+        )
         self.felt = turned(rotation.T, wrench.value.wrench)
         if reason:
             self._rest(reason)
@@ -89,25 +95,37 @@ class ComplianceWatch:
             size = norm(wanted[half])
             if size > most:
                 wanted[half] *= most / size
-                text = f"{what} of {size:.3g} {unit} is wanted, {most:g} applied: the arm's limit on contacts"
+                text = (
+                    f"{what} of {size:.3g} {unit} is wanted, {most:g} applied: the arm's limit on"
+                    " contacts"
+                )
                 self.reason = self.reason or text
         return wanted
 
     def _guard(self, compliance: Message) -> None:
         """End the motion once for a command whose guard is struck."""
-        beyond: NDArray[np.bool_] = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
+        beyond: NDArray[np.bool_] = (compliance.guard > 0.0) & (
+            np.abs(self.felt) > compliance.guard
+        )
         if beyond.any() and self.struck != compliance.id:
             self.struck, self.axis = compliance.id, int(beyond.argmax())
         if self.struck == compliance.id:
-            self._rest(f"guard of axis {AXIS_NAMES[self.axis]} was struck: held until another command")
+            self._rest(
+                f"guard of axis {AXIS_NAMES[self.axis]} was struck: held until another command"
+            )
 
 
 def objection(compliance: Message) -> str:
     """Return why a command is impossible; empty: it is not."""
-    numbers = np.concatenate((compliance.frame, compliance.wrench, compliance.speed, compliance.guard))
+    numbers = np.concatenate(
+        (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)
+    )
     if np.isfinite(numbers).all() and compliance.frame.any():
         return ""
-    return f"compliance {compliance.id} rejected: a number is not finite, or the frame's quaternion is zero"
+    return (
+        f"compliance {compliance.id} rejected: a number is not finite, or the frame's quaternion is"
+        " zero"
+    )
 
 
 def rotation_of(quaternion: Array) -> Array:

@@ -1,4 +1,5 @@
-"""The contact that requests have asked for: which axes of a task frame are of force, and what ends a motion."""
+"""The contact that requests have asked for: which axes of a task frame are of force, and what ends
+a motion."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class Contact:
         return bool(self.selected.any())
 
     def comply(self, frame: Array, selected: Array, wrench: Array, speed: Array) -> bool:
-        """Replace the axes of force, and the guards if the frame is another; return whether motion begins anew."""
+        """Replace the axes of force, and the guards if the frame is another; return whether motion
+        begins anew."""
         turned = not self._is_frame(frame)
         begins_anew = self.complies and (turned or bool((self.selected != selected).any()))
         if turned:
@@ -70,7 +72,10 @@ class Contact:
     def objection(self, frame: Array, guard: Array) -> str:
         """Return why guards in that frame are impossible now; empty: they are not."""
         if self.complies and guard.any() and not self._is_frame(frame):
-            return "the guard's frame is not that of the axes of force; permitted while complying: the same"
+            return (
+                "the guard's frame is not that of the axes of force; permitted while complying: the"
+                " same"
+            )
         return ""
 
     def _is_frame(self, frame: Array) -> bool:
@@ -95,7 +100,8 @@ class Contact:
 
 
 def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
-    """Return why a task frame (4,), or wrenches (6,) in it, are impossible; `most`: of a contact, N and N m.
+    """Return why a task frame (4,), or wrenches (6,) in it, are impossible; `most`: of a contact, N
+    and N m.
 
     Empty: they are possible.
     """
@@ -105,5 +111,8 @@ def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) ->
     for wrench in vectors:
         for (half, what, unit), limit in zip(HALVES, most, strict=True):
             if not norm(wrench[half]) <= limit:
-                return f"{what} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor: {limit:g}"
+                return (
+                    f"{what} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor:"
+                    f" {limit:g}"
+                )
     return ""

@@ -1,4 +1,5 @@
-"""The executor of a level of hybrid motion/force control, between a trajectory level and boards that servo joints."""
+"""The executor of a level of hybrid motion/force control, between a trajectory level and boards
+that servo joints."""
 
 from __future__ import annotations
 
@@ -21,19 +22,23 @@ from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.tables import read_params
 
 LEAD_CYCLES = 2
-"""Cycles from the release that makes a reference to the tick at which it is due: the boards below need it in time."""
+"""Cycles from the release that makes a reference to the tick at which it is due: the boards below
+need it in time."""
 PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
 """Fields of a reference that are handed on as they are."""
 
 
 class HybridExecutor(WristLevel):
-    """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves for the force.
+    """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves
+    for the force.
 
-    A guard that is struck ends the motion: the arm ramps to rest and holds until the level above has another command;
-    axes of force keep their forces. Without a fresh wrench, or while the level above is lost, all axes rest.
+    A guard that is struck ends the motion: the arm ramps to rest and holds until the level above
+    has another command; axes of force keep their forces. Without a fresh wrench, or while the level
+    above is lost, all axes rest.
 
-    References after that, after the brakes, and after a restart of this board, begin where `status` says that the arm
-    is held. References that go on when axes cease to be of force are followed at the distance that force has left.
+    References after that, after the brakes, and after a restart of this board, begin where `status`
+    says that the arm is held. References that go on when axes cease to be of force are followed at
+    the distance that force has left.
     """
 
     inputs = {
@@ -59,7 +64,9 @@ class HybridExecutor(WristLevel):
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._boards = JointBoards(context.robot.joints)
         self._target: Array = cell.home.copy()  # (joints,), rad: commanded last
-        self._moving = np.zeros(len(cell.home))  # (joints,), rad/s: of the motion alone, without that for forces
+        self._moving = np.zeros(
+            len(cell.home)
+        )  # (joints,), rad/s: of the motion alone, without that for forces
         self._still = np.zeros(len(cell.home))
         self._tick: int | None = None  # of the last cycle
 
@@ -105,7 +112,9 @@ class HybridExecutor(WristLevel):
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every
-        command.position, command.velocity, command.acceleration, command.inertia, command.load = joints
+        command.position, command.velocity, command.acceleration, command.inertia, command.load = (
+            joints
+        )
         self._target, self._moving[:] = joints.position, motion.velocity
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)
@@ -114,7 +123,10 @@ class HybridExecutor(WristLevel):
         """Show the boards below as one, whose set points are those of this level."""
         values = [reading.value for reading in read.statuses.values()]
         status.position = values[0].position
-        status.torque, status.driven = sum(v.torque for v in values), np.any([v.driven for v in values], axis=0)
+        status.torque, status.driven = (
+            sum(v.torque for v in values),
+            np.any([v.driven for v in values], axis=0),
+        )
         status.target = self._target
         status.target_velocity = self._moving
         status.echo = read.command.value.id

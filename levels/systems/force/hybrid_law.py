@@ -1,11 +1,14 @@
-"""The law of hybrid motion/force control: where the joints are to be, some axes of a task frame being of force.
+"""The law of hybrid motion/force control: where the joints are to be, some axes of a task frame
+being of force.
 
-On axes of motion the tool follows the level above; on axes of force it moves with a velocity proportional to the error
-of the force (Raibert and Craig, "Hybrid position/force control of manipulators", 1981, split the axes so; the velocity
-in place of their torque is what suits joints that are servoed in position). The force wanted is fed forward as J^T F.
+On axes of motion the tool follows the level above; on axes of force it moves with a velocity
+proportional to the error of the force (Raibert and Craig, "Hybrid position/force control of
+manipulators", 1981, split the axes so; the velocity in place of their torque is what suits joints
+that are servoed in position). The force wanted is fed forward as J^T F.
 
-The law works on the difference between what it commands and what the level above wants, dq in joint space: with no axis
-of force the difference stays what it is, so the motion goes on without a step, only elsewhere.
+The law works on the difference between what it commands and what the level above wants, dq in joint
+space: with no axis of force the difference stays what it is, so the motion goes on without a step,
+only elsewhere.
 """
 
 from __future__ import annotations
@@ -25,28 +28,35 @@ from rack.levels.systems.force.messages import AXES
 from rack.levels.tables import Positive, Table
 
 DAMPING = 1e-4
-"""Added to J J^T, m2 and 1: a direction in which the arm hardly moves, by less than 0.01 m/s at 1 rad/s, gets less of
-what is wanted, and no joint is asked for more than 50 rad/s for 1 m/s. Elsewhere 0.25 % is missing."""
+"""Added to J J^T, m2 and 1: a direction in which the arm hardly moves, by less than 0.01 m/s at 1
+rad/s, gets less of what is wanted, and no joint is asked for more than 50 rad/s for 1 m/s.
+Elsewhere 0.25 % is missing."""
 CATCH_UP = 20.0
-"""Pace at which an error on an axis of motion is made up, 1/s: it comes from damping and limits alone."""
+"""Pace at which an error on an axis of motion is made up, 1/s: it comes from damping and limits
+alone."""
 
 
 class HybridGains(Table):
     """Gains of the loop around the contact.
 
-    The velocity on an axis of force is `bandwidth` / `stiffness` times the error of the force, smoothed: against a
-    contact of that stiffness the error falls by e in 1 / `bandwidth`. Smoothing is needed because boards that servo
-    joints feed dry friction forward by the sign of a velocity: unsmoothed, at 200 Hz, the PUMA's tool shakes by 14 N.
+    The velocity on an axis of force is `bandwidth` / `stiffness` times the error of the force,
+    smoothed: against a contact of that stiffness the error falls by e in 1 / `bandwidth`. Smoothing
+    is needed because boards that servo joints feed dry friction forward by the sign of a velocity:
+    unsmoothed, at 200 Hz, the PUMA's tool shakes by 14 N.
 
-    Measured with the PUMA and a pad of 16 N/mm, at 200 Hz over 1 kHz: 20 N are reached without overshoot, within 5 %
-    0.2 s after the first contact, and kept within 2 N while the tool slides at 0.1 m/s; a loop 4 times as fast is as
-    good, one 6 times as fast shakes while it slides.
+    Measured with the PUMA and a pad of 16 N/mm, at 200 Hz over 1 kHz: 20 N are reached without
+    overshoot, within 5 % 0.2 s after the first contact, and kept within 2 N while the tool slides
+    at 0.1 m/s; a loop 4 times as fast is as good, one 6 times as fast shakes while it slides.
     """
 
     stiffness: Positive = Field(10_000.0, description="of the stiffest contact, tool included, N/m")
     turning_stiffness: Positive = Field(40.0, description="the same about an axis, N m/rad")
-    bandwidth: Positive = Field(10.0, le=100.0, description="of the force loop against that contact, rad/s")
-    smoothing: Positive = Field(0.03, le=1.0, description="time constant of the velocity on axes of force, s")
+    bandwidth: Positive = Field(
+        10.0, le=100.0, description="of the force loop against that contact, rad/s"
+    )
+    smoothing: Positive = Field(
+        0.03, le=1.0, description="time constant of the velocity on axes of force, s"
+    )
 
 
 class ForceTask(NamedTuple):
@@ -55,7 +65,9 @@ class ForceTask(NamedTuple):
     rotation: Array  # (3, 3), of the task frame in the world
     selected: NDArray[np.bool_]  # (6,), axes of force
     wanted: Array  # (6,), N, N m: of the tool on the surroundings, on axes of force
-    exerted: Array | None  # (6,), N, N m: of the tool on the surroundings; None: not known, so force axes rest
+    exerted: (
+        Array | None
+    )  # (6,), N, N m: of the tool on the surroundings; None: not known, so force axes rest
     speed: Array  # (6,), m/s, rad/s: most on axes of force
 
 
@@ -82,7 +94,9 @@ class ToolKinematics:
         self.terms = self._dynamics.terms(position, velocity, payload)
         model, data = self._dynamics.evaluated
         mujoco.mj_jacSite(model, data, self._whole[:3], self._whole[3:], self._cell.tool)
-        self.jacobian: Array = np.take(self._whole, self._cell.dof, axis=1)  # (6, joints), in the world's frame
+        self.jacobian: Array = np.take(
+            self._whole, self._cell.dof, axis=1
+        )  # (6, joints), in the world's frame
         self.position = data.site_xpos[self._cell.tool].copy()  # (3,), m
         self.quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(self.quaternion, data.site_xmat[self._cell.tool])
@@ -94,19 +108,30 @@ class HybridLaw:
     def __init__(self, cell: Cell, gains: HybridGains) -> None:
         self._limits = cell.limits
         joints = len(cell.dof)
-        self._gain = np.repeat([gains.bandwidth / gains.stiffness, gains.bandwidth / gains.turning_stiffness], 3)
+        self._gain = np.repeat(
+            [gains.bandwidth / gains.stiffness, gains.bandwidth / gains.turning_stiffness], 3
+        )
         self._pace = gains.bandwidth
         self._smoothing_s = gains.smoothing
         self._there = ToolKinematics(cell)
         self._here = ToolKinematics(cell)
-        self._away, self._speed, self._base = np.zeros((3, joints))  # dq, its velocity; dq of a motion without force
+        self._away, self._speed, self._base = np.zeros(
+            (3, joints)
+        )  # dq, its velocity; dq of a motion without force
         self._forward = np.zeros(AXES)  # N, N m: fed forward, in the world's frame
         self._forced = np.zeros(AXES)  # m/s, rad/s: on the axes of force, in the task frame
         self.offset = np.zeros(3)  # (3,), m: from where the motion alone would have the tool
 
     def begin(self) -> None:
         """Begin without a difference from the motion, at rest."""
-        for numbers in (self._away, self._speed, self._base, self._forward, self._forced, self.offset):
+        for numbers in (
+            self._away,
+            self._speed,
+            self._base,
+            self._forward,
+            self._forced,
+            self.offset,
+        ):
             numbers[:] = 0.0
 
     @property
@@ -114,8 +139,11 @@ class HybridLaw:
         """Whether the difference from the motion does not change."""
         return not self._speed.any()
 
-    def step(self, motion: Motion, task: ForceTask | None, passed_s: float, payload: Payload) -> JointCommand:
-        """Return the command for a `motion`, `passed_s` after the last; without a `task` all axes are of motion."""
+    def step(
+        self, motion: Motion, task: ForceTask | None, passed_s: float, payload: Payload
+    ) -> JointCommand:
+        """Return the command for a `motion`, `passed_s` after the last; without a `task` all axes
+        are of motion."""
         q = motion.position
         qd = motion.velocity
         wanted = np.zeros(len(q)) if task is None else self._velocity(motion, task, passed_s) - qd
@@ -133,10 +161,13 @@ class HybridLaw:
         if task is None:
             self._base[:] = self._away
         gained = motion.acceleration + (self._speed - before) / passed_s
-        return JointCommand(position, velocity, gained, *self._loads(task, position, velocity, passed_s, payload))
+        return JointCommand(
+            position, velocity, gained, *self._loads(task, position, velocity, passed_s, payload)
+        )
 
     def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
-        """Return the joint velocities, rad/s, that follow the motion on its axes, and move for force on the others."""
+        """Return the joint velocities, rad/s, that follow the motion on its axes, and move for
+        force on the others."""
         there = self._there
         here = self._here
         there.look(motion.position + self._base, motion.velocity)
@@ -153,16 +184,28 @@ class HybridLaw:
             forced = np.clip(self._gain * (task.wanted - task.exerted), -task.speed, task.speed)
         forced -= self._forced
         self._forced += min(passed_s / self._smoothing_s, 1.0) * forced
-        velocity = damped_inverse(here.jacobian, turned(task.rotation, np.where(task.selected, self._forced, twist)))
+        velocity = damped_inverse(
+            here.jacobian, turned(task.rotation, np.where(task.selected, self._forced, twist))
+        )
         excess = float((np.abs(velocity) / self._limits.velocity).max())
         return velocity / excess if excess > 1.0 else velocity
 
     def _loads(
-        self, task: ForceTask | None, position: Array, velocity: Array, passed_s: float, payload: Payload
+        self,
+        task: ForceTask | None,
+        position: Array,
+        velocity: Array,
+        passed_s: float,
+        payload: Payload,
     ) -> tuple[Array, Array]:
-        """Return inertia and load, N m, there; the force fed forward follows the one wanted at the loop's pace."""
+        """Return inertia and load, N m, there; the force fed forward follows the one wanted at the
+        loop's pace."""
         self._here.look(position, velocity, payload)
-        forward = np.zeros(AXES) if task is None else turned(task.rotation, np.where(task.selected, task.wanted, 0.0))
+        forward = (
+            np.zeros(AXES)
+            if task is None
+            else turned(task.rotation, np.where(task.selected, task.wanted, 0.0))
+        )
         self._forward += min(self._pace * passed_s, 1.0) * (forward - self._forward)
         inertia, bias = self._here.terms
         return inertia.diagonal(), bias + transposed_mat_vec(self._here.jacobian, self._forward)
@@ -171,11 +214,14 @@ class HybridLaw:
 def turned(rotation: Array, vector: Array) -> Array:
     """Return both halves of `vector` (6,) turned by `rotation` (3, 3)."""
     rotation = np.ascontiguousarray(rotation)
-    return np.concatenate((mat_vec(rotation, vector[:3].copy()), mat_vec(rotation, vector[3:].copy())))
+    return np.concatenate(
+        (mat_vec(rotation, vector[:3].copy()), mat_vec(rotation, vector[3:].copy()))
+    )
 
 
 def damped_inverse(jacobian: Array, twist: Array) -> Array:
-    """Return the joint velocities J^T (J J^T + d)^-1 `twist` (6,): finite near singularities, see `DAMPING`."""
+    """Return the joint velocities J^T (J J^T + d)^-1 `twist` (6,): finite near singularities, see
+    `DAMPING`."""
     square = gram(np.ascontiguousarray(jacobian.T))
     square.flat[:: AXES + 1] += DAMPING
     return transposed_mat_vec(jacobian, solve(square, twist))

@@ -1,8 +1,10 @@
-"""The messages of force control: what the wrist senses, what is wanted of a contact, and how the contact is.
+"""The messages of force control: what the wrist senses, what is wanted of a contact, and how the
+contact is.
 
-A task frame has its origin at the tool, and the orientation that the command gives. Of its six axes, three of
-translation and three of rotation, each is either an axis of motion or one of force. Vectors of six are force, N, and
-torque, N m, or velocity, m/s, and angular velocity, rad/s. A wrench is what the surroundings exert on the tool.
+A task frame has its origin at the tool, and the orientation that the command gives. Of its six
+axes, three of translation and three of rotation, each is either an axis of motion or one of force.
+Vectors of six are force, N, and torque, N m, or velocity, m/s, and angular velocity, rad/s. A
+wrench is what the surroundings exert on the tool.
 """
 
 from __future__ import annotations
@@ -21,10 +23,18 @@ WRENCH = MessageType(
     1,
     (
         Field("tick", "i8", "tick", "tick at which it was sensed"),
-        Field("wrench", "f8", "N, N m", "of the contact, at the tool, in the world's frame, without weights", (AXES,)),
+        Field(
+            "wrench",
+            "f8",
+            "N, N m",
+            "of the contact, at the tool, in the world's frame, without weights",
+            (AXES,),
+        ),
         Field("sample", "f8", "N, N m", "as the sensor gives it, in the sensor's frame", (AXES,)),
         Field("saturated", "u1", "1", "1: the sensor is at the end of its range"),
-        Field("exceeded", "u4", "1", "cycles in which the contact was beyond the arm's force limits"),
+        Field(
+            "exceeded", "u4", "1", "cycles in which the contact was beyond the arm's force limits"
+        ),
     ),
 )
 """From the board of an arm with a wrist sensor, in every cycle."""
@@ -36,11 +46,24 @@ COMPLIANCE = command(
     Field("active", "u1", "1", "1: some axis is one of force, or guarded; 0: motion alone"),
     Field("frame", "f8", "1", "orientation of the task frame in the world, w, x, y, z", (4,)),
     Field("selected", "u1", "1", "1: an axis of force; 0: of motion", (AXES,)),
-    Field("wrench", "f8", "N, N m", "wanted of the tool on the surroundings, on the axes of force", (AXES,)),
+    Field(
+        "wrench",
+        "f8",
+        "N, N m",
+        "wanted of the tool on the surroundings, on the axes of force",
+        (AXES,),
+    ),
     Field("speed", "f8", "m/s, rad/s", "most on the axes of force, both ways", (AXES,)),
-    Field("guard", "f8", "N, N m", "wrench, either way, at which motion ends; 0: the axis is not guarded", (AXES,)),
+    Field(
+        "guard",
+        "f8",
+        "N, N m",
+        "wrench, either way, at which motion ends; 0: the axis is not guarded",
+        (AXES,),
+    ),
 )
-"""From the motion server to the level of hybrid control. `id` rises with every change; a guard strikes once an id."""
+"""From the motion server to the level of hybrid control. `id` rises with every change; a guard
+strikes once an id."""
 
 FORCE_STATUS = status(
     "force_status",
@@ -50,7 +73,13 @@ FORCE_STATUS = status(
     Field("wrench", "f8", "N, N m", "of the contact, at the tool, in the task frame", (AXES,)),
     Field("wanted", "f8", "N, N m", "on the axes of force; others 0", (AXES,)),
     Field("selected", "u1", "1", "1: an axis of force", (AXES,)),
-    Field("offset", "f8", "m", "from where the motion alone would have the tool to where it is commanded", (3,)),
+    Field(
+        "offset",
+        "f8",
+        "m",
+        "from where the motion alone would have the tool to where it is commanded",
+        (3,),
+    ),
     Field("struck", "u4", "1", "id of the newest command whose guard was struck; 0: none"),
     Field("axis", "i2", "1", "axis on which that was; -1: none"),
 )
@@ -62,19 +91,41 @@ SERVER_REQUEST = MessageType(
     (
         *MOTION_REQUEST.fields,
         Field("frame", "f8", "1", "task frame of COMPLY and GUARD, as in COMPLIANCE", (4,)),
-        Field("selected", "u1", "1", "of COMPLY, 1: an axis of force; none: motion alone, no guard", (AXES,)),
-        Field("wrench", "f8", "N, N m", "of COMPLY: wanted of the tool on the surroundings", (AXES,)),
-        Field("speed", "f8", "m/s, rad/s", "of COMPLY: most on the axes of force; 0: the level's default", (AXES,)),
-        Field("guard", "f8", "N, N m", "of GUARD: wrench, either way, that ends a segment; 0: not guarded", (AXES,)),
+        Field(
+            "selected",
+            "u1",
+            "1",
+            "of COMPLY, 1: an axis of force; none: motion alone, no guard",
+            (AXES,),
+        ),
+        Field(
+            "wrench", "f8", "N, N m", "of COMPLY: wanted of the tool on the surroundings", (AXES,)
+        ),
+        Field(
+            "speed",
+            "f8",
+            "m/s, rad/s",
+            "of COMPLY: most on the axes of force; 0: the level's default",
+            (AXES,),
+        ),
+        Field(
+            "guard",
+            "f8",
+            "N, N m",
+            "of GUARD: wrench, either way, that ends a segment; 0: not guarded",
+            (AXES,),
+        ),
     ),
 )
 """From a client to a server of force and motion: a `MOTION_REQUEST`, or
 
-- COMPLY: what follows is done with these axes of force. It is done when their forces are as wanted, or, without any,
-  when the arm rests where compliance left it.
-- GUARD: the next of these wrenches ends the request under way, GUARDED; the guard ends with it. Those after it go on.
+- COMPLY: what follows is done with these axes of force. It is done when their forces are as wanted,
+  or, without any, when the arm rests where compliance left it.
+- GUARD: the next of these wrenches ends the request under way, GUARDED; the guard ends with it.
+  Those after it go on.
 
-Kind NONE with id 0 is a sign of life: without one, or a request, the server's client counts as lost.
+Kind NONE with id 0 is a sign of life: without one, or a request, the server's client counts as
+lost.
 """
 
 SERVER_STATE = state_of("server_state", SERVER_REQUEST)
@@ -88,7 +139,9 @@ class Mode(IntEnum):
     FORCE = 1  # some axes are of force
     HELD = 2  # the same without its client: at rest on the axes of motion, for a bounded time
     RELEASING = 3  # the time is over: the forces go to zero
-    RELEASED = 4  # and the arm holds its position; a CANCEL ends this, as it ends HELD and RELEASING
+    RELEASED = (
+        4  # and the arm holds its position; a CANCEL ends this, as it ends HELD and RELEASING
+    )
 
 
 SERVER_STATUS = MessageType(
@@ -100,8 +153,12 @@ SERVER_STATUS = MessageType(
         Field("place", "f8", "m", "tool position as sensed", (3,)),
         Field("quaternion", "f8", "1", "tool orientation as sensed, w, x, y, z", (4,)),
         Field("frame", "f8", "1", "orientation of the task frame, w, x, y, z", (4,)),
-        Field("wrench", "f8", "N, N m", "of the tool on the surroundings, in the task frame", (AXES,)),
-        Field("wanted", "f8", "N, N m", "the same as wanted, on the axes of force; others 0", (AXES,)),
+        Field(
+            "wrench", "f8", "N, N m", "of the tool on the surroundings, in the task frame", (AXES,)
+        ),
+        Field(
+            "wanted", "f8", "N, N m", "the same as wanted, on the axes of force; others 0", (AXES,)
+        ),
         Field("selected", "u1", "1", "1: an axis of force", (AXES,)),
         Field("guarded", "u4", "1", "newest request that a guard has ended; 0: none yet"),
         Field("axis", "i2", "1", "axis on which that was; -1: none yet"),

@@ -19,7 +19,8 @@ MAX_COSINE = 1e-3
 
 
 class FrameConfig(Table):
-    """`[task.frame.<name>]`: a task frame by two of its axes, in the world's frame, of any length."""
+    """`[task.frame.<name>]`: a task frame by two of its axes, in the world's frame, of any
+    length."""
 
     x: Vector = Field(description="its x axis")
     z: Vector = Field(description="its z axis, at a right angle to x")
@@ -30,7 +31,11 @@ class FrameConfig(Table):
         if not lengths > 0.0:
             return "an axis of length 0: no frame"
         cosine = float((np.array(self.x) * self.z).sum()) / lengths
-        return "" if abs(cosine) <= MAX_COSINE else "its axes x and z are not at a right angle: no frame"
+        return (
+            ""
+            if abs(cosine) <= MAX_COSINE
+            else "its axes x and z are not at a right angle: no frame"
+        )
 
     @property
     def quaternion(self) -> Array:
@@ -43,7 +48,8 @@ class FrameConfig(Table):
 
 
 class ContactConfig(Table):
-    """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`; axes that are not named are of motion."""
+    """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`; axes that are not
+    named are of motion."""
 
     frame: str = Field(description="task frame")
     wrench: dict[Axis, Finite] = Field(
@@ -52,7 +58,9 @@ class ContactConfig(Table):
     speed: dict[Axis, Positive] = Field(
         {}, description="most on an axis of force, m/s or rad/s; by axis; default: the server's"
     )
-    guard: dict[Axis, Positive] = Field({}, description="wrench, either way, that ends a motion, N or N m; by axis")
+    guard: dict[Axis, Positive] = Field(
+        {}, description="wrench, either way, that ends a motion, N or N m; by axis"
+    )
 
 
 class Wanted(NamedTuple):
@@ -71,8 +79,11 @@ class ForceProgram(Program):
     frame: dict[str, FrameConfig] = Field({}, description="task frames, by name")
     contact: dict[str, ContactConfig] = Field({}, description="contacts, by name")
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterable[tuple[str, Any, str]]:
-        """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and sensor."""
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterable[tuple[str, Any, str]]:
+        """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and
+        sensor."""
         bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}
         for name, reason in bent.items():
             yield f"frame.{name}", self.frame[name].model_dump(), reason
@@ -83,17 +94,29 @@ class ForceProgram(Program):
     def objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
         """Return why a contact is impossible; empty: it is not."""
         if contact.frame not in self.frame:
-            return f"frame '{contact.frame}' is not in [task.frame]; permitted: {', '.join(self.frame) or 'none'}"
+            return (
+                f"frame '{contact.frame}' is not in [task.frame]; permitted:"
+                f" {', '.join(self.frame) or 'none'}"
+            )
         if robot is None or robot.wrist is None:
             return "the arm has no wrist sensor"
         if idle := [axis for axis in contact.speed if axis not in contact.wrench]:
-            return f"axis {idle[0]} has a speed and no force; axes of force: {', '.join(contact.wrench) or 'none'}"
+            return (
+                f"axis {idle[0]} has a speed and no force; axes of force:"
+                f" {', '.join(contact.wrench) or 'none'}"
+            )
         wanted = self.wanted(contact)
-        return misfit(wanted.frame, (wanted.wrench, wanted.guard), (robot.wrist.most_force, robot.wrist.most_torque))
+        return misfit(
+            wanted.frame,
+            (wanted.wrench, wanted.guard),
+            (robot.wrist.most_force, robot.wrist.most_torque),
+        )
 
     def wanted(self, contact: ContactConfig) -> Wanted:
         """Return a contact as the numbers of a request."""
-        wrench, speed, guard = (by_axis(values) for values in (contact.wrench, contact.speed, contact.guard))
+        wrench, speed, guard = (
+            by_axis(values) for values in (contact.wrench, contact.speed, contact.guard)
+        )
         selected = np.array([name in contact.wrench for name in AXIS_NAMES])
         return Wanted(self.frame[contact.frame].quaternion, selected, wrench, speed, guard)
 

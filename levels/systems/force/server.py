@@ -1,4 +1,5 @@
-"""The executor of a server of force and motion: does a client's requests, and outlives the client."""
+"""The executor of a server of force and motion: does a client's requests, and outlives the
+client."""
 
 from __future__ import annotations
 
@@ -23,11 +24,13 @@ from rack.levels.tables import read_params
 
 
 class ForceServer(WristLevel, TrajectoryExecutor):
-    """A trajectory level above one of hybrid control, which makes axes of a task frame ones of force.
+    """A trajectory level above one of hybrid control, which makes axes of a task frame ones of
+    force.
 
-    A client that falls silent while requests are left, or while axes are of force, is lost: its requests are CANCELLED,
-    and the arm comes to rest on the axes of motion. Forces are held for `hold`, go to zero, and the arm holds where it
-    then is. What comes meanwhile is REFUSED until a CANCEL.
+    A client that falls silent while requests are left, or while axes are of force, is lost: its
+    requests are CANCELLED, and the arm comes to rest on the axes of motion. Forces are held for
+    `hold`, go to zero, and the arm holds where it then is. What comes meanwhile is REFUSED until a
+    CANCEL.
     """
 
     inputs = {
@@ -56,7 +59,9 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         assert wrist is not None, "`misfits` refuses an arm without a sensor"
         self._work.most = wrist.most_force, wrist.most_torque
         self._now = 0  # tick of this cycle
-        self._heard: int | None = None  # tick of the client's last sign of life; None: not yet counted
+        self._heard: int | None = (
+            None  # tick of the client's last sign of life; None: not yet counted
+        )
         self._without, self._since = Mode.MOTION, 0  # mode without a client, and tick since when
         self._sensed = np.array(context.robot.home)  # (joints,), rad
 
@@ -97,7 +102,12 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         """Take over the newest contact; a guard that was struck ends the request under way."""
         status = force.value
         work = self._work
-        answers = force.is_there and not force.is_lost and status.echo == work.contact.id and status.sensed >= 0
+        answers = (
+            force.is_there
+            and not force.is_lost
+            and status.echo == work.contact.id
+            and status.sensed >= 0
+        )
         work.force = status if answers else None
         if answers and status.struck == work.contact.id and work.contact.guard.any():
             work.strike(int(status.axis))
@@ -108,7 +118,9 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         params = self._params
         agenda = self._agenda
         if agenda.error is not Error.CLIENT:
-            if self._passed_s(self._heard) > params.silence and (agenda.held or work.contact.complies):
+            if self._passed_s(self._heard) > params.silence and (
+                agenda.held or work.contact.complies
+            ):
                 self._lose_client()
         elif self._without is Mode.HELD and self._passed_s(self._since) > params.hold:
             work.contact.relax()
@@ -121,7 +133,9 @@ class ForceServer(WristLevel, TrajectoryExecutor):
 
     def _lose_client(self) -> None:
         complies = self._work.contact.complies
-        mode, what = (Mode.HELD, "forces are held") if complies else (Mode.RELEASED, "the position is held")
+        mode, what = (
+            (Mode.HELD, "forces are held") if complies else (Mode.RELEASED, "the position is held")
+        )
         self._work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
         self._enter(mode, f"{what} for {self._params.hold:g} s" if complies else what)
 

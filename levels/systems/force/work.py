@@ -1,4 +1,5 @@
-"""Does the requests of a server of force and motion: those of a trajectory level, COMPLY and GUARD."""
+"""Does the requests of a server of force and motion: those of a trajectory level, COMPLY and
+GUARD."""
 
 from __future__ import annotations
 
@@ -17,28 +18,40 @@ from rack.levels.systems.trajectory.work import MotionTools, RequestWork, Trajec
 from rack.levels.tables import Positive
 
 LEAST = np.array([5.0] * 3 + [0.5] * 3)
-"""N, N m: of a smaller wanted wrench the tolerance is that of these: dry friction and noise do not scale."""
+"""N, N m: of a smaller wanted wrench the tolerance is that of these: dry friction and noise do not
+scale."""
 
 
 class ServerParams(TrajectoryParams):
     """`[board.<name>.params]`: how contacts are judged, and what happens without a client."""
 
-    speed: Positive = Field(0.05, description="most on an axis of force, where a request gives none, m/s")
-    turning: Positive = Field(0.2, description="the same about an axis, rad/s")
-    tolerance: Positive = Field(0.3, le=1.0, description="part of a wanted force by which it may be off")
-    settle: Positive = Field(
-        0.2, description="time for which forces are within it when they are settled, and a COMPLY is done, s"
+    speed: Positive = Field(
+        0.05, description="most on an axis of force, where a request gives none, m/s"
     )
-    reach: Positive = Field(4.0, description="longest time without settled forces, s: then compliance ends")
-    silence: Positive = Field(2.0, description="time without a sign of life after which the client is lost, s")
+    turning: Positive = Field(0.2, description="the same about an axis, rad/s")
+    tolerance: Positive = Field(
+        0.3, le=1.0, description="part of a wanted force by which it may be off"
+    )
+    settle: Positive = Field(
+        0.2,
+        description=(
+            "time for which forces are within it when they are settled, and a COMPLY is done, s"
+        ),
+    )
+    reach: Positive = Field(
+        4.0, description="longest time without settled forces, s: then compliance ends"
+    )
+    silence: Positive = Field(
+        2.0, description="time without a sign of life after which the client is lost, s"
+    )
     hold: Positive = Field(3.0, description="time for which forces are held without a client, s")
 
 
 class ServerWork(RequestWork):
     """Begins and ends compliance, and judges contacts: see `SERVER_REQUEST`.
 
-    Motion begins anew from where the arm is when axes cease to be of force, or are others: the boards below come to
-    rest and hold, and fall into step again.
+    Motion begins anew from where the arm is when axes cease to be of force, or are others: the
+    boards below come to rest and hold, and fall into step again.
     """
 
     boards: JointBoards
@@ -49,9 +62,16 @@ class ServerWork(RequestWork):
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
         self.contact = Contact()
-        self.force: Message | None = None  # FORCE_STATUS that answers the contact in force; None: none does yet
-        self.guarded, self.axis = 0, -1  # newest request that a guard has ended, and the guard's axis
-        self._on_s = self._off_s = 0.0  # time for which all forces are as wanted, and since they were settled
+        self.force: Message | None = (
+            None  # FORCE_STATUS that answers the contact in force; None: none does yet
+        )
+        self.guarded, self.axis = (
+            0,
+            -1,
+        )  # newest request that a guard has ended, and the guard's axis
+        self._on_s = self._off_s = (
+            0.0  # time for which all forces are as wanted, and since they were settled
+        )
 
     def step(self, time_s: float, hold: bool) -> None:
         """Go on to the sample at `time_s`; with `hold`, ramp to rest. Judge the contact."""
@@ -84,7 +104,8 @@ class ServerWork(RequestWork):
             self._begin_anew("the arm comes to rest: compliance ends")
 
     def off(self) -> Array:
-        """Return by how much forces are off, (6,), as parts of what is tolerated; 0 on axes of motion."""
+        """Return by how much forces are off, (6,), as parts of what is tolerated; 0 on axes of
+        motion."""
         contact = self.contact
         force = self.force
         if force is None:
@@ -101,7 +122,8 @@ class ServerWork(RequestWork):
         return params
 
     def _judge(self) -> None:
-        """Count how long forces have been as wanted; end compliance when they have not settled for too long."""
+        """Count how long forces have been as wanted; end compliance when they have not settled for
+        too long."""
         off = self.off()
         current = self.agenda.current
         params = self._params
@@ -113,8 +135,13 @@ class ServerWork(RequestWork):
         if self._off_s > params.reach:
             axis = int(off.argmax())
             felt = 0.0 if self.force is None else -self.force.wrench[axis]
-            wanted = f"axis {AXIS_NAMES[axis]} has not settled at {self.contact.wrench[axis]:g} {UNITS[axis]}"
-            self.drop(RequestEnd.FAILED, f"{wanted} for {params.reach:g} s: {felt:.3g} now", Error.CONTACT)
+            wanted = (
+                f"axis {AXIS_NAMES[axis]} has not settled at {self.contact.wrench[axis]:g}"
+                f" {UNITS[axis]}"
+            )
+            self.drop(
+                RequestEnd.FAILED, f"{wanted} for {params.reach:g} s: {felt:.3g} now", Error.CONTACT
+            )
             self.release()
 
     def _begin_anew(self, why: str) -> None:
@@ -127,7 +154,9 @@ class ServerWork(RequestWork):
         if request.kind == MotionKind.COMPLY:
             return misfit(r["frame"], (r["wrench"],), self.most) if r["selected"].any() else ""
         if request.kind == MotionKind.GUARD:
-            return misfit(r["frame"], (r["guard"],), self.most) or self.contact.objection(r["frame"], r["guard"])
+            return misfit(r["frame"], (r["guard"],), self.most) or self.contact.objection(
+                r["frame"], r["guard"]
+            )
         return super()._misfit(request)
 
     def _start(self, request: MotionRequest) -> None:
@@ -149,7 +178,9 @@ class ServerWork(RequestWork):
     def _is_done(self, current: MotionRequest) -> bool:
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
-        return self.motion.settled and (not self.contact.complies or self.passed_s >= self._params.settle)
+        return self.motion.settled and (
+            not self.contact.complies or self.passed_s >= self._params.settle
+        )
 
     def _lasts_s(self, request: MotionRequest) -> float:
         if request.kind == MotionKind.COMPLY and self.contact.complies:

@@ -18,4 +18,8 @@ class WristLevel(Executor):
         """Yield an arm without a wrist sensor, besides what any level of the kind finds."""
         yield from super().misfits(context, above, below)
         if context.robot.wrist is None:
-            yield "executor", cls.__name__, "it needs a wrist sensor: give the arm a table [robot.wrist]"
+            yield (
+                "executor",
+                cls.__name__,
+                "it needs a wrist sensor: give the arm a table [robot.wrist]",
+            )

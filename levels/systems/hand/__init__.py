@@ -1,4 +1,5 @@
-"""A hand of fingers driven by pairs of tendons: its plant, and its loops from tendon tension to grasp.
+"""A hand of fingers driven by pairs of tendons: its plant, and its loops from tendon tension to
+grasp.
 
 Names are imported on first use: tools that read the messages need not wait for the levels.
 """
@@ -17,7 +18,14 @@ if TYPE_CHECKING:
     from rack.levels.systems.hand.joint_loop import JointLoop
     from rack.levels.systems.hand.tendon_loop import TendonLoop
 
-__all__ = ["FingerExecutor", "FingertipLoop", "GraspExecutor", "HandExecutor", "JointLoop", "TendonLoop"]
+__all__ = [
+    "FingerExecutor",
+    "FingertipLoop",
+    "GraspExecutor",
+    "HandExecutor",
+    "JointLoop",
+    "TendonLoop",
+]
 _PLACES = {
     "rack.levels.systems.hand.executor": ("HandExecutor",),
     "rack.levels.systems.hand.finger": ("FingerExecutor",),

@@ -1,4 +1,5 @@
-"""The executor of a board of a hand: gives its valves the tensions of the boards above, or closes them."""
+"""The executor of a board of a hand: gives its valves the tensions of the boards above, or closes
+them."""
 
 from __future__ import annotations
 
@@ -31,10 +32,10 @@ DEMANDED = "demand '{}' on the hand: valves closed until boards and emergency st
 class HandExecutor(Executor):
     """Drives a hand with the tensions of the boards above: all of its tendons, or none.
 
-    A hand has no brakes, and one that lets go is not safe either. So on a demand, an emergency stop too, on an
-    operator's HOLD, while a board above is lost or late, and while a tension is NaN, the valves close: the grip is kept
-    and moving fingers come to rest, see `SimulatedHand`. They open when all boards above have seen it, with what these
-    want then.
+    A hand has no brakes, and one that lets go is not safe either. So on a demand, an emergency stop
+    too, on an operator's HOLD, while a board above is lost or late, and while a tension is NaN, the
+    valves close: the grip is kept and moving fingers come to rest, see `SimulatedHand`. They open
+    when all boards above have seen it, with what these want then.
     """
 
     inputs = {
@@ -52,11 +53,15 @@ class HandExecutor(Executor):
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         if cell.hand is None:
             raise LevelError("robot.hand is missing: this board drives a hand")
-        self.hand = SimulatedHand(cell, context.scene, context.clock_ns, context.every, context.seed)
+        self.hand = SimulatedHand(
+            cell, context.scene, context.clock_ns, context.every, context.seed
+        )
         self.tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
         self._started = False  # the first cycle has begun
-        self._closed_at: int | None = 0  # tick of the first status that said so; None: the valves are open
+        self._closed_at: int | None = (
+            0  # tick of the first status that said so; None: the valves are open
+        )
         self._opened = False  # the valves have been open on this board, or before it was restarted
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
         self._wrong: Alarm | None = None  # last cycle's finding about a tension
@@ -74,14 +79,23 @@ class HandExecutor(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield every joint that not exactly one board above drives: the one of its finger, or the one of all."""
+        """Yield every joint that not exactly one board above drives: the one of its finger, or the
+        one of all."""
         hand = context.robot.hand
         if hand is None:
-            yield "executor", f"{cls.__module__}:{cls.__name__}", "this board drives a hand; [robot.hand] is missing"
+            yield (
+                "executor",
+                f"{cls.__module__}:{cls.__name__}",
+                "this board drives a hand; [robot.hand] is missing",
+            )
             return
         owners = {joint: finger.name for finger in hand.finger for joint in finger.joints}
         for joint in context.robot.joints:
-            boards = [other.board for other in above if other.params.get("finger", owners[joint]) == owners[joint]]
+            boards = [
+                other.board
+                for other in above
+                if other.params.get("finger", owners[joint]) == owners[joint]
+            ]
             if len(boards) != 1:
                 by = ", ".join(f"'{board}'" for board in boards) or "none"
                 why = f"joint '{joint}' must be commanded by one board; it is commanded by {by}"
@@ -139,7 +153,9 @@ class HandExecutor(Executor):
             found, refused = self.tensions.check()
             self._find(found)
         held = self.orders.standing is Operation.HOLD
-        demanded = DEMANDED.format(self.demand.name.lower()) if self.demand is not Demand.NONE else ""
+        demanded = (
+            DEMANDED.format(self.demand.name.lower()) if self.demand is not Demand.NONE else ""
+        )
         self._waiting = demanded or missing or refused or (HELD if held else "")
         if self._waiting:
             if self._closed_at is None:
@@ -185,6 +201,12 @@ class HandExecutor(Executor):
             status.error = Error.SIMULATION
             status.reason = hand.fault
             return
-        status.state = State.EXECUTING if not closed else State.HOLDING if self._opened else State.IDLE
-        status.error = Error.LIMIT if hand.violations else Error.TOUCHED if hand.touches else Error.NONE
-        status.reason = self._waiting or hand.first_violation or hand.first_touch or self._slack.note
+        status.state = (
+            State.EXECUTING if not closed else State.HOLDING if self._opened else State.IDLE
+        )
+        status.error = (
+            Error.LIMIT if hand.violations else Error.TOUCHED if hand.touches else Error.NONE
+        )
+        status.reason = (
+            self._waiting or hand.first_violation or hand.first_touch or self._slack.note
+        )

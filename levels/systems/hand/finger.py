@@ -1,4 +1,5 @@
-"""All loops of one finger on one board, by the laws of the boards that run one loop of all fingers."""
+"""All loops of one finger on one board, by the laws of the boards that run one loop of all
+fingers."""
 
 from __future__ import annotations
 
@@ -18,7 +19,13 @@ from rack.levels.systems.hand.fingertip_loop import NUMBERS, VELOCITIES, follow_
 from rack.levels.systems.hand.joint_law import JointGains, JointLaw
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.loop import HandLoop
-from rack.levels.systems.hand.messages import FINGER_STATUS, FINGER_TARGET, GRASP_TARGET, HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.messages import (
+    FINGER_STATUS,
+    FINGER_TARGET,
+    GRASP_TARGET,
+    HAND_STATUS,
+    TENSION_COMMAND,
+)
 from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from rack.levels.tables import read_params
 
@@ -30,9 +37,11 @@ class FingerParams(FingertipGains, JointGains, TendonGains):
 
 
 class FingerExecutor(HandLoop):
-    """Drives the tendons of one finger as the grasp loop wants; holds it where it found it until there is a target.
+    """Drives the tendons of one finger as the grasp loop wants; holds it where it found it until
+    there is a target.
 
-    After a restart it holds the finger where it is, or goes on with the newest command of the grasp loop.
+    After a restart it holds the finger where it is, or goes on with the newest command of the grasp
+    loop.
     """
 
     inputs = {
@@ -52,7 +61,9 @@ class FingerExecutor(HandLoop):
         finger = hand.names.index(params.finger)
         self.driven = np.arange(len(hand.names)) == finger
         self._joints = hand.fingers[finger]
-        self._tip = FingertipLaw(FingerKinematics(self.cell, hand), [finger], params, context.period_s)
+        self._tip = FingertipLaw(
+            FingerKinematics(self.cell, hand), [finger], params, context.period_s
+        )
         self._servo = JointLaw(self.cell, self._joints, params)
         self._tendons = TendonLaw(hand, self._joints, params, context)
         self._target = Message(FINGER_TARGET.dtype(context.sizes))
@@ -68,7 +79,8 @@ class FingerExecutor(HandLoop):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield a finger that the hand does not have, in addition to a lack of a hand or of neighbours."""
+        """Yield a finger that the hand does not have, in addition to a lack of a hand or of
+        neighbours."""
         yield from super().misfits(context, above, below)
         hand = context.robot.hand
         name = read_params(FingerParams, context.params).finger

@@ -1,4 +1,5 @@
-"""The fingers as the grasp loop sees them: the boards below, one for all fingers or one a finger, as one."""
+"""The fingers as the grasp loop sees them: the boards below, one for all fingers or one a finger,
+as one."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from rack.levels.messages import Error
 
 
 class FingersBelow:
-    """Merges `FINGER_STATUS`es; each board fills what is its own. Points and forces are in the frame of the palm."""
+    """Merges `FINGER_STATUS`es; each board fills what is its own. Points and forces are in the
+    frame of the palm."""
 
     def __init__(self, context: LevelContext, fingers: Sequence[NDArray[np.int_]]) -> None:
         """`fingers` are the joints of each finger, as indices of `robot.joints`."""

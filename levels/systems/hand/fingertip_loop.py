@@ -1,4 +1,5 @@
-"""The fingertip loop: targets of all joints of a hand, from what the grasp loop wants of its fingers."""
+"""The fingertip loop: targets of all joints of a hand, from what the grasp loop wants of its
+fingers."""
 
 from __future__ import annotations
 
@@ -10,7 +11,13 @@ from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.systems.hand.fingertip_law import FingertipGains, FingertipLaw
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.loop import HandLoop
-from rack.levels.systems.hand.messages import FINGER_STATUS, FINGER_TARGET, GRASP_TARGET, HAND_STATUS, LOOP_STATUS
+from rack.levels.systems.hand.messages import (
+    FINGER_STATUS,
+    FINGER_TARGET,
+    GRASP_TARGET,
+    HAND_STATUS,
+    LOOP_STATUS,
+)
 from rack.levels.tables import read_params
 
 NUMBERS = ("position", "velocity", "tip", "tip_velocity", "stiffness", "force")
@@ -56,8 +63,11 @@ class FingertipLoop(HandLoop):
         follow_grasp(self, self._law, hand, write.command, write.status, tick)
 
 
-def follow_grasp(loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int) -> None:
-    """Fill a `FINGER_TARGET` for the `GRASP_TARGET` that a loop follows, and the `FINGER_STATUS`."""
+def follow_grasp(
+    loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int
+) -> None:
+    """Fill a `FINGER_TARGET` for the `GRASP_TARGET` that a loop follows, and the
+    `FINGER_STATUS`."""
     status.tip = law.sense(hand.position)
     target.active = loop.command.active
     if loop.command.active:

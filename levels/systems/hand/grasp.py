@@ -1,4 +1,5 @@
-"""The grasp loop: does a program of steps, from the open hand around an object to the open hand again."""
+"""The grasp loop: does a program of steps, from the open hand around an object to the open hand
+again."""
 
 from __future__ import annotations
 
@@ -42,10 +43,10 @@ NO_PLAN = "no plan of the grasp yet: waiting for one from '{}'"
 class GraspExecutor(Executor):
     """Does the steps of a program in their order; the fingers keep what they do while it waits.
 
-    It waits while a finger does not follow, and on an operator's hold; then the step under way goes on. A step that
-    fails, or waits for too long, ends the program with an error: the fingers stay. With a planner above, the posture
-    before a CLOSE, its points and the grip after it are those of the newest plan. After a restart it continues from its
-    own last messages.
+    It waits while a finger does not follow, and on an operator's hold; then the step under way goes
+    on. A step that fails, or waits for too long, ends the program with an error: the fingers stay.
+    With a planner above, the posture before a CLOSE, its points and the grip after it are those of
+    the newest plan. After a restart it continues from its own last messages.
     """
 
     inputs = {
@@ -56,7 +57,10 @@ class GraspExecutor(Executor):
         "last_status": Input(GRASP_STATUS, "own.status"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"command": Output(GRASP_TARGET, rests_on="fingers"), "status": Output(GRASP_STATUS, rests_on="fingers")}
+    outputs = {
+        "command": Output(GRASP_TARGET, rests_on="fingers"),
+        "status": Output(GRASP_STATUS, rests_on="fingers"),
+    }
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = GraspParams
     program = GraspProgram
@@ -95,7 +99,8 @@ class GraspExecutor(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield a robot without a hand, and every finger that not exactly one board below drives."""
+        """Yield a robot without a hand, and every finger that not exactly one board below
+        drives."""
         hand = context.robot.hand
         if hand is None:
             yield "executor", cls.__name__, "it drives a hand; there is no [robot.hand]"
@@ -105,13 +110,18 @@ class GraspExecutor(Executor):
             boards = [board.board for board in below if board.params.get("finger", name) == name]
             if len(boards) != 1:
                 by = ", ".join(f"'{board}'" for board in boards) or "none"
-                yield "below", list(context.below), f"finger '{name}' needs one board that drives it; it has: {by}"
+                yield (
+                    "below",
+                    list(context.below),
+                    f"finger '{name}' needs one board that drives it; it has: {by}",
+                )
         steps = GraspProgram.model_validate(dict(context.task)).step
         if not above and any(isinstance(step, CloseStep) and not step.points for step in steps):
             yield "above", [], "a step 'close' without points needs a planner of grasps there"
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Look at fingers and object, go on with the step under way, write what is wanted, report."""
+        """Look at fingers and object, go on with the step under way, write what is wanted,
+        report."""
         grasp = self._grasp
         self._orders.take(read.operator)
         grasp.fingers.look(read.fingers)
@@ -150,7 +160,8 @@ class GraspExecutor(Executor):
         return position
 
     def _closing(self) -> CloseStep | None:
-        """Return the newest step that has closed, or closes, on an object; None: there is none yet."""
+        """Return the newest step that has closed, or closes, on an object; None: there is none
+        yet."""
         steps = self._program.step[: self._done + 1]
         return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
 
@@ -172,7 +183,9 @@ class GraspExecutor(Executor):
         is_over = self._done == len(self._program.step) or self._orders.standing is Operation.HOLD
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
         if self._waited_s > self._grasp.params.stalled and not self._failed.code:
-            self._failed = Refused(Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}")
+            self._failed = Refused(
+                Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}"
+            )
 
     @staticmethod
     def _newest(plans: Mapping[str, Reading]) -> Message:
@@ -221,7 +234,8 @@ class GraspExecutor(Executor):
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepared(self, index: int) -> Step:
-        """Return a step of the program with what the plan says, and with ways in the frame of the palm."""
+        """Return a step of the program with what the plan says, and with ways in the frame of the
+        palm."""
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):
@@ -232,7 +246,9 @@ class GraspExecutor(Executor):
             return step
         if isinstance(step, CloseStep):
             inside = plan.contact + step.depth * plan.normal
-            points = {name: tuple(point) for name, point in zip(self._grasp.names, inside, strict=True)}
+            points = {
+                name: tuple(point) for name, point in zip(self._grasp.names, inside, strict=True)
+            }
             return step.model_copy(update={"points": points})
         after = self._program.step[index - 1] if isinstance(step, SqueezeStep) else None
         if isinstance(after, CloseStep):
@@ -276,7 +292,9 @@ class GraspExecutor(Executor):
         status.passed = self._passed_s
         status.touching = grasp.touching
         status.grip = grasp.grip.force
-        status.object = -1 if grasp.close is None else self.context.scene.objects.index(grasp.close.object)
+        status.object = (
+            -1 if grasp.close is None else self.context.scene.objects.index(grasp.close.object)
+        )
         status.load = grasp.grip.load
         status.anchor = grasp.anchor
         status.plan = self._plan.id

@@ -1,9 +1,11 @@
-"""Plans grasps: where the tips of a hand take hold of an object, one finger opposed to all others, and from where.
+"""Plans grasps: where the tips of a hand take hold of an object, one finger opposed to all others,
+and from where.
 
-The fingers press along one line, from one side, the opposing finger from the other. Lines in all directions across the
-fingers' knuckles are tried. Rays give contacts on the object's surface, inverse kinematics the joints. A line is
-possible if all tips reach their contacts, and if the hand touches nothing before; of those the one counts whose joints
-are farthest from the ends of their ranges.
+The fingers press along one line, from one side, the opposing finger from the other. Lines in all
+directions across the fingers' knuckles are tried. Rays give contacts on the object's surface,
+inverse kinematics the joints. A line is possible if all tips reach their contacts, and if the hand
+touches nothing before; of those the one counts whose joints are farthest from the ends of their
+ranges.
 """
 
 from __future__ import annotations
@@ -35,10 +37,15 @@ OUTSIDE_M = 0.2
 class GraspRules(Table):
     """What a planned grasp is to be."""
 
-    pad: Positive = Field(0.009, description="distance of a tip's site from the surface that the tip touches, m")
-    clear: Positive = Field(0.02, description="distance from the object at which tips begin to close, m")
+    pad: Positive = Field(
+        0.009, description="distance of a tip's site from the surface that the tip touches, m"
+    )
+    clear: Positive = Field(
+        0.02, description="distance from the object at which tips begin to close, m"
+    )
     pull: NotNegative = Field(
-        2.0, description="force on the object, in addition to its weight, that friction must bear, N"
+        2.0,
+        description="force on the object, in addition to its weight, that friction must bear, N",
     )
     reserve: Positive = Field(1.5, ge=1.0, description="by how much more it could bear")
 
@@ -55,13 +62,17 @@ class PlannedGrasp:
 
 
 class GraspPlanner:
-    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError` without one."""
+    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError`
+    without one."""
 
     def __init__(self, cell: Cell, opposing: str, rules: GraspRules) -> None:
         assert cell.hand is not None, "a cell with a hand"
         names = cell.hand.names
         if opposing not in names:
-            raise LevelError(f"params.opposing = {opposing}: the hand has no such finger; fingers: {', '.join(names)}")
+            raise LevelError(
+                f"params.opposing = {opposing}: the hand has no such finger; fingers:"
+                f" {', '.join(names)}"
+            )
         self._cell = cell
         self._rules = rules
         self._kinematics = FingerKinematics(cell, cell.hand)
@@ -69,13 +80,18 @@ class GraspPlanner:
         self._palm = self._data.site_xmat[cell.tool].reshape(3, 3).copy()
         self._origin = self._data.site_xpos[cell.tool].copy()
         bases = [int(np.flatnonzero(row)[0]) for row in cell.hand.fingers]
-        self._bases = [self._data.xanchor[self._joint(base)].copy() for base in bases]  # (3,), m, of each finger
+        self._bases = [
+            self._data.xanchor[self._joint(base)].copy() for base in bases
+        ]  # (3,), m, of each finger
 
     def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
-        """Return a grasp of the object in a row of the scene at a pose in the world; None if no line is possible."""
+        """Return a grasp of the object in a row of the scene at a pose in the world; None if no
+        line is possible."""
         self._place(row, position, quaternion)
         found = (self._along(row, 2.0 * math.pi * number / LINES) for number in range(LINES))
-        return max((one for one in found if one is not None), key=lambda one: one.margin, default=None)
+        return max(
+            (one for one in found if one is not None), key=lambda one: one.margin, default=None
+        )
 
     def _place(self, row: int, position: Array, quaternion: Array) -> None:
         at = self._cell.object_qpos[row]
@@ -96,7 +112,9 @@ class GraspPlanner:
                 return None
             contact[finger], normal[finger] = touched, way
         closed = self._reach(contact - self._rules.pad * normal)
-        open_ = None if closed is None else self._reach(contact - self._rules.clear * normal, closed)
+        open_ = (
+            None if closed is None else self._reach(contact - self._rules.clear * normal, closed)
+        )
         if closed is None or open_ is None or self._touches(open_):
             return None
         low, high = self._cell.limits.position.T
@@ -113,7 +131,8 @@ class GraspPlanner:
         )
 
     def _touched(self, row: int, base: Array, way: Array) -> Array | None:
-        """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it does not."""
+        """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it
+        does not."""
         model = self._cell.model
         data = self._data
         body = self._cell.bodies[row]
@@ -122,17 +141,22 @@ class GraspPlanner:
         centre = centre + float(((base - centre) * along).sum()) * along
         start = centre - OUTSIDE_M * way
         nearest = math.inf
-        for own in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
+        for own in range(
+            model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]
+        ):
             if not model.geom_contype[own]:
                 continue
             size = model.geom_size[own]
             kind = int(model.geom_type[own])
-            distance = mujoco.mju_rayGeom(data.geom_xpos[own], data.geom_xmat[own], size, start, way, kind, None)
+            distance = mujoco.mju_rayGeom(
+                data.geom_xpos[own], data.geom_xmat[own], size, start, way, kind, None
+            )
             nearest = min(nearest, distance if distance >= 0.0 else math.inf)
         return None if nearest > OUTSIDE_M else start + nearest * way
 
     def _reach(self, tips: Array, start: Array | None = None) -> Array | None:
-        """Return joint positions, (joints,), rad, at which the tips are at points of the world, (fingers, 3), m."""
+        """Return joint positions, (joints,), rad, at which the tips are at points of the world,
+        (fingers, 3), m."""
         kinematics = self._kinematics
         position = (self._cell.home if start is None else start).copy()
         wanted = [transposed_mat_vec(self._palm, point - self._origin) for point in tips]
@@ -144,7 +168,9 @@ class GraspPlanner:
                 return position
             for finger, (way, length) in enumerate(zip(ways, lengths, strict=True)):
                 homing = np.zeros(len(kinematics.joints[finger]))
-                kinematics.step(finger, position, way * min(1.0, STEP_M / max(length, STEP_M)), homing)
+                kinematics.step(
+                    finger, position, way * min(1.0, STEP_M / max(length, STEP_M)), homing
+                )
         return None
 
     def _touches(self, position: Array) -> bool:
@@ -157,13 +183,18 @@ class GraspPlanner:
         return bool((hand & (data.contact.dist < 0.0)).any())
 
     def _grip(self, row: int) -> float:
-        """Return the force of each finger, N, with which friction on both sides bears weight and pull."""
+        """Return the force of each finger, N, with which friction on both sides bears weight and
+        pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
         first = model.body_geomadr[body]
         friction = float(model.geom_friction[first : first + model.body_geomnum[body], 0].max())
         weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
-        return self._rules.reserve * (weight + self._rules.pull) / (2.0 * friction * (len(self._bases) - 1))
+        return (
+            self._rules.reserve
+            * (weight + self._rules.pull)
+            / (2.0 * friction * (len(self._bases) - 1))
+        )
 
     def _joint(self, number: int) -> int:
         return int(np.flatnonzero(self._cell.model.jnt_qposadr == self._cell.qpos[number])[0])

@@ -1,4 +1,5 @@
-"""A program of a grasp, in `[task]`: named postures of the fingers, and steps from the open hand to the open hand."""
+"""A program of a grasp, in `[task]`: named postures of the fingers, and steps from the open hand to
+the open hand."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class PreshapeStep(Table):
 
 
 class CloseStep(Table):
-    """Move the tips evenly towards points in an object until each touches it; a tip that arrives there has missed.
+    """Move the tips evenly towards points in an object until each touches it; a tip that arrives
+    there has missed.
 
     Without points, they and the fingers are those of a plan from the level above.
     """
@@ -32,9 +34,15 @@ class CloseStep(Table):
     do: Literal["close"] = Field("close", description="the kind of step")
     object: str = Field(description="object of the scene")
     points: Mapping[str, Vector] = Field(
-        {}, description="where the tips would go if nothing were in the way, in the object's frame, m, by finger"
+        {},
+        description=(
+            "where the tips would go if nothing were in the way, in the object's frame, m, by"
+            " finger"
+        ),
     )
-    depth: Positive = Field(0.01, le=0.2, description="distance of such a point from a planned contact, inwards, m")
+    depth: Positive = Field(
+        0.01, le=0.2, description="distance of such a point from a planned contact, inwards, m"
+    )
     speed: Positive = Field(0.03, le=1.0, description="of the tip with the longest way, m/s")
     touch: Positive = Field(0.3, description="force at which a tip touches the object, N")
     seconds: Positive = Field(3.0, description="time by which all must touch it, s")
@@ -44,7 +52,9 @@ class SqueezeStep(Table):
     """Raise the internal forces of the grasp."""
 
     do: Literal["squeeze"] = Field("squeeze", description="the kind of step")
-    grip: Positive = Field(description="force of the finger that opposes the others, which share it, N")
+    grip: Positive = Field(
+        description="force of the finger that opposes the others, which share it, N"
+    )
     seconds: Positive = Field(0.5, description="time in which they rise, s")
 
 
@@ -80,41 +90,72 @@ class GraspProgram(Program):
     """Postures and steps."""
 
     opposing: str = Field("thumb", description="the finger that opposes all others")
-    posture: Mapping[str, Posture] = Field({}, description="joint positions of every finger, rad, by posture")
+    posture: Mapping[str, Posture] = Field(
+        {}, description="joint positions of every finger, rad, by posture"
+    )
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field(
         (), max_length=MAX_STEPS, description="steps, done in their order"
     )
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
-        """Yield key, value and reason of everything that the hand or the scene lacks, and of steps out of order."""
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterator[tuple[str, Any, str]]:
+        """Yield key, value and reason of everything that the hand or the scene lacks, and of steps
+        out of order."""
         if robot is None or robot.hand is None:
             return
         hand = robot.hand
         names = [finger.name for finger in hand.finger]
         if self.opposing not in names:
-            yield "opposing", self.opposing, f"the hand has no such finger; fingers: {', '.join(names)}"
+            yield (
+                "opposing",
+                self.opposing,
+                f"the hand has no such finger; fingers: {', '.join(names)}",
+            )
         for name, posture in self.posture.items():
             yield from _misfits_of_posture(f"posture.{name}", posture, hand)
         gripped = False
         for k, step in enumerate(self.step):
             if isinstance(step, PreshapeStep) and step.posture not in self.posture:
-                yield f"step[{k}].posture", step.posture, f"no such posture; postures: {_listed(self.posture)}"
+                yield (
+                    f"step[{k}].posture",
+                    step.posture,
+                    f"no such posture; postures: {_listed(self.posture)}",
+                )
             if isinstance(step, CloseStep):
                 yield from _misfits_of_close(f"step[{k}]", step, self.opposing, names, scene)
             if isinstance(step, GRIPPING) and not gripped:
-                yield f"step[{k}].do", step.do, "it needs an object in the fingers: a 'close' must come before it"
+                yield (
+                    f"step[{k}].do",
+                    step.do,
+                    "it needs an object in the fingers: a 'close' must come before it",
+                )
             if gripped and isinstance(step, (PreshapeStep, CloseStep)):
-                yield f"step[{k}].do", step.do, "the fingers have an object: a 'release' must come before it"
+                yield (
+                    f"step[{k}].do",
+                    step.do,
+                    "the fingers have an object: a 'release' must come before it",
+                )
             gripped = isinstance(step, CloseStep) or (gripped and not isinstance(step, ReleaseStep))
 
 
-def _misfits_of_posture(key: str, posture: Posture, hand: HandConfig) -> Iterator[tuple[str, Any, str]]:
+def _misfits_of_posture(
+    key: str, posture: Posture, hand: HandConfig
+) -> Iterator[tuple[str, Any, str]]:
     names = {finger.name: len(finger.joints) for finger in hand.finger}
     for name, values in posture.items():
         if name not in names:
-            yield f"{key}.{name}", list(values), f"the hand has no such finger; fingers: {', '.join(names)}"
+            yield (
+                f"{key}.{name}",
+                list(values),
+                f"the hand has no such finger; fingers: {', '.join(names)}",
+            )
         elif len(values) != names[name]:
-            yield f"{key}.{name}", list(values), f"{len(values)} values; permitted: {names[name]}, one per joint"
+            yield (
+                f"{key}.{name}",
+                list(values),
+                f"{len(values)} values; permitted: {names[name]}, one per joint",
+            )
     if missing := [name for name in names if name not in posture]:
         yield key, list(posture), f"it lacks: {', '.join(missing)}"
 
@@ -126,9 +167,17 @@ def _misfits_of_close(
         yield f"{key}.object", step.object, f"not in the scene; objects: {_listed(scene.objects)}"
     for name in step.points:
         if name not in names:
-            yield f"{key}.points.{name}", name, f"the hand has no such finger; fingers: {', '.join(names)}"
+            yield (
+                f"{key}.points.{name}",
+                name,
+                f"the hand has no such finger; fingers: {', '.join(names)}",
+            )
     if step.points and (opposing not in step.points or len(step.points) < 2):
-        yield f"{key}.points", list(step.points), f"it needs the opposing finger, '{opposing}', and another one"
+        yield (
+            f"{key}.points",
+            list(step.points),
+            f"it needs the opposing finger, '{opposing}', and another one",
+        )
 
 
 def _listed(names: Any) -> str:

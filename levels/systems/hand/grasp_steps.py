@@ -1,7 +1,9 @@
-"""The steps of a grasp at work: from what is sensed of fingers and object, what is wanted of the fingers next.
+"""The steps of a grasp at work: from what is sensed of fingers and object, what is wanted of the
+fingers next.
 
-A step is begun once, and again after a restart of its board: from where the fingers are, with the time that it was
-under way. Its `do` returns whether it is done, and raises `Refused` when it has failed.
+A step is begun once, and again after a restart of its board: from where the fingers are, with the
+time that it was under way. Its `do` returns whether it is done, and raises `Refused` when it has
+failed.
 """
 
 from __future__ import annotations
@@ -40,18 +42,27 @@ SLIPPED_PART = 0.2
 class GraspParams(GripGains):
     """`[board.<name>.params]` of a grasp loop."""
 
-    astray: Positive = Field(0.03, description="distance from a posture at which a joint has reached it, rad")
-    patience: Positive = Field(1.0, description="time in excess of its own after which a step has failed, s")
+    astray: Positive = Field(
+        0.03, description="distance from a posture at which a joint has reached it, rad"
+    )
+    patience: Positive = Field(
+        1.0, description="time in excess of its own after which a step has failed, s"
+    )
     stalled: Positive = Field(
         60.0, description="time of waiting, other than for an operator, that fails the program, s"
     )
-    lost: Positive = Field(0.2, description="time without touch after which a finger has lost the object, s")
-    tolerance: Positive = Field(0.02, description="distance of a gripped object from its place: it is lost, m")
+    lost: Positive = Field(
+        0.2, description="time without touch after which a finger has lost the object, s"
+    )
+    tolerance: Positive = Field(
+        0.02, description="distance of a gripped object from its place: it is lost, m"
+    )
 
 
 @dataclass
 class Grasp:
-    """What the steps share: the fingers as sensed, the object, and what is wanted. Points are in the palm's frame."""
+    """What the steps share: the fingers as sensed, the object, and what is wanted. Points are in
+    the palm's frame."""
 
     params: GraspParams
     names: tuple[str, ...]  # of the fingers
@@ -90,7 +101,8 @@ class StepWork(ABC):
         """Fill the target, `passed_s` after the step began; return whether it is done."""
 
     def progress(self, passed_s: float) -> tuple[float, float]:
-        """Return the part of what was left at the beginning that is done by now, 0 to 1, and its rate, 1/s."""
+        """Return the part of what was left at the beginning that is done by now, 0 to 1, and its
+        rate, 1/s."""
         part, rate = least_jerk(passed_s / self.step.seconds)
         before, _ = least_jerk(self.begun_s / self.step.seconds)
         if before >= 1.0:
@@ -99,7 +111,8 @@ class StepWork(ABC):
 
 
 def least_jerk(time: float) -> tuple[float, float]:
-    """Return the way, 0 to 1, at `time`, 0 to 1, of the motion of least jerk (Flash and Hogan, 1985), and its rate."""
+    """Return the way, 0 to 1, at `time`, 0 to 1, of the motion of least jerk (Flash and Hogan,
+    1985), and its rate."""
     x = min(max(time, 0.0), 1.0)
     return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x), 30.0 * x * x * (1.0 - x) * (1.0 - x)
 
@@ -130,13 +143,17 @@ class PreshapeWork(StepWork):
             return part >= 1.0
         if passed_s > self.step.seconds + grasp.params.patience:
             joint = int(away.argmax())
-            far = f"joint '{grasp.joints[joint]}' is {away[joint]:.2g} rad from posture '{self.step.posture}'"
+            far = (
+                f"joint '{grasp.joints[joint]}' is {away[joint]:.2g} rad from posture"
+                f" '{self.step.posture}'"
+            )
             raise Refused(Error.FOLLOWING, f"{far}: it is in the way of something, or too weak")
         return False
 
 
 class CloseWork(StepWork):
-    """Moves tips evenly towards points in the object, until each touches it; one that touches stays, and presses."""
+    """Moves tips evenly towards points in the object, until each touches it; one that touches
+    stays, and presses."""
 
     kind = GraspKind.CLOSE
     step: CloseStep
@@ -151,7 +168,9 @@ class CloseWork(StepWork):
             inside = grasp.object @ Pose(np.array(point), np.array([1.0, 0.0, 0.0, 0.0]))
             self._ways[finger] = inside.position - self._start[finger]
         self._seconds = max(norm(way) for way in self._ways) / step.speed
-        self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])  # N: with which the opposing one presses
+        self._touch = step.touch / min(
+            grasp.grip.shares[grasp.grip.fingers]
+        )  # N: with which the opposing one presses
 
     def do(self, passed_s: float) -> bool:
         """Move the tips."""
@@ -171,7 +190,10 @@ class CloseWork(StepWork):
         missing = [grasp.names[finger] for finger in np.flatnonzero(closing & ~grasp.touching)]
         at_the_end = passed_s - self.begun_s > self._seconds + grasp.params.patience
         if missing and (at_the_end or passed_s > self.step.seconds):
-            raise Refused(Error.GRASP_MISSED, f"missed '{self.step.object}': touched nothing: {', '.join(missing)}")
+            raise Refused(
+                Error.GRASP_MISSED,
+                f"missed '{self.step.object}': touched nothing: {', '.join(missing)}",
+            )
         grasp.base = grasp.grip.force = self._touch
         return not missing
 
@@ -179,17 +201,23 @@ class CloseWork(StepWork):
         """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
         target = self.grasp.target
         grasp = self.grasp
-        target.mode[finger], target.stiffness[finger] = FingerMode.FORCE, grasp.grip.stiffness[finger]
+        target.mode[finger], target.stiffness[finger] = (
+            FingerMode.FORCE,
+            grasp.grip.stiffness[finger],
+        )
         target.tip[finger], target.tip_velocity[finger] = grasp.fingers.tip[finger], 0.0
         target.force[finger] = force
 
 
 class GrippingWork(StepWork):
-    """Base of the steps while the fingers have the object: they keep the grip, and notice when it is lost."""
+    """Base of the steps while the fingers have the object: they keep the grip, and notice when it
+    is lost."""
 
     def __init__(self, grasp: Grasp, step: Step, passed_s: float) -> None:
         super().__init__(grasp, step, passed_s)
-        self._silent_s = np.zeros(len(grasp.names))  # (fingers,), s: time for which one has not touched
+        self._silent_s = np.zeros(
+            len(grasp.names)
+        )  # (fingers,), s: time for which one has not touched
 
     def keep(self) -> None:
         """Press with the grip that the load asks for; raises `Refused` when the object is lost."""
@@ -213,19 +241,30 @@ class GrippingWork(StepWork):
         params = self.grasp.params
         close = self.grasp.close
         assert close is not None, "checked with the program"
-        silent = np.array([norm(force) < SLIPPED_PART * close.touch for force in grasp.fingers.force])
+        silent = np.array(
+            [norm(force) < SLIPPED_PART * close.touch for force in grasp.fingers.force]
+        )
         self._silent_s[:] = np.where(silent, self._silent_s + grasp.period_s, 0.0)
         grasp.touching[:] = grasp.grip.fingers & (self._silent_s < params.lost)
-        without = [grasp.names[finger] for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching)]
+        without = [
+            grasp.names[finger] for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching)
+        ]
         if without:
-            raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': no longer touched by {', '.join(without)}")
+            raise Refused(
+                Error.OBJECT_LOST,
+                f"lost '{close.object}': no longer touched by {', '.join(without)}",
+            )
         if grasp.moved > params.tolerance:
-            far = f"{1e3 * grasp.moved:.1f} mm from its place; permitted: {1e3 * params.tolerance:g} mm"
+            far = (
+                f"{1e3 * grasp.moved:.1f} mm from its place; permitted:"
+                f" {1e3 * params.tolerance:g} mm"
+            )
             raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': {far}")
 
 
 class SqueezeWork(GrippingWork):
-    """Raises the grip. The object settles between the fingers meanwhile: its place is where it is afterwards."""
+    """Raises the grip. The object settles between the fingers meanwhile: its place is where it is
+    afterwards."""
 
     kind = GraspKind.SQUEEZE
     step: SqueezeStep
@@ -244,7 +283,8 @@ class SqueezeWork(GrippingWork):
 
 
 class ShiftWork(GrippingWork):
-    """Moves the place of the object, and the points of the tips with it; `by` is a way in the palm's frame."""
+    """Moves the place of the object, and the points of the tips with it; `by` is a way in the
+    palm's frame."""
 
     kind = GraspKind.SHIFT
     step: ShiftStep
@@ -308,7 +348,10 @@ class ReleaseWork(StepWork):
         for finger in np.flatnonzero(grasp.grip.fingers):
             way = self.step.way * self._out[finger]
             target.mode[finger], target.force[finger] = FingerMode.POINT, 0.0
-            target.tip[finger], target.tip_velocity[finger] = self._start[finger] + part * way, rate / half * way
+            target.tip[finger], target.tip_velocity[finger] = (
+                self._start[finger] + part * way,
+                rate / half * way,
+            )
         return part >= 1.0
 
 

@@ -1,12 +1,14 @@
-"""The law of the joints: torques that make every joint's error that of a damped oscillator, as stiff as is wanted.
+"""The law of the joints: torques that make every joint's error that of a damped oscillator, as
+stiff as is wanted.
 
-torque = M(q) (2 d w (qd_wanted - qd) + s w^2 e) + S e + torque of tip forces + weight(q) + friction(qd_wanted)
+torque = M(q) (2 d w (qd_wanted - qd) + s w^2 e) + S e + torque of tip forces + weight(q) +
+friction(qd_wanted)
 
-e = q_wanted - q. `s`, 0 to 1 a joint, is the part of the stiffness that acts; S is that of tips which are springs. The
-damping always acts, so a finger that only exerts a force is still slow. The weight of a finger is small, but at a joint
-that is soft it would cost degrees. Viscous friction is fed forward for the velocity wanted, not for the one sensed:
-what damps is not cancelled. The sample is taken on to when the torque acts, a valve's lag included, at the velocity
-sensed.
+e = q_wanted - q. `s`, 0 to 1 a joint, is the part of the stiffness that acts; S is that of tips
+which are springs. The damping always acts, so a finger that only exerts a force is still slow. The
+weight of a finger is small, but at a joint that is soft it would cost degrees. Viscous friction is
+fed forward for the velocity wanted, not for the one sensed: what damps is not cancelled. The sample
+is taken on to when the torque acts, a valve's lag included, at the velocity sensed.
 """
 
 from __future__ import annotations
@@ -29,9 +31,15 @@ from rack.levels.tables import NotNegative, Positive, Table
 class JointGains(Table):
     """Gains of the joint loop."""
 
-    bandwidth: Positive = Field(35.0, le=400.0, description="natural frequency of the error in every joint, rad/s")
-    damping: Positive = Field(0.7, le=5.0, description="damping ratio that the loop adds to the friction of joints")
-    ahead: NotNegative = Field(0.006, le=0.1, description="time from a command of tensions until they have come, s")
+    bandwidth: Positive = Field(
+        35.0, le=400.0, description="natural frequency of the error in every joint, rad/s"
+    )
+    damping: Positive = Field(
+        0.7, le=5.0, description="damping ratio that the loop adds to the friction of joints"
+    )
+    ahead: NotNegative = Field(
+        0.006, le=0.1, description="time from a command of tensions until they have come, s"
+    )
 
 
 class JointLaw:
@@ -42,7 +50,12 @@ class JointLaw:
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))
         self._constants = np.zeros((4, len(driven)))  # in the rows of `set_joint_torques`
-        self._constants[:] = self._dynamics.dry, cell.model.dof_damping[cell.dof], cell.bounds.torque, driven
+        self._constants[:] = (
+            self._dynamics.dry,
+            cell.model.dof_damping[cell.dof],
+            cell.bounds.torque,
+            driven,
+        )
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
         self._state: Array = np.zeros(0)  # numbers of a status of the hand, and of a target
@@ -58,7 +71,8 @@ class JointLaw:
         self._spring = target.spring
 
     def torques(self, age_s: float, ahead_s: float, out: Array) -> None:
-        """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by `ahead_s`."""
+        """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by
+        `ahead_s`."""
         terms = self._dynamics.terms(self._state[0], self._still)
         times = age_s + self._ahead, ahead_s
         given = self._state, self._wanted, self._spring
@@ -79,7 +93,12 @@ def set_joint_torques(
     torque: Array,  # (joints,), N m: set; 0 for joints of other boards
 ) -> bool:
     """Set the torques; return whether a limit cut one."""
-    dry, viscous, limit, driven = constants[0], constants[1], constants[2], constants[3]  # N m, N m s/rad, N m, 1
+    dry, viscous, limit, driven = (
+        constants[0],
+        constants[1],
+        constants[2],
+        constants[3],
+    )  # N m, N m s/rad, N m, 1
     joints = len(torque)
     clipped = False
     for j in range(joints):
@@ -107,4 +126,6 @@ def preload() -> None:
     """Load this module's compiled function."""
     joint = np.zeros(1)
     table = np.zeros((4, 1))
-    set_joint_torques.load()((0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], table[:1], joint, joint)
+    set_joint_torques.load()(
+        (0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], table[:1], joint, joint
+    )

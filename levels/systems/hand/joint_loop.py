@@ -20,7 +20,8 @@ class JointParams(JointGains):
 
 
 class JointLoop(HandLoop):
-    """Brings the joints to their targets with torques; until there are targets it holds them where it found them.
+    """Brings the joints to their targets with torques; until there are targets it holds them where
+    it found them.
 
     See `JointLaw`.
     """

@@ -1,7 +1,8 @@
-"""Kinematics of the fingers: tips and their Jacobians in the frame of the palm, and joint positions for a tip.
+"""Kinematics of the fingers: tips and their Jacobians in the frame of the palm, and joint positions
+for a tip.
 
-Evaluated on separate data, like the arm's (`rack.levels.robot.dynamics`): a pure function of joint positions. The palm
-does not move.
+Evaluated on separate data, like the arm's (`rack.levels.robot.dynamics`): a pure function of joint
+positions. The palm does not move.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
 
 DAMPING_M2 = 1e-5
-"""Damping of an inverse step, in squared tip motion per rad: 3 mm per rad, of 80 that a finger has when it is bent."""
+"""Damping of an inverse step, in squared tip motion per rad: 3 mm per rad, of 80 that a finger has
+when it is bent."""
 MARGIN_RAD = 0.01
 """Distance that targets keep from the ends of a joint's range."""
 
@@ -26,15 +28,22 @@ class FingerKinematics:
     def __init__(self, cell: Cell, hand: Hand) -> None:
         self._cell = cell
         self._tips = hand.tips
-        self.joints = [np.flatnonzero(row) for row in hand.fingers]  # of each finger, as indices of `robot.joints`
+        self.joints = [
+            np.flatnonzero(row) for row in hand.fingers
+        ]  # of each finger, as indices of `robot.joints`
         self._data = d = mujoco.MjData(cell.model)
         mujoco.mj_resetDataKeyframe(cell.model, d, 0)
         self.limits = cell.limits
-        self._low, self._high = self.limits.position[:, 0] + MARGIN_RAD, self.limits.position[:, 1] - MARGIN_RAD
+        self._low, self._high = (
+            self.limits.position[:, 0] + MARGIN_RAD,
+            self.limits.position[:, 1] - MARGIN_RAD,
+        )
         self._whole = np.zeros((3, cell.model.nv))
         mujoco.mj_kinematics(cell.model, d)
         self.palm = site_pose(d, cell.tool)  # in the world
-        self._turned = d.site_xmat[cell.tool].reshape(3, 3).copy()  # from the palm's frame into the world's
+        self._turned = (
+            d.site_xmat[cell.tool].reshape(3, 3).copy()
+        )  # from the palm's frame into the world's
 
     def look(self, position: Array) -> None:
         """Go to joint positions, (joints,), rad: tips and Jacobians are for these from now on."""
@@ -44,10 +53,13 @@ class FingerKinematics:
 
     def tip(self, finger: int) -> Array:
         """Return the tip of a finger, (3,), m."""
-        return transposed_mat_vec(self._turned, self._data.site_xpos[self._tips[finger]] - self.palm.position)
+        return transposed_mat_vec(
+            self._turned, self._data.site_xpos[self._tips[finger]] - self.palm.position
+        )
 
     def jacobian(self, finger: int) -> Array:
-        """Return the Jacobian of the tip of a finger by its own joints, (3, joints of the finger), m/rad."""
+        """Return the Jacobian of the tip of a finger by its own joints, (3, joints of the finger),
+        m/rad."""
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
         own = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
         rotated = np.empty_like(own)
@@ -55,15 +67,18 @@ class FingerKinematics:
         return rotated
 
     def step(self, finger: int, position: Array, way: Array, homing: Array) -> None:
-        """Move the joints of a finger in `position`, (joints,), rad, so that its tip goes `way`, (3,), m: one step.
+        """Move the joints of a finger in `position`, (joints,), rad, so that its tip goes `way`,
+        (3,), m: one step.
 
-        `look(position)` comes before. A finger has more joints than its tip needs: of the motions that do so it takes
-        the one nearest to `homing`, (joints of the finger,), rad.
+        `look(position)` comes before. A finger has more joints than its tip needs: of the motions
+        that do so it takes the one nearest to `homing`, (joints of the finger,), rad.
         """
         own = self.joints[finger]
         jacobian = self.jacobian(finger)
         square = np.empty((3, 3))
         mujoco.mju_mulMatMatT(square, jacobian, jacobian)
         square.flat[::4] += DAMPING_M2
-        moved = homing + transposed_mat_vec(jacobian, solve(square, way - mat_vec(jacobian, homing)))
+        moved = homing + transposed_mat_vec(
+            jacobian, solve(square, way - mat_vec(jacobian, homing))
+        )
         position[own] = np.clip(position[own] + moved, self._low[own], self._high[own])

@@ -1,4 +1,5 @@
-"""What all loops of a hand have in common: whom they follow, when they keep what they have, and what they report."""
+"""What all loops of a hand have in common: whom they follow, when they keep what they have, and
+what they report."""
 
 from __future__ import annotations
 
@@ -21,11 +22,12 @@ HAND_LOST = "no status of the hand: what was commanded last is kept"
 
 
 class HandLoop(Executor):
-    """A loop between the level above and the hand: follows the newest command, at the state that the hand has sensed.
+    """A loop between the level above and the hand: follows the newest command, at the state that
+    the hand has sensed.
 
-    Without a fresh command it keeps what was commanded last, at rest: what the hand holds, it goes on holding. So it
-    does on an operator's hold. A command that is not finite is not taken. A subclass has the ports "command", "hand",
-    "operator" and, unless the hand is below it, "below".
+    Without a fresh command it keeps what was commanded last, at rest: what the hand holds, it goes
+    on holding. So it does on an operator's hold. A command that is not finite is not taken. A
+    subclass has the ports "command", "hand", "operator" and, unless the hand is below it, "below".
     """
 
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
@@ -43,10 +45,17 @@ class HandLoop(Executor):
         self.orders = Orders(self.commands)
         self.command = Message(self.inputs["command"].type.dtype(context.sizes))  # that is followed
         self.commanded = False  # there was one
-        self.driven: NDArray[np.bool_]  # (joints,) or (fingers,), as in the status: those of this board
-        self._above, self._period = ", ".join(context.above), max(pace.every for pace in context.above.values())
+        self.driven: NDArray[
+            np.bool_
+        ]  # (joints,) or (fingers,), as in the status: those of this board
+        self._above, self._period = (
+            ", ".join(context.above),
+            max(pace.every for pace in context.above.values()),
+        )
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
-        self._oldest = slowest + self.cell.patience.ticks(slowest, context.tick_s)  # ticks, of a status of the hand
+        self._oldest = slowest + self.cell.patience.ticks(
+            slowest, context.tick_s
+        )  # ticks, of a status of the hand
         self._taken = 0  # tick at which `command` came
         self._rejected = ""  # why the newest command is not followed
         self._held = False  # by an operator, in the last cycle
@@ -70,7 +79,8 @@ class HandLoop(Executor):
 
     @abstractmethod
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
-        """Write the level's command for `self.command`, and what its status says of fingers or joints."""
+        """Write the level's command for `self.command`, and what its status says of fingers or
+        joints."""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Follow the newest command, and report."""
@@ -93,10 +103,13 @@ class HandLoop(Executor):
 
     def age_s(self, hand: Message, tick: int) -> float:
         """Return how old the sample of a `HAND_STATUS` is when what this cycle commands acts, s."""
-        return float((min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s)
+        return float(
+            (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
+        )
 
     def ahead_s(self, tick: int) -> float:
-        """Return the time by which the command is to be taken on at its velocities, s: a cycle of the level above."""
+        """Return the time by which the command is to be taken on at its velocities, s: a cycle of
+        the level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s
 
     def _take(self, command: Reading, tick: int) -> None:
@@ -108,8 +121,12 @@ class HandLoop(Executor):
                 setattr(self.command, name, 0.0)
             self.orders.done()
         elif command.is_new or (released and command.is_there):
-            wrong = [name for name in self.numbers if not np.isfinite(getattr(command.value, name)).all()]
-            self._rejected = f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
+            wrong = [
+                name for name in self.numbers if not np.isfinite(getattr(command.value, name)).all()
+            ]
+            self._rejected = (
+                f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
+            )
             if not wrong:
                 self.command.copy_from(command.value)
                 self.commanded = True

@@ -1,9 +1,11 @@
-"""The messages of a hand: tensions down to the valves, angles and tensions up, and the targets of the loops between.
+"""The messages of a hand: tensions down to the valves, angles and tensions up, and the targets of
+the loops between.
 
-Symbolic sizes: `joints` of the hand, in the order of `robot.joints`, and `fingers`, in the order of `robot.hand`.
-Vectors have all joints and all fingers; a board of some of them fills and obeys its own, others are 0. Tensions have
-two rows, flexors and extensors: a flexor's tension turns its joint in the positive direction. Points and forces are in
-the frame of the palm, which is the site `robot.tool`.
+Symbolic sizes: `joints` of the hand, in the order of `robot.joints`, and `fingers`, in the order of
+`robot.hand`. Vectors have all joints and all fingers; a board of some of them fills and obeys its
+own, others are 0. Tensions have two rows, flexors and extensors: a flexor's tension turns its joint
+in the positive direction. Points and forces are in the frame of the palm, which is the site
+`robot.tool`.
 """
 
 from __future__ import annotations
@@ -43,7 +45,12 @@ TENSION_COMMAND = command(
     "tension_command",
     1,
     RESTS_ON,
-    Field("sampled", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet, so no tension"),
+    Field(
+        "sampled",
+        "i8",
+        "tick",
+        "tick of the hand's status that it rests on; -1: none yet, so no tension",
+    ),
     Field("tension", "f8", "N", "of the tendons of the board's own joints", (2, "joints")),
     Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
 )
@@ -61,7 +68,9 @@ HAND_STATUS = status(
     Field("wanted", "f8", "N", "tensions commanded of the valves", (2, "joints")),
     Field("force", "f8", "N", "of the surroundings on the fingertips, as sensed", ("fingers", 3)),
     Field("holding", "u1", "1", "1: no fresh tensions: the valves are closed"),
-    Field("stopped", "u1", "1", "1: tensions are not followed: a demand, an operator, or a lost board"),
+    Field(
+        "stopped", "u1", "1", "1: tensions are not followed: a demand, an operator, or a lost board"
+    ),
     Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
     Field("clipped", "u4", "1", "cycles in which a tension was cut to its limits"),
     Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
@@ -86,9 +95,21 @@ FINGER_TARGET = command(
     Field("active", "u1", "1", "0: no target yet, hold"),
     Field("position", "f8", "rad", "joint positions", ("joints",)),
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
-    Field("stiff", "f8", "1", "part of the joint loop's stiffness that acts, 0 to 1; its damping acts", ("joints",)),
+    Field(
+        "stiff",
+        "f8",
+        "1",
+        "part of the joint loop's stiffness that acts, 0 to 1; its damping acts",
+        ("joints",),
+    ),
     Field("torque", "f8", "N m", "in addition: of the forces of tips", ("joints",)),
-    Field("spring", "f8", "N m/rad", "in addition: stiffness of tips, by joint and joint", ("joints", "joints")),
+    Field(
+        "spring",
+        "f8",
+        "N m/rad",
+        "in addition: stiffness of tips, by joint and joint",
+        ("joints", "joints"),
+    ),
 )
 """From the fingertip loop to the joint loop."""
 
@@ -103,7 +124,13 @@ GRASP_TARGET = command(
     Field("tip", "f8", "m", "points of the tips, for POINT and FORCE", ("fingers", 3)),
     Field("tip_velocity", "f8", "m/s", "their velocities", ("fingers", 3)),
     Field("stiffness", "f8", "N/m", "of each tip about its point, for FORCE", ("fingers",)),
-    Field("force", "f8", "N", "of each tip on the surroundings, at its point, for FORCE", ("fingers", 3)),
+    Field(
+        "force",
+        "f8",
+        "N",
+        "of each tip on the surroundings, at its point, for FORCE",
+        ("fingers", 3),
+    ),
 )
 """From the grasp loop to the fingertip loop, or to the boards of fingers."""
 
@@ -115,7 +142,12 @@ LOOP_STATUS = status(
     Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
     Field("clipped", "u4", "1", "cycles in which a torque was cut to what tendons can give"),
     Field("holding", "u1", "1", "1: no fresh command from above: what was commanded last is kept"),
-    Field("stopped", "u1", "1", "1: commands are not followed: the hand is stopped, or an operator holds the loop"),
+    Field(
+        "stopped",
+        "u1",
+        "1",
+        "1: commands are not followed: the hand is stopped, or an operator holds the loop",
+    ),
 )
 """From the tendon loop to the joint loop, and from that to the fingertip loop."""
 
@@ -130,7 +162,12 @@ FINGER_STATUS = status(
     Field("tip", "f8", "m", "points of the tips", ("fingers", 3)),
     Field("force", "f8", "N", "of the surroundings on the tips", ("fingers", 3)),
     Field("holding", "u1", "1", "1: no fresh target: the fingers stay"),
-    Field("stopped", "u1", "1", "1: targets are not followed: the hand is stopped, or an operator holds a loop"),
+    Field(
+        "stopped",
+        "u1",
+        "1",
+        "1: targets are not followed: the hand is stopped, or an operator holds a loop",
+    ),
 )
 """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp loop."""
 

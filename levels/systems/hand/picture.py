@@ -1,6 +1,8 @@
-"""A picture of a hand in SVG, as plain text: its fingers, the objects, the forces, seen from the front and from above.
+"""A picture of a hand in SVG, as plain text: its fingers, the objects, the forces, seen from the
+front and from above.
 
-Everything is in the world's frame: x to the right; z up in the view from the front, y up in that from above.
+Everything is in the world's frame: x to the right; z up in the view from the front, y up in that
+from above.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ PLAN = "#118833"
 
 @dataclass(frozen=True)
 class HandScene:
-    """What a picture shows: a hand's joints, bodies of the scene, forces on tips, and where they should touch."""
+    """What a picture shows: a hand's joints, bodies of the scene, forces on tips, and where they
+    should touch."""
 
     position: Array  # (joints,), rad
     bodies: Array  # (bodies, 3), m, in the order of `scene.bodies`
@@ -62,10 +65,18 @@ class HandPicture:
         self._centre = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
         bodies = cell.bodies
         self._objects = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in bodies]
-        fixed = [geom for geom in range(model.ngeom) if geom not in self._objects and self._is_solid(geom)]
-        self._palms = [geom for geom in fixed if geom in own and model.geom_bodyid[geom] == self._palm]
+        fixed = [
+            geom
+            for geom in range(model.ngeom)
+            if geom not in self._objects and self._is_solid(geom)
+        ]
+        self._palms = [
+            geom for geom in fixed if geom in own and model.geom_bodyid[geom] == self._palm
+        ]
         self._rest = [geom for geom in fixed if geom not in own]
-        self._local = {geom: local_points(model, geom) for geom in (*self._rest, *self._palms, *self._objects)}
+        self._local = {
+            geom: local_points(model, geom) for geom in (*self._rest, *self._palms, *self._objects)
+        }
         joints = np.array([self._joint(address) for address in cell.qpos])
         self._chains = [joints[row] for row in self._hand.fingers]
 
@@ -74,16 +85,24 @@ class HandPicture:
         self._pose(scene)
         width = len(VIEWS) * (SIDE + GAP) + SIDE
         height = SIDE + 2 * GAP
-        parts = [f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif">']
+        parts = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}"'
+            ' font-family="sans-serif">'
+        ]
         parts.append(f'<rect width="{width}" height="{height}" fill="white"/>')
         for number, (name, right, up) in enumerate(VIEWS):
-            parts.append(f'<svg x="{GAP + number * (SIDE + GAP)}" y="{GAP}" width="{SIDE}" height="{SIDE}">')
+            parts.append(
+                f'<svg x="{GAP + number * (SIDE + GAP)}" y="{GAP}" width="{SIDE}" height="{SIDE}">'
+            )
             parts.append(f'<rect width="{SIDE}" height="{SIDE}" fill="#f6f7f9" stroke="{REST}"/>')
             parts += self._view(scene, (right, up))
             parts += [f'<text x="8" y="18" font-size="13" fill="{HAND}">{name}</text>', "</svg>"]
         left = GAP + len(VIEWS) * (SIDE + GAP)
         for row, line in enumerate(text):
-            parts.append(f'<text x="{left}" y="{GAP + LINE * (row + 1)}" font-size="13">{escape(line)}</text>')
+            parts.append(
+                f'<text x="{left}" y="{GAP + LINE * (row + 1)}"'
+                f' font-size="13">{escape(line)}</text>'
+            )
         return "\n".join([*parts, "</svg>", ""])
 
     def _pose(self, scene: HandScene) -> None:
@@ -101,23 +120,41 @@ class HandPicture:
                 outline = hull([self._pixel(point, axes) for point in self._surface(geom)])
                 points = " ".join(f"{x:.1f},{y:.1f}" for x, y in outline)
                 if points:
-                    yield f'<polygon points="{points}" fill="{colour}" fill-opacity="0.45" stroke="{colour}"/>'
+                    yield (
+                        f'<polygon points="{points}" fill="{colour}" fill-opacity="0.45"'
+                        f' stroke="{colour}"/>'
+                    )
         for finger, chain in enumerate(self._chains):
             tip = self._data.site_xpos[self._hand.tips[finger]]
             row = [self._pixel(point, axes) for point in (*self._data.xanchor[chain], tip)]
             points = " ".join(f"{x:.1f},{y:.1f}" for x, y in row)
-            yield f'<polyline points="{points}" fill="none" stroke="{HAND}" stroke-width="7" stroke-linejoin="round"/>'
-            yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="white"/>' for x, y in row[:-1])
+            yield (
+                f'<polyline points="{points}" fill="none" stroke="{HAND}" stroke-width="7"'
+                ' stroke-linejoin="round"/>'
+            )
+            yield from (
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="white"/>' for x, y in row[:-1]
+            )
             x, y = row[-1]
-            yield f'<text x="{x + 9:.1f}" y="{y - 9:.1f}" font-size="11">{escape(self._hand.names[finger])}</text>'
+            yield (
+                f'<text x="{x + 9:.1f}" y="{y - 9:.1f}"'
+                f' font-size="11">{escape(self._hand.names[finger])}</text>'
+            )
             yield from self._arrow(row[-1], scene.force[finger], axes)
         for point in self._in_world(scene):
             x, y = self._pixel(point, axes)
-            yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="none" stroke="{PLAN}" stroke-width="2"/>'
+            yield (
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="none" stroke="{PLAN}"'
+                ' stroke-width="2"/>'
+            )
 
-    def _arrow(self, start: tuple[float, float], force: Array, axes: tuple[int, int]) -> Iterator[str]:
+    def _arrow(
+        self, start: tuple[float, float], force: Array, axes: tuple[int, int]
+    ) -> Iterator[str]:
         """Yield the force of a tip on what it touches."""
-        turned = mat_vec(self._data.site_xmat[self._cell.tool].reshape(3, 3), np.asarray(force, dtype=float))
+        turned = mat_vec(
+            self._data.site_xmat[self._cell.tool].reshape(3, 3), np.asarray(force, dtype=float)
+        )
         scale = SIDE / 2.0 / NEWTONS_A_VIEW
         way = np.array([scale * turned[axes[0]], -scale * turned[axes[1]]])
         length = float(np.sqrt((way**2).sum()))
@@ -128,8 +165,13 @@ class HandPicture:
         end_y = y + way[1]
         head = min(9.0, length)
         corners = ((0.0, 0.0), (-head, 0.45 * head), (-head, -0.45 * head))
-        points = " ".join(f"{end_x + a * u - b * v:.1f},{end_y + a * v + b * u:.1f}" for a, b in corners)
-        yield f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{end_x:.1f}" y2="{end_y:.1f}" stroke="{FORCE}" stroke-width="2"/>'
+        points = " ".join(
+            f"{end_x + a * u - b * v:.1f},{end_y + a * v + b * u:.1f}" for a, b in corners
+        )
+        yield (
+            f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{end_x:.1f}" y2="{end_y:.1f}" stroke="{FORCE}"'
+            ' stroke-width="2"/>'
+        )
         yield f'<polygon points="{points}" fill="{FORCE}"/>'
 
     def _in_world(self, scene: HandScene) -> Iterator[Array]:
@@ -138,7 +180,9 @@ class HandPicture:
             body = self._cell.bodies[scene.held]
             turned = self._data.xmat[body].reshape(3, 3)
             origin = self._data.xpos[body]
-            yield from (origin + mat_vec(turned, point) for point in np.asarray(scene.contact, dtype=float))
+            yield from (
+                origin + mat_vec(turned, point) for point in np.asarray(scene.contact, dtype=float)
+            )
 
     def _pixel(self, point: Array, axes: tuple[int, int]) -> tuple[float, float]:
         right, up = (float(point[axis] - self._centre[axis]) / REACH_M for axis in axes)
@@ -158,7 +202,8 @@ class HandPicture:
 
 
 def local_points(model: mujoco.MjModel, geom: int) -> Array:
-    """Return points on the surface of a geom, (n, 3), m, in its own frame; of a box or mesh the corners of its box."""
+    """Return points on the surface of a geom, (n, 3), m, in its own frame; of a box or mesh the
+    corners of its box."""
     kinds, (a, b, c) = mujoco.mjtGeom, model.geom_size[geom]
     kind = kinds(int(model.geom_type[geom]))
     turns = [2.0 * math.pi * k / RIM for k in range(RIM)]
@@ -166,7 +211,9 @@ def local_points(model: mujoco.MjModel, geom: int) -> Array:
     up = np.array([0.0, 0.0, 1.0])
     if kind in (kinds.mjGEOM_CYLINDER, kinds.mjGEOM_CAPSULE):
         ends = [a * ring + b * up, a * ring - b * up]
-        return np.concatenate(ends if kind == kinds.mjGEOM_CYLINDER else [*ends, [(a + b) * up, -(a + b) * up]])
+        return np.concatenate(
+            ends if kind == kinds.mjGEOM_CYLINDER else [*ends, [(a + b) * up, -(a + b) * up]]
+        )
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
         size = np.array([a, a, a] if kind == kinds.mjGEOM_SPHERE else [a, b, c])
         return np.array(size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]]))

@@ -17,7 +17,8 @@ from rack.levels.tables import SceneConfig
 
 
 class HandSample(NamedTuple):
-    """One sample of a hand's sensors. Positions and velocities are as coarse and noisy as their encoders."""
+    """One sample of a hand's sensors. Positions and velocities are as coarse and noisy as their
+    encoders."""
 
     position: Array  # (joints,), rad
     velocity: Array  # (joints,), rad/s
@@ -29,13 +30,17 @@ class HandSample(NamedTuple):
 class SimulatedHand(Simulation):
     """A hand of tendons. It has no brakes: without commands its valves close, and the grip is kept.
 
-    The air in a closed valve is a spring: the tension of its tendon rises by `Hand.closed` with every metre by which
-    the joint pulls at it. So fingers that moved come to rest, and what they held stays held, by the tension with which
-    the valves closed. At the start they are closed with tensions that carry the weight of the open hand.
+    The air in a closed valve is a spring: the tension of its tendon rises by `Hand.closed` with
+    every metre by which the joint pulls at it. So fingers that moved come to rest, and what they
+    held stays held, by the tension with which the valves closed. At the start they are closed with
+    tensions that carry the weight of the open hand.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
-        """Start at home. One tick is `clock_ns`, one cycle of commands `every` ticks; `seed` is for random noise."""
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
+        """Start at home. One tick is `clock_ns`, one cycle of commands `every` ticks; `seed` is for
+        random noise."""
         super().__init__(cell)
         assert cell.hand is not None, "it is a hand"
         self.hand = hand = cell.hand
@@ -50,13 +55,17 @@ class SimulatedHand(Simulation):
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._before = np.zeros(len(hand.arms))
         acts = cell.model.actuator_actadr[hand.actuators]
-        self._acts = acts if (acts >= 0).all() else None  # (2, joints), tensions behind valves that take time
+        self._acts = (
+            acts if (acts >= 0).all() else None
+        )  # (2, joints), tensions behind valves that take time
 
     def _start_with(self, tension: Array) -> None:
         """Let the valves have had tensions, (2, joints), N, for ever."""
         model = self.cell.model
         d = self._data
-        for actuator, pull in zip(self.hand.actuators.ravel().tolist(), tension.ravel().tolist(), strict=True):
+        for actuator, pull in zip(
+            self.hand.actuators.ravel().tolist(), tension.ravel().tolist(), strict=True
+        ):
             d.ctrl[actuator] = pull
             if model.actuator_actnum[actuator]:
                 d.act[model.actuator_actadr[actuator]] = pull
@@ -67,11 +76,13 @@ class SimulatedHand(Simulation):
 
     @property
     def wanted(self) -> Array:
-        """Tensions commanded of the valves, (2, joints), N; of closed ones, those that the air in them tends to."""
+        """Tensions commanded of the valves, (2, joints), N; of closed ones, those that the air in
+        them tends to."""
         return np.asarray(np.clip(self._data.ctrl[self.hand.actuators], 0.0, self.hand.most))
 
     def sense(self) -> HandSample:
-        """Return the newest sample; torques, tensions and forces are those of a step ago, as MuJoCo's are."""
+        """Return the newest sample; torques, tensions and forces are those of a step ago, as
+        MuJoCo's are."""
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
@@ -81,7 +92,8 @@ class SimulatedHand(Simulation):
         return HandSample(position, velocity, self._steps.seen[-1, 2], tension, in_palm)
 
     def pull(self, tension: Array) -> None:
-        """Open the valves, and let them follow tensions, (2, joints), N, which are within the limits."""
+        """Open the valves, and let them follow tensions, (2, joints), N, which are within the
+        limits."""
         self.waited = 0
         self.braked = False
         self._data.ctrl[self.hand.actuators] = tension
@@ -95,7 +107,8 @@ class SimulatedHand(Simulation):
         self.braked = True
 
     def step(self, ticks: int) -> None:
-        """Simulate `ticks` ticks. After a fault the hand stands still in its last sound state; time continues."""
+        """Simulate `ticks` ticks. After a fault the hand stands still in its last sound state; time
+        continues."""
         self.contact = None
         for _ in range(ticks):
             self.braked = self.braked or self.waited >= self.patience
@@ -107,9 +120,11 @@ class SimulatedHand(Simulation):
             self._data.time = self._now_s
 
     def _simulate(self) -> None:
-        """Simulate one tick. Tensions behind closed valves follow the joints at once, and their controls with them.
+        """Simulate one tick. Tensions behind closed valves follow the joints at once, and their
+        controls with them.
 
-        The controls may go below 0, where MuJoCo cuts them: a slack tendon is tight again where it became slack.
+        The controls may go below 0, where MuJoCo cuts them: a slack tendon is tight again where it
+        became slack.
         """
         if not self.braked:
             return super()._simulate()

@@ -13,10 +13,11 @@ from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand.messages import EXTENSOR
 
 SLACK_CYCLES = 5
-"""Cycles in a row in which a tendon must be slack: a valve that opens takes up to four to tighten one."""
+"""Cycles in a row in which a tendon must be slack: a valve that opens takes up to four to tighten
+one."""
 SLACK_PART = 0.5
-"""Part of the least tension below which a tendon is slack: a sound one never gets there, wherever its tension came
-from."""
+"""Part of the least tension below which a tendon is slack: a sound one never gets there, wherever
+its tension came from."""
 
 
 class SlackMonitor:
@@ -31,14 +32,18 @@ class SlackMonitor:
         self.note = ""  # which tendons are slack, readable; empty: none
 
     def look(self, tension: Array, wanted: Array) -> list[Finding]:
-        """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2, joints), N."""
+        """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2,
+        joints), N."""
         if tension.min() >= self._slack and not self._any:
             return []
         slack = (tension < self._slack) & (wanted >= self._least)
         self._cycles = np.where(slack, self._cycles + 1, 0)
         self._any = bool(slack.any())
         torn = np.argwhere(self._cycles >= SLACK_CYCLES).tolist()
-        named = (f"{'extensor' if row == EXTENSOR else 'flexor'} of '{self._joints[joint]}'" for row, joint in torn)
+        named = (
+            f"{'extensor' if row == EXTENSOR else 'flexor'} of '{self._joints[joint]}'"
+            for row, joint in torn
+        )
         self.note = f"slack: {', '.join(named)}" if torn else ""
         found = np.argwhere(self._cycles == SLACK_CYCLES).tolist()
         return [Finding(Alarm.TENDON, joint, float(tension[row, joint])) for row, joint in found]

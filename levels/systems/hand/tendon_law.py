@@ -1,14 +1,18 @@
-"""The law of the tendons: tensions for a torque, early enough for slow valves, and corrected by what is sensed.
+"""The law of the tendons: tensions for a torque, early enough for slow valves, and corrected by
+what is sensed.
 
-A pair turns its joint with torque = a (Tf - Te), a being its moment arm. Of all tensions that give a torque, those
-about a mean T0 are Tf = T0 + torque / 2a and Te = T0 - torque / 2a: the statics of a symmetric pair. Tendons only pull:
-where one would go slack, the mean is raised; where the other could then not pull enough, the torque is clipped.
+A pair turns its joint with torque = a (Tf - Te), a being its moment arm. Of all tensions that give
+a torque, those about a mean T0 are Tf = T0 + torque / 2a and Te = T0 - torque / 2a: the statics of
+a symmetric pair. Tendons only pull: where one would go slack, the mean is raised; where the other
+could then not pull enough, the torque is clipped.
 
-A valve follows its command with a lag [assumed: of first order]. `lead` commands more than is wanted while the tension,
-by a model of the valve, has not arrived: it is then there (1 + lead) times as soon, and nothing sensed is fed back, so
-the delays on the way to and from the hand cannot make it unstable. What the model lacks, gain and offset of a valve, is
-an error that lasts: `trim` integrates the difference of the sensed tension from that of the model, far slower than the
-lag. The model for this runs on the commands that the hand reports with each sample: both are of the same time.
+A valve follows its command with a lag [assumed: of first order]. `lead` commands more than is
+wanted while the tension, by a model of the valve, has not arrived: it is then there (1 + lead)
+times as soon, and nothing sensed is fed back, so the delays on the way to and from the hand cannot
+make it unstable. What the model lacks, gain and offset of a valve, is an error that lasts: `trim`
+integrates the difference of the sensed tension from that of the model, far slower than the lag. The
+model for this runs on the commands that the hand reports with each sample: both are of the same
+time.
 """
 
 from __future__ import annotations
@@ -35,27 +39,44 @@ class TendonGains(Table):
     """What the law knows of the valves, and its gains."""
 
     lag: Positive = Field(0.008, le=1.0, description="time constant of a valve, s")
-    lead: NotNegative = Field(1.0, le=4.0, description="part of the tension still missing that is commanded in excess")
-    trim: NotNegative = Field(4.0, le=20.0, description="rate at which a valve's lasting error is corrected, 1/s")
+    lead: NotNegative = Field(
+        1.0, le=4.0, description="part of the tension still missing that is commanded in excess"
+    )
+    trim: NotNegative = Field(
+        4.0, le=20.0, description="rate at which a valve's lasting error is corrected, 1/s"
+    )
     most_trim: NotNegative = Field(10.0, description="largest such correction, N")
-    margin: NotNegative = Field(1.0, description="tension kept above the hand's least, for a valve's error, N")
+    margin: NotNegative = Field(
+        1.0, description="tension kept above the hand's least, for a valve's error, N"
+    )
 
 
 class TendonLaw:
-    """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew after a restart."""
+    """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew
+    after a restart."""
 
-    def __init__(self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, context: LevelContext) -> None:
+    def __init__(
+        self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, context: LevelContext
+    ) -> None:
         """Drive the joints `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         self._constants = np.zeros((4, joints))  # in the rows of `set_tensions`
         self._constants[0], self._constants[1] = hand.arms, hand.least + gains.margin
         self._constants[2], self._constants[3] = hand.most, driven
-        self._numbers = hand.rest, gains.lead, 1.0 - math.exp(-context.period_s / gains.lag), gains.most_trim
+        self._numbers = (
+            hand.rest,
+            gains.lead,
+            1.0 - math.exp(-context.period_s / gains.lag),
+            gains.most_trim,
+        )
         self._lag = gains.lag
         self._trim = gains.trim
         self._tick_s = context.tick_s
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
-        self._elapsed, self._shares = 0, (0.0, 0.0)  # ticks between two samples, and shares of that time
+        self._elapsed, self._shares = (
+            0,
+            (0.0, 0.0),
+        )  # ticks between two samples, and shares of that time
         self._set = set_tensions.load()
         self._status: Message  # of the hand
         self._sensed: Array  # its numbers
@@ -63,7 +84,8 @@ class TendonLaw:
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
     def start(self, status: Message) -> None:
-        """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same place."""
+        """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same
+        place."""
         self._valves[0], self._valves[1], self._valves[2] = status.wanted, status.tension, 0.0
         self._status = status
         self._sampled = status.tick
@@ -77,14 +99,21 @@ class TendonLaw:
         if elapsed != self._elapsed:
             self._elapsed = elapsed
             elapsed_s = elapsed * self._tick_s
-            self._shares = 1.0 - math.exp(-elapsed_s / self._lag), min(self._trim * elapsed_s, MOST_LEARNED)
-        if self._set(self._numbers, self._shares, self._constants, self._valves, self._sensed, torque, out):
+            self._shares = (
+                1.0 - math.exp(-elapsed_s / self._lag),
+                min(self._trim * elapsed_s, MOST_LEARNED),
+            )
+        if self._set(
+            self._numbers, self._shares, self._constants, self._valves, self._sensed, torque, out
+        ):
             self.clipped += 1
 
 
 @compiled
 def set_tensions(
-    numbers: tuple[float, float, float, float],  # mean tension, N, lead, share of a cycle in the lag, largest trim, N
+    numbers: tuple[
+        float, float, float, float
+    ],  # mean tension, N, lead, share of a cycle in the lag, largest trim, N
     shares: tuple[float, float],  # of the time since the sample before: in the lag, and in the trim
     constants: Array,  # (4, joints): rows as below
     valves: Array,  # (3, 2, joints), N: rows as below
@@ -95,7 +124,11 @@ def set_tensions(
     """Set the tensions; return whether a torque had to be clipped."""
     rest, lead, share, most_trim = numbers
     arm, least, most, driven = constants[0], constants[1], constants[2], constants[3]  # m, N, N, 1
-    reached, expected, trim = valves[0], valves[1], valves[2]  # model now, model at the sample, correction
+    reached, expected, trim = (
+        valves[0],
+        valves[1],
+        valves[2],
+    )  # model now, model at the sample, correction
     joints = len(arm)
     clipped = False
     for j in range(joints):
@@ -125,4 +158,6 @@ def preload() -> None:
     """Load this module's compiled function."""
     numbers = np.zeros(4)
     pair = np.zeros((2, 1))
-    set_tensions.load()((0.0,) * 4, (0.0,) * 2, np.zeros((4, 1)), np.zeros((3, 2, 1)), numbers, numbers[:1], pair)
+    set_tensions.load()(
+        (0.0,) * 4, (0.0,) * 2, np.zeros((4, 1)), np.zeros((3, 2, 1)), numbers, numbers[:1], pair
+    )

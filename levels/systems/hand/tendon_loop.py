@@ -1,4 +1,5 @@
-"""The tendon loop: tensions of all tendons of a hand, from the torques that the joint loop wants."""
+"""The tendon loop: tensions of all tendons of a hand, from the torques that the joint loop
+wants."""
 
 from __future__ import annotations
 
@@ -9,7 +10,12 @@ from rack.levels.level import Input, LevelContext, Ports
 from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.systems.hand import tendon_law
 from rack.levels.systems.hand.loop import HandLoop
-from rack.levels.systems.hand.messages import HAND_STATUS, LOOP_STATUS, TENDON_TORQUE, TENSION_COMMAND
+from rack.levels.systems.hand.messages import (
+    HAND_STATUS,
+    LOOP_STATUS,
+    TENDON_TORQUE,
+    TENSION_COMMAND,
+)
 from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from rack.levels.tables import read_params
 
@@ -21,8 +27,8 @@ class TendonParams(TendonGains):
 class TendonLoop(HandLoop):
     """Gives the hand a tension for each tendon, in every cycle. See `TendonLaw`.
 
-    What it commands rests on the status of the hand on which the torques rest: the hand thus notices a joint loop that
-    is gone, too.
+    What it commands rests on the status of the hand on which the torques rest: the hand thus
+    notices a joint loop that is gone, too.
     """
 
     inputs = {

@@ -14,7 +14,8 @@ from rack.levels.robot.limits import MotorPatience
 from rack.levels.systems.hand.messages import EXTENSOR
 
 MARGIN = 1e-3
-"""Part of its largest tension by which one may miss its limits without count: rounding of whoever kept them."""
+"""Part of its largest tension by which one may miss its limits without count: rounding of whoever
+kept them."""
 
 
 class Tensions(CommandsAbove):
@@ -39,7 +40,8 @@ class Tensions(CommandsAbove):
             np.copyto(self.tension, value.tension, where=value.driven != 0)
 
     def check(self) -> tuple[Finding | None, str]:
-        """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused; empty: it is not."""
+        """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused;
+        empty: it is not."""
         tension = self.tension
         low = self._low
         high = self._high
@@ -49,7 +51,9 @@ class Tensions(CommandsAbove):
             return None, ""
         if not np.isfinite(tension).all():
             row, joint = np.argwhere(~np.isfinite(tension))[0].tolist()
-            return Finding(Alarm.TENSION_INVALID, joint), f"rejected: tension of {self._named(row, joint)} is NaN"
+            return Finding(
+                Alarm.TENSION_INVALID, joint
+            ), f"rejected: tension of {self._named(row, joint)} is NaN"
         row, joint = np.argwhere(~within)[0].tolist()
         found = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
         np.clip(tension, low, high, out=tension)

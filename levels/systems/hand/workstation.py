@@ -1,8 +1,9 @@
 """The workstation of a hand: it plans the grasp, and draws the hand. A program of the host side.
 
-It reads messages through the bus adapter, and sends plans the same way. The counts of the boards, which no message
-carries, it reads in the crate's memory, word by word at their bus addresses: the adapter maps it for its host. They are
-for the picture alone: other boards may be writing them, in lockstep too.
+It reads messages through the bus adapter, and sends plans the same way. The counts of the boards,
+which no message carries, it reads in the crate's memory, word by word at their bus addresses: the
+adapter maps it for its host. They are for the picture alone: other boards may be writing them, in
+lockstep too.
 """
 
 from __future__ import annotations
@@ -40,13 +41,17 @@ class WorkstationParams(Table):
     opposing: str = Field(description="finger that opposes all others")
     rules: GraspRules = Field(GraspRules(), description="what the grasp is to be")
     picture: str | None = Field(
-        None, description="SVG file, replaced as the hand moves; {rack} stands for the rack's name; default: none"
+        None,
+        description=(
+            "SVG file, replaced as the hand moves; {rack} stands for the rack's name; default: none"
+        ),
     )
     every_s: Positive = Field(0.2, description="time between pictures, s")
 
 
 class Workstation(HostProgram):
-    """Plans a grasp of one object, anew when that moves before it is held, and draws what the boards report."""
+    """Plans a grasp of one object, anew when that moves before it is held, and draws what the
+    boards report."""
 
     inputs = {
         "world": Input(WORLD_MODEL, "below.world"),
@@ -94,7 +99,12 @@ class Workstation(HostProgram):
         sensed = int(world.value.sensed)
         self._planned = found = self._planner.plan(self._row, self._at, np.array(quaternion))
         if found is not None:
-            parts = {"contact": found.contact, "normal": found.normal, "posture": found.posture, "grip": found.grip}
+            parts = {
+                "contact": found.contact,
+                "normal": found.normal,
+                "posture": found.posture,
+                "grip": found.grip,
+            }
             bus.send("plan", object=self._row, sensed=sensed, **parts)
         return found
 
@@ -121,8 +131,13 @@ class Workstation(HostProgram):
         partial.replace(self._picture)
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return what a prompt offers: `plan()`, `draw()`, and `boards()`, the counts in the crate's memory."""
-        return {"plan": lambda: self.plan(bus), "draw": lambda: self.draw(bus), "boards": lambda: self.boards(bus)}
+        """Return what a prompt offers: `plan()`, `draw()`, and `boards()`, the counts in the
+        crate's memory."""
+        return {
+            "plan": lambda: self.plan(bus),
+            "draw": lambda: self.draw(bus),
+            "boards": lambda: self.boards(bus),
+        }
 
     def boards(self, bus: Bus) -> dict[str, dict[str, int]]:
         """Return the counts of every task, from the words of its control block."""
@@ -141,7 +156,10 @@ class Workstation(HostProgram):
         if grasp.is_there:
             status = grasp.value
             kind = GraspKind(int(status.kind)).name.lower()
-            yield f"step {min(status.step + 1, status.steps)} of {status.steps}: {kind}, plan {status.plan or 'none'}"
+            yield (
+                f"step {min(status.step + 1, status.steps)} of {status.steps}: {kind}, plan"
+                f" {status.plan or 'none'}"
+            )
             moved = f"moved {1e3 * status.moved:.1f} mm, at most {1e3 * status.farthest:.1f}"
             yield f"grip {status.grip:.1f} N, {moved}"
             yield str(status.reason)
@@ -149,10 +167,15 @@ class Workstation(HostProgram):
             margin = f"joints {100 * self._planned.margin:.0f} % from their ends"
             yield f"planned: grip {self._planned.grip:.1f} N, {margin}"
         robot = self.context.robot.hand
-        for finger, force in zip(robot.finger if robot is not None else (), hand.force, strict=True):
+        for finger, force in zip(
+            robot.finger if robot is not None else (), hand.force, strict=True
+        ):
             rows = [self.context.robot.joints.index(joint) for joint in finger.joints]
             pulls = hand.tension[:, rows]
-            yield f"{finger.name}: {norm(force):.1f} N, tendons {pulls.min():.0f} to {pulls.max():.0f} N"
+            yield (
+                f"{finger.name}: {norm(force):.1f} N, tendons {pulls.min():.0f} to"
+                f" {pulls.max():.0f} N"
+            )
         yield "crate memory: cycles, missed, skipped"
         for task, counts in self.boards(bus).items():
             yield f"{task}: {', '.join(map(str, counts.values()))}"

@@ -1,4 +1,5 @@
-"""The executor of a board of the arm: gives it the torques of the boards that servo its joints, or brakes it."""
+"""The executor of a board of the arm: gives it the torques of the boards that servo its joints, or
+brakes it."""
 
 from __future__ import annotations
 
@@ -29,9 +30,10 @@ HELD = "held by the operator; `resume` releases it"
 class ArmExecutor(ArmDriver):
     """Drives an arm with the torques of the boards above: all of its joints, or none.
 
-    While it says `stopped`, these boards bring the joints to rest and hold them; an arm that is still not at rest after
-    the time that this takes is braked. A board that is lost or late brakes the arm. It is released when all boards
-    have seen that it was braked: their torques then hold it where it is. See `ArmDriver`.
+    While it says `stopped`, these boards bring the joints to rest and hold them; an arm that is
+    still not at rest after the time that this takes is braked. A board that is lost or late brakes
+    the arm. It is released when all boards have seen that it was braked: their torques then hold it
+    where it is. See `ArmDriver`.
     """
 
     inputs = {
@@ -44,15 +46,23 @@ class ArmExecutor(ArmDriver):
     params = ArmParams
 
     def __init__(self, context: LevelContext, params: ArmParams | None = None) -> None:
-        super().__init__(context, read_params(ArmParams, context.params) if params is None else params)
+        super().__init__(
+            context, read_params(ArmParams, context.params) if params is None else params
+        )
         limits = self.cell.limits
         self.joints = JointTorques(context, self.cell)
         self.orders = Orders(self.commands)
         rest_s = float(np.max(limits.velocity / limits.acceleration))
-        self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values(), default=0)
+        self._rest_ticks = round(rest_s / context.tick_s) + max(
+            self.joints.oldest.values(), default=0
+        )
         self._defied = False  # the boards above have not brought it to rest in that time
-        self._rest_by: int | None = None  # tick by which the arm must have come to rest; None: it need not
-        self._braked_at: int | None = None  # tick of the first status that said so; None: not braked, or not yet said
+        self._rest_by: int | None = (
+            None  # tick by which the arm must have come to rest; None: it need not
+        )
+        self._braked_at: int | None = (
+            None  # tick of the first status that said so; None: not braked, or not yet said
+        )
         self._torques: Mapping[str, Reading] = {}
         self._waiting = ""  # why the boards above do not drive the arm
 
@@ -66,18 +76,27 @@ class ArmExecutor(ArmDriver):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield every joint, and the gripper, that not exactly one board above drives, and what `ArmDriver` yields."""
+        """Yield every joint, and the gripper, that not exactly one board above drives, and what
+        `ArmDriver` yields."""
         yield from super().misfits(context, above, below)
         everything = context.robot.joints
         wanted = {other.board: other.params.get("joints", everything) for other in above}
         for joint in everything:
             boards = [board for board, joints in wanted.items() if joint in joints]
             if len(boards) != 1:
-                yield "above", list(wanted), f"joint '{joint}' must be commanded by one board; {_by(boards)}"
+                yield (
+                    "above",
+                    list(wanted),
+                    f"joint '{joint}' must be commanded by one board; {_by(boards)}",
+                )
         grips = [other.board for other in above if other.params.get("gripper", False)]
         if len(grips) != (context.robot.gripper is not None):
             is_bare = context.robot.gripper is None
-            must = "the arm has no gripper" if is_bare else "the gripper must be commanded by one board"
+            must = (
+                "the arm has no gripper"
+                if is_bare
+                else "the gripper must be commanded by one board"
+            )
             yield "above", list(wanted), f"{must}; {_by(grips)}"
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
@@ -120,18 +139,23 @@ class ArmExecutor(ArmDriver):
     def _is_astray(self) -> bool:
         """Return whether the boards above want the arm elsewhere than where it is braked.
 
-        They do for two cycles when sensors are trusted again and show another position than was estimated.
+        They do for two cycles when sensors are trusted again and show another position than was
+        estimated.
         """
         away = self.joints.wanted.position - self.sensors.position
         joint = int(np.abs(away).argmax())
         astray = abs(away[joint]) > ASTRAY_RAD
         if astray:
             name = self.context.robot.joints[joint]
-            self._waiting = f"braked: joint '{name}' is wanted more than {ASTRAY_RAD:g} rad away from where it is"
+            self._waiting = (
+                f"braked: joint '{name}' is wanted more than {ASTRAY_RAD:g} rad away from where"
+                " it is"
+            )
         return bool(astray)
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
-        """Return whether the arm `stops`, and the boards above have had enough time to bring it to rest."""
+        """Return whether the arm `stops`, and the boards above have had enough time to bring it to
+        rest."""
         if not stops:
             self._rest_by = None
         elif self._rest_by is None:
@@ -147,7 +171,9 @@ class ArmExecutor(ArmDriver):
 
     def terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with what the gripper holds."""
-        return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.joints.payload)
+        return self.arm.dynamics.terms(
+            self.sensors.position, self.sensors.velocity, self.joints.payload
+        )
 
     def torques(self, wanted: Motion, sensed: Sensed, terms: Terms) -> tuple[Array, float]:
         """Return the torques of the boards above, N m, and their grip force, N."""
@@ -167,7 +193,13 @@ class ArmExecutor(ArmDriver):
         """Return what the status says of the torques from above."""
         held = self.orders.standing is Operation.HOLD
         kept = self.stopping.reason or self._waiting or (HELD if held else "")
-        return 0, self.abandoned or not self.joints.moves, self.abandoned or reaction > 0 or held, 0, kept
+        return (
+            0,
+            self.abandoned or not self.joints.moves,
+            self.abandoned or reaction > 0 or held,
+            0,
+            kept,
+        )
 
 
 def _by(boards: Sequence[str]) -> str:

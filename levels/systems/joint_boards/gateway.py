@@ -1,4 +1,5 @@
-"""The executor of a board that joins a trajectory level, across a link with a delay, to boards that servo joints."""
+"""The executor of a board that joins a trajectory level, across a link with a delay, to boards that
+servo joints."""
 
 from __future__ import annotations
 
@@ -13,22 +14,26 @@ from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STA
 from rack.levels.tables import NotNegative, Table, read_params
 
 LEAD_CYCLES = 2
-"""Cycles of this board until a reference that is there has come to the boards below: they need it in time."""
+"""Cycles of this board until a reference that is there has come to the boards below: they need it
+in time."""
 
 
 class GatewayParams(Table):
     """`[board.<name>.params]`: the link to the level above, and what to do without it."""
 
     delay: NotNegative = Field(0.0, le=1.0, description="time that the link takes, each way, s")
-    missing: int = Field(5, ge=0, le=1000, description="references in a row that may be missing and are extrapolated")
+    missing: int = Field(
+        5, ge=0, le=1000, description="references in a row that may be missing and are extrapolated"
+    )
 
 
 class JointGateway(Executor):
-    """Hands references on to the boards below, later by a constant time; makes up those that are missing.
+    """Hands references on to the boards below, later by a constant time; makes up those that are
+    missing.
 
-    A reference that is not there in time is extrapolated from the newest, at its velocity. After `missing` of them the
-    arm is left to the boards below, which ramp to rest and hold; when references come again, they join them. Upwards
-    the boards below appear as one.
+    A reference that is not there in time is extrapolated from the newest, at its velocity. After
+    `missing` of them the arm is left to the boards below, which ramp to rest and hold; when
+    references come again, they join them. Upwards the boards below appear as one.
     """
 
     inputs = {
@@ -42,11 +47,18 @@ class JointGateway(Executor):
         super().__init__(context)
         params = read_params(GatewayParams, context.params)
         every = context.every
-        self._delay = -(-round(params.delay / context.tick_s) // every) * every  # ticks: whole cycles
+        self._delay = (
+            -(-round(params.delay / context.tick_s) // every) * every
+        )  # ticks: whole cycles
         self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
-        self._missing, self._period = params.missing, max(pace.every for pace in context.above.values())
+        self._missing, self._period = (
+            params.missing,
+            max(pace.every for pace in context.above.values()),
+        )
         self._above = ", ".join(context.above)
-        self._down: deque[tuple[int, bytes]] = deque()  # messages on the link, with the tick at which they are here
+        self._down: deque[tuple[int, bytes]] = (
+            deque()
+        )  # messages on the link, with the tick at which they are here
         self._up: deque[tuple[int, bytes]] = deque()
         self._newest: Message | None = None  # reference that came
         self._merged: Message | None = None  # status of the boards below, as one
@@ -114,8 +126,12 @@ class JointGateway(Executor):
             field[:] = 0
             for value in values:
                 field += getattr(value, name)
-        silent = [board for board, reading in statuses.items() if reading.is_lost or not reading.is_there]
-        worst = max(values, key=lambda value: (bool(value.error), bool(value.stopped), bool(value.holding)))
+        silent = [
+            board for board, reading in statuses.items() if reading.is_lost or not reading.is_there
+        ]
+        worst = max(
+            values, key=lambda value: (bool(value.error), bool(value.stopped), bool(value.holding))
+        )
         merged.holding = any(bool(value.holding) for value in values)
         merged.stopped = bool(silent) or any(bool(value.stopped) for value in values)
         merged.echo = min([value.echo for value in values])

@@ -1,4 +1,5 @@
-"""The law of a board that servoes joints of an arm: each by itself, with the inertia and load that it is given."""
+"""The law of a board that servoes joints of an arm: each by itself, with the inertia and load that
+it is given."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ DUE = slice(2, 4)
 
 
 class JointLoads:
-    """Inertia and load of every joint: interpolated between references; computed where there is none."""
+    """Inertia and load of every joint: interpolated between references; computed where there is
+    none."""
 
     def __init__(self, cell: Cell) -> None:
         joints = len(cell.dof)
@@ -29,13 +31,17 @@ class JointLoads:
         self._payload = Payload(0.0, np.zeros(3))
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(joints)
-        self._computed_at = np.full(joints, np.nan)  # (joints,), rad; NaN: they are those of a reference
+        self._computed_at = np.full(
+            joints, np.nan
+        )  # (joints,), rad; NaN: they are those of a reference
 
     @staticmethod
     def are_good(command: Message) -> bool:
         """Return whether a `JOINT_REFERENCE` has inertias and loads that a torque can rest on."""
         return bool(
-            np.isfinite(command.load).all() and np.isfinite(command.inertia).all() and command.inertia.min() > 0
+            np.isfinite(command.load).all()
+            and np.isfinite(command.inertia).all()
+            and command.inertia.min() > 0
         )
 
     def take(self, command: Message, tick: int) -> None:
@@ -52,7 +58,8 @@ class JointLoads:
         return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
 
     def hold(self, position: Array) -> None:
-        """Compute them for an arm at rest at `position`, (joints,), rad, unless they were computed near it."""
+        """Compute them for an arm at rest at `position`, (joints,), rad, unless they were computed
+        near it."""
         if (np.abs(position - self._computed_at) < MOVED_RAD).all():
             return
         inertia, bias = self._dynamics.terms(position, self._still, self._payload)
@@ -72,11 +79,17 @@ def servo_joints(
     torque: Array,  # (3 joints,): set: torques, N m, targets, rad, and their velocities, rad/s
     status: Array,  # (4 joints,): set: positions, targets, their velocities, torques
 ) -> None:
-    """Set torques that make every joint's error that of a damped oscillator, from a sample taken on to when they act.
+    """Set torques that make every joint's error that of a damped oscillator, from a sample taken on
+    to when they act.
 
     torque = inertia (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + load + dry friction
     """
-    stiffness, damping, dry, limits = constants[0], constants[1], constants[2], constants[3]  # 1/s2, 1/s, N m, N m
+    stiffness, damping, dry, limits = (
+        constants[0],
+        constants[1],
+        constants[2],
+        constants[3],
+    )  # 1/s2, 1/s, N m, N m
     driven = constants[4]  # 1: a joint of this board; 0: of another
     joints = len(driven)
     for j in range(joints):
@@ -95,11 +108,17 @@ def servo_joints(
         needed += dry[j] * math.tanh(target_velocity / FRICTION_SPEED)
         needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
         torque[j], torque[joints + j], torque[2 * joints + j] = needed, target, target_velocity
-        status[joints + j], status[2 * joints + j], status[3 * joints + j] = target, target_velocity, needed
+        status[joints + j], status[2 * joints + j], status[3 * joints + j] = (
+            target,
+            target_velocity,
+            needed,
+        )
 
 
 def preload() -> None:
     """Load this module's compiled function."""
     numbers = np.zeros(4)
     table = np.zeros((5, 1))
-    servo_joints.load()(table, table[:4], 0.0, 0.0, 0.0, numbers[:2], table[:3], numbers[:3], numbers)
+    servo_joints.load()(
+        table, table[:4], 0.0, 0.0, 0.0, numbers[:2], table[:3], numbers[:3], numbers
+    )

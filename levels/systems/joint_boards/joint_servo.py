@@ -1,4 +1,5 @@
-"""The executor of a board that servoes some or all joints of an arm whose plant is on a board of its own."""
+"""The executor of a board that servoes some or all joints of an arm whose plant is on a board of
+its own."""
 
 from __future__ import annotations
 
@@ -26,7 +27,12 @@ from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.joint_boards import joint_control
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads, servo_joints
-from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS, JOINT_TORQUE
+from rack.levels.systems.joint_boards.messages import (
+    ARM_STATUS,
+    JOINT_REFERENCE,
+    JOINT_STATUS,
+    JOINT_TORQUE,
+)
 from rack.levels.tables import read_params
 
 ARM_LOST = "no status from the board of the arm: waiting for it"
@@ -35,15 +41,19 @@ ARM_LOST = "no status from the board of the arm: waiting for it"
 class JointServoParams(ModifiableParams, LoopGains):
     """`[board.<name>.params]`: the joints that a board servoes, and the gains of their loop."""
 
-    joints: tuple[str, ...] | None = Field(None, description="joints of `robot.joints` that it servoes; default: all")
+    joints: tuple[str, ...] | None = Field(
+        None, description="joints of `robot.joints` that it servoes; default: all"
+    )
     gripper: bool = Field(False, description="true: it drives the gripper, too")
 
 
 class JointServo(Executor):
-    """Follows references with the torques of its own joints, and leaves the rest of the arm to other boards.
+    """Follows references with the torques of its own joints, and leaves the rest of the arm to
+    other boards.
 
-    Set points are interpolated for all joints, so that all of them come to rest at the same time, on whichever boards.
-    While the arm is braked they begin where it is; while the arm says `stopped`, they come to rest.
+    Set points are interpolated for all joints, so that all of them come to rest at the same time,
+    on whichever boards. While the arm is braked they begin where it is; while the arm says
+    `stopped`, they come to rest.
     """
 
     inputs = {
@@ -76,13 +86,20 @@ class JointServo(Executor):
         self._servo = partial(servo_joints.load(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         modify = self._modified.obey
-        self.operator = OperatorControl(self.commands, robot.joints, cell.limits.position, self._driven, modify=modify)
-        self._unmodified: Array = np.zeros(7 * len(robot.joints))  # what the law sets for its modifications
+        self.operator = OperatorControl(
+            self.commands, robot.joints, cell.limits.position, self._driven, modify=modify
+        )
+        self._unmodified: Array = np.zeros(
+            7 * len(robot.joints)
+        )  # what the law sets for its modifications
         self._grip = Grip(robot.gripper) if params.gripper and robot.gripper is not None else None
         below = max(pace.every for pace in context.below.values())
-        # Ticks, of a status: while its board stalls for less, the arm goes on with the last torques.
+        # Ticks, of a status: while its board stalls for less, the arm goes on with the last
+        # torques.
         self._oldest = below + cell.patience.ticks(below, context.tick_s)
-        self._sample: Array = np.zeros(0)  # numbers of a status of the arm, and of the messages to write
+        self._sample: Array = np.zeros(
+            0
+        )  # numbers of a status of the arm, and of the messages to write
         self._shown_numbers: tuple[Array, ...] = ()
         self._offered: Message | None = None  # reference whose loads are not yet taken
         self._command = self._rests_on = self._due = 0
@@ -104,13 +121,18 @@ class JointServo(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield joints that the arm lacks or that are named twice, an idle board, and modifications that do not fit."""
+        """Yield joints that the arm lacks or that are named twice, an idle board, and modifications
+        that do not fit."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
         named = known if params.joints is None else params.joints
         for joint in dict.fromkeys(named):
             if joint not in known:
-                yield "params.joints", joint, f"the arm has no such joint; joints: {', '.join(known)}"
+                yield (
+                    "params.joints",
+                    joint,
+                    f"the arm has no such joint; joints: {', '.join(known)}",
+                )
             elif named.count(joint) > 1:
                 yield "params.joints", joint, "named twice"
         if not named and not params.gripper:
@@ -184,7 +206,10 @@ class JointServo(Executor):
         if self._grip is not None and arm.grip_force:
             self._grip.keep(arm.grip_force)
         self._sample = numbers(arm, "position", "velocity")
-        self._shown_numbers = numbers(torque, "torque", "target_velocity"), numbers(status, "position", "torque")
+        self._shown_numbers = (
+            numbers(torque, "torque", "target_velocity"),
+            numbers(status, "position", "torque"),
+        )
         return True
 
     def _take_messages(self, read: Ports, write: Ports) -> None:
@@ -201,10 +226,14 @@ class JointServo(Executor):
             self._offered = command
             if self._grip is not None:
                 self._grip.take(command)
-                write.command.payload_mass, write.command.payload_offset = command.payload_mass, command.payload_offset
+                write.command.payload_mass, write.command.payload_offset = (
+                    command.payload_mass,
+                    command.payload_offset,
+                )
 
     def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
-        """Take over inertia and load of the reference that is followed; compute them while none is."""
+        """Take over inertia and load of the reference that is followed; compute them while none
+        is."""
         if stopped or self.reference.holding:
             self.loads.hold(arm.position)
         elif self._offered is not None:

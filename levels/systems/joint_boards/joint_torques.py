@@ -25,10 +25,14 @@ class JointTorques(CommandsAbove):
     def __init__(self, context: LevelContext, cell: Cell) -> None:
         super().__init__(context, cell.patience, 1, "torque", "braked")
         joints = len(cell.home)
-        self._sum = np.zeros(3 * joints + 5)  # the fields of a `JOINT_TORQUE` from `torque` to `payload_offset`
+        self._sum = np.zeros(
+            3 * joints + 5
+        )  # the fields of a `JOINT_TORQUE` from `torque` to `payload_offset`
         self.torque = self._sum[:joints]  # (joints,), N m
         self._offset = self._sum[-3:]
-        self.wanted = Motion(np.zeros((3, joints)))  # where the boards want the joints; accelerations are not known
+        self.wanted = Motion(
+            np.zeros((3, joints))
+        )  # where the boards want the joints; accelerations are not known
         self.moves = False  # a joint is wanted to move
         self.rests_on = 0  # serial of the newest command of an operator that the torques rest on
         self._messages: dict[str, Message] = {}
@@ -61,7 +65,8 @@ class JointTorques(CommandsAbove):
         self.moves = self._add_up(self._sum, self.wanted.table, self._memory, self._begins)
 
     def _see(self, board: str, message: Message) -> None:
-        """Find the numbers of a message: those of the next ones of its board are in the same place."""
+        """Find the numbers of a message: those of the next ones of its board are in the same
+        place."""
         self._messages[board] = message
         views = [numbers(m, "torque", "payload_offset") for m in self._messages.values()]
         self._memory, self._begins = one_view(*views)

@@ -1,17 +1,19 @@
 """The messages between a trajectory level, the boards that servo joints, and the board of the arm.
 
-Every vector has all joints of the arm; a board of some joints fills and obeys its own. Symbolic sizes as in
-`rack.levels.messages`.
+Every vector has all joints of the arm; a board of some joints fills and obeys its own. Symbolic
+sizes as in `rack.levels.messages`.
 
 A level of your own that servoes joints
-- names them in its parameter `joints` (without one: all), and says with `gripper = true` that it drives the gripper.
-- writes a `JOINT_TORQUE` in every cycle, for the moment when it acts: a cycle after the release. `sampled` shows the
-  arm which of its statuses the torque rests on; one that is too old brakes it.
-- wants its joints where they are while the arm says `braked`: only then is it released. While it only says `stopped`,
-  brings them to rest and holds them; an arm that still moves after the time that this takes is braked.
+- names them in its parameter `joints` (without one: all), and says with `gripper = true` that it
+  drives the gripper.
+- writes a `JOINT_TORQUE` in every cycle, for the moment when it acts: a cycle after the release.
+  `sampled` shows the arm which of its statuses the torque rests on; one that is too old brakes it.
+- wants its joints where they are while the arm says `braked`: only then is it released. While it
+  only says `stopped`, brings them to rest and holds them; an arm that still moves after the time
+  that this takes is braked.
 
-A level of your own above these reports no set point (`due = 0`) while one of them is `stopped`, and begins again where
-they hold the arm.
+A level of your own above these reports no set point (`due = 0`) while one of them is `stopped`, and
+begins again where they hold the arm.
 """
 
 from __future__ import annotations
@@ -29,39 +31,68 @@ JOINT_REFERENCE = command(
     Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
     Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
     Field("inertia", "f8", "kg m2", "diagonal of the joint-space inertia there", ("joints",)),
-    Field("load", "f8", "N m", "torques of gravity and motion there, without acceleration", ("joints",)),
+    Field(
+        "load",
+        "f8",
+        "N m",
+        "torques of gravity and motion there, without acceleration",
+        ("joints",),
+    ),
     Field("opening", "f8", "m", "gripper joint position to go to"),
     Field("force", "f8", "N", "largest gripper force"),
     Field("payload_mass", "f8", "kg", "mass in the gripper, which `inertia` and `load` include"),
     Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
 )
-"""From the trajectory level to all boards that servo joints; these interpolate between its set points."""
+"""From the trajectory level to all boards that servo joints; these interpolate between its set
+points."""
 
 JOINT_TORQUE = command(
     "joint_torque",
     1,
     RESTS_ON,
-    Field("sampled", "i8", "tick", "tick of the arm's status that it rests on; -1: none yet, so no torque"),
+    Field(
+        "sampled",
+        "i8",
+        "tick",
+        "tick of the arm's status that it rests on; -1: none yet, so no torque",
+    ),
     Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
-    Field("target", "f8", "rad", "where the board wants its own joints when the torque acts; others 0", ("joints",)),
+    Field(
+        "target",
+        "f8",
+        "rad",
+        "where the board wants its own joints when the torque acts; others 0",
+        ("joints",),
+    ),
     Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
     Field("grip_force", "f8", "N", "of the gripper, from the board that drives it; others 0"),
-    Field("payload_mass", "f8", "kg", "mass in the gripper, from the board that drives it; others 0"),
+    Field(
+        "payload_mass", "f8", "kg", "mass in the gripper, from the board that drives it; others 0"
+    ),
     Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
 )
-"""From a board that servoes joints to the board of the arm, which adds them up; id rises with every cycle."""
+"""From a board that servoes joints to the board of the arm, which adds them up; id rises with every
+cycle."""
 
 JOINT_STATUS = status(
     "joint_status",
     1,
     *ANSWER,
     Field("position", "f8", "rad", "joint positions, from the arm's status", ("joints",)),
-    Field("target", "f8", "rad", "set point of the board's own joints in this cycle; others 0", ("joints",)),
+    Field(
+        "target",
+        "f8",
+        "rad",
+        "set point of the board's own joints in this cycle; others 0",
+        ("joints",),
+    ),
     Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
     Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
     Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
     Field("holding", "u1", "1", "1: no fresh set point, the joints ramp to rest and stay"),
-    Field("stopped", "u1", "1", "1: set points are not followed: an operator, or the arm is braked"),
+    Field(
+        "stopped", "u1", "1", "1: set points are not followed: an operator, or the arm is braked"
+    ),
     Field("due", "i8", "tick", "newest set point taken over; 0: none"),
 )
 """From a board that servoes joints to the trajectory level."""
@@ -73,7 +104,8 @@ ARM_STATUS = status(
     Field("tick", "i8", "tick", "tick at which the arm was sensed"),
     *DRIVEN_ARM,
 )
-"""From the board of the arm to those that servo joints; a servo level's status without set points of its own."""
+"""From the board of the arm to those that servo joints; a servo level's status without set points
+of its own."""
 
 DRIVING = (SERVO_STATUS.name, ARM_STATUS.name)
 """Names of the statuses of levels that drive an arm."""

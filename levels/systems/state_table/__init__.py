@@ -1,4 +1,5 @@
-"""State tables: levels whose executors are tables in TOML files, with static plans and no planners."""
+"""State tables: levels whose executors are tables in TOML files, with static plans and no
+planners."""
 
 from rack.levels.systems.state_table.elemental_move import MoveTable
 from rack.levels.systems.state_table.level import StateTableExecutor

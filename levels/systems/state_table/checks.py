@@ -1,7 +1,9 @@
-"""The check of a state table: unknown words, unreachable states, overlapping rows, cases that no row takes.
+"""The check of a state table: unknown words, unreachable states, overlapping rows, cases that no
+row takes.
 
-The cases of a state are the combinations of the values of all conditions that its rows name. A set of cases is kept as
-boxes, a set of values per condition each; what a row leaves of a box are at most as many boxes as it has conditions.
+The cases of a state are the combinations of the values of all conditions that its rows name. A set
+of cases is kept as boxes, a set of values per condition each; what a row leaves of a box are at
+most as many boxes as it has conditions.
 """
 
 from __future__ import annotations
@@ -71,7 +73,9 @@ def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
     for condition, values in row.when.items():
         known = vocabulary.conditions.get(condition)
         if known is None:
-            found.append(f"when: unknown condition '{condition}'; known: {', '.join(vocabulary.conditions)}")
+            found.append(
+                f"when: unknown condition '{condition}'; known: {', '.join(vocabulary.conditions)}"
+            )
             continue
         found += [
             f"when: {condition} is never '{value}'; its values: {', '.join(known.values)}"
@@ -79,7 +83,9 @@ def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
             if value not in known.values
         ]
         if not values:
-            found.append(f"when: {condition} has an empty list; its values: {', '.join(known.values)}")
+            found.append(
+                f"when: {condition} has an empty list; its values: {', '.join(known.values)}"
+            )
     return found
 
 
@@ -100,17 +106,25 @@ def _states(text: TableText) -> Iterator[str]:
         state = ahead.pop()
         if state not in reached:
             reached.add(state)
-            ahead += [row.next for row in _rows_of(state, text).values() if row.next not in (None, SAME)]
+            ahead += [
+                row.next for row in _rows_of(state, text).values() if row.next not in (None, SAME)
+            ]
     # If the start is unknown, nothing is reached.
     for state in names if text.start in names else ():
         if state not in reached:
             numbers = ", ".join(map(str, _rows_of(state, text)))
-            yield f"row {numbers}: unreachable: no row leads from '{text.start}' to the state '{state}'"
+            yield (
+                f"row {numbers}: unreachable: no row leads from '{text.start}' to the state"
+                f" '{state}'"
+            )
 
 
 def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) -> Iterator[str]:
-    """Yield overlaps of the rows of one state, rows that never fire, and cases that no row takes."""
-    named = [name for name in vocabulary.conditions if any(name in row.when for row in rows.values())]
+    """Yield overlaps of the rows of one state, rows that never fire, and cases that no row
+    takes."""
+    named = [
+        name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
+    ]
     every: Box = {name: frozenset(vocabulary.conditions[name].values) for name in named}
     boxes = {number: {**every, **_box(row)} for number, row in rows.items()}
     left = [every]
@@ -120,7 +134,10 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
             yield from _overlaps(state, (number, row), {n: rows[n] for n in earlier}, boxes)
         rest = [piece for box in left for piece in without(box, boxes[number])]
         if row.otherwise and rest == left:
-            yield f"{_named(number, row)}: never fires in '{state}': the rows above it take every case of it"
+            yield (
+                f"{_named(number, row)}: never fires in '{state}': the rows above it take every"
+                " case of it"
+            )
         left = rest
     left = joined(left)
     for box in left[:MAX_HOLES]:
@@ -130,16 +147,24 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
 
 
 def _overlaps(
-    state: str, new: tuple[int, RowConfig], earlier: Mapping[int, RowConfig], boxes: Mapping[int, Box]
+    state: str,
+    new: tuple[int, RowConfig],
+    earlier: Mapping[int, RowConfig],
+    boxes: Mapping[int, Box],
 ) -> Iterator[str]:
     number, row = new
     for other, before in earlier.items():
         both = {name: values & boxes[other][name] for name, values in boxes[number].items()}
         if all(both.values()):
-            shared = {name: values for name, values in both.items() if name in row.when or name in before.when}
+            shared = {
+                name: values
+                for name, values in both.items()
+                if name in row.when or name in before.when
+            }
             yield (
-                f"{_named(number, row)}: overlaps {_named(other, before)} in '{state}'"
-                f" when {_listed(shared)}; let them exclude each other, or give the later one else = true"
+                f"{_named(number, row)}: overlaps {_named(other, before)} in '{state}' when"
+                f" {_listed(shared)}; let them exclude each other, or give the later one else ="
+                " true"
             )
 
 
@@ -148,7 +173,8 @@ def _box(row: RowConfig) -> Box:
 
 
 def without(box: Box, taken: Box) -> Sequence[Box]:
-    """Return disjoint boxes that hold the cases of `box` that are not in `taken`; both name the same conditions."""
+    """Return disjoint boxes that hold the cases of `box` that are not in `taken`; both name the
+    same conditions."""
     pieces = []
     rest = dict(box)
     for condition, values in taken.items():
@@ -177,9 +203,14 @@ def joined(boxes: Sequence[Box]) -> list[Box]:
 
 def _described(box: Box, vocabulary: Vocabulary) -> str:
     """Return the cases of a box as text, without the conditions that may have any value."""
-    narrow = {n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n].values)}
+    narrow = {
+        n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n].values)
+    }
     return _listed(narrow)
 
 
 def _listed(box: Box) -> str:
-    return ", ".join(f"{name} = {'|'.join(sorted(values))}" for name, values in box.items()) or "any case"
+    return (
+        ", ".join(f"{name} = {'|'.join(sorted(values))}" for name, values in box.items())
+        or "any case"
+    )

@@ -1,7 +1,8 @@
-"""The elemental move level as a state table: pick and place by poses taught relative to an object or a place.
+"""The elemental move level as a state table: pick and place by poses taught relative to an object
+or a place.
 
-The plan is static: heights above what is to be reached, at a speed each. The executor computes the joints of a pose
-when a row says `move`, from the object's place as sensed, in bounded time.
+The plan is static: heights above what is to be reached, at a speed each. The executor computes the
+joints of a pose when a row says `move`, from the object's place as sensed, in bounded time.
 """
 
 from __future__ import annotations
@@ -63,9 +64,15 @@ class MovePlanConfig(Table):
     pose: dict[Name, TaughtPoseConfig] = Key(min_length=1, description="poses by name")
     place: dict[Name, Place] = Key({}, description="origin of an object put there, m, by name")
     moved: NotNegative = Key(
-        0.01, description="distance from where it was sensed , or should stand, at which an object is displaced, m"
+        0.01,
+        description=(
+            "distance from where it was sensed , or should stand, at which an object is"
+            " displaced, m"
+        ),
     )
-    home_speed: Positive = Key(1.0, le=1.0, description="part of the joints' limits on the way home")
+    home_speed: Positive = Key(
+        1.0, le=1.0, description="part of the joints' limits on the way home"
+    )
 
 
 class MoveTable(StateTableExecutor):
@@ -86,9 +93,12 @@ class MoveTable(StateTableExecutor):
             "world": Condition(("seen", "unseen"), "whether the objects are sensed"),
             "target": Condition(
                 ("there", "displaced", "moving"),
-                "the object to pick: there: where it was sensed for the newest `move`; a place is always there",
+                "the object to pick: there: where it was sensed for the newest `move`; a place is"
+                " always there",
             ),
-            "support": Condition(("there", "elsewhere"), "where the object put down last rests: at its place, or not"),
+            "support": Condition(
+                ("there", "elsewhere"), "where the object put down last rests: at its place, or not"
+            ),
             "gripper": Condition(("free", "holds"), "whether the gripper holds something"),
             "reach": Condition(YES_NO, "whether the newest pose has joint positions"),
         },
@@ -98,7 +108,9 @@ class MoveTable(StateTableExecutor):
             HOME: Phrase((), "go where the arm starts"),
         },
         actions={
-            "move": Phrase(("pose",), "go to a pose, relative to the object or place of the command in force"),
+            "move": Phrase(
+                ("pose",), "go to a pose, relative to the object or place of the command in force"
+            ),
             "open": Phrase((), "open the gripper"),
             "close": Phrase((), "close the gripper"),
         },
@@ -116,7 +128,9 @@ class MoveTable(StateTableExecutor):
         self._aim = np.zeros(3)  # m: where the object, or the place, was for it
         self._yaw = 0.0  # rad: likewise
         self._holds = False  # the gripper holds something
-        self._carried = self._put = -1  # rows of the object in it, and of the one put down last; -1: none
+        self._carried = (
+            self._put
+        ) = -1  # rows of the object in it, and of the one put down last; -1: none
         self._row = -1  # of that object in the world model; -1: it was a place
         self._positions: Array = np.zeros((context.sizes["bodies"], 3))  # m, as sensed
         self._quaternions: Array = np.zeros((context.sizes["bodies"], 4))
@@ -155,7 +169,11 @@ class MoveTable(StateTableExecutor):
             "below": answer_of(read.status, self._sent),
             "world": "seen" if is_seen else "unseen",
             "target": self._target(world) if is_seen else "moving",
-            "support": "there" if not is_seen or self._put < 0 or self._is_at(world, self._put) else "elsewhere",
+            "support": (
+                "there"
+                if not is_seen or self._put < 0 or self._is_at(world, self._put)
+                else "elsewhere"
+            ),
             "gripper": ("free", "holds")[self._holds],
             "reach": YES_NO[self._reached],
         }
@@ -194,7 +212,8 @@ class MoveTable(StateTableExecutor):
         self._send("close", self._joints, 1.0)
 
     def _tool_at(self, height: float) -> Pose:
-        """Return the pose of the tool, pointing down, at a height above the object or place of the command."""
+        """Return the pose of the tool, pointing down, at a height above the object or place of the
+        command."""
         verb, *names = self.words
         now = self._ik.tool_at(self._joints)
         self._row = self.context.scene.objects.index(names[0]) if verb == "pick" else -1
@@ -202,14 +221,18 @@ class MoveTable(StateTableExecutor):
             self._aim[:], self._yaw = self.table.plan.place[names[0]], 0.0
         elif not self._holds:
             # In the gripper it moves with the arm: it is raised from where it was.
-            self._aim[:], self._yaw = self._positions[self._row], yaw_of(self._quaternions[self._row])
+            self._aim[:], self._yaw = (
+                self._positions[self._row],
+                yaw_of(self._quaternions[self._row]),
+            )
         above = self._aim + np.array([0.0, 0.0, height])
         # Across the object's faces, whichever quarter turn is nearest to the tool now.
         turns = [pointing(DOWN, -(self._yaw + quarter * 0.5 * math.pi)) for quarter in range(4)]
         return min((Pose(above, turn) for turn in turns), key=now.angle_to)
 
     def _solve(self, goal: Pose) -> Array | None:
-        """Return joint positions, rad, at a pose: on the branch of the arm, else from home; at most three descents."""
+        """Return joint positions, rad, at a pose: on the branch of the arm, else from home; at most
+        three descents."""
         found = self._ik.nearby(goal, self._joints)
         if found is None:
             found = self._ik.reach(goal, self._cell.home)

@@ -1,8 +1,9 @@
-"""A level whose executor is a state table: preprocess (read), decide (the table), postprocess (write).
+"""A level whose executor is a state table: preprocess (read), decide (the table), postprocess
+(write).
 
-Plans are static: the file of a table names taught poses or steps, and no planner runs. The tables of a level are read
-when its board starts, never in a cycle; an operator swaps between them at a tick. To try an edited file, restart the
-board: `rack inject RACK BOARD kill`.
+Plans are static: the file of a table names taught poses or steps, and no planner runs. The tables
+of a level are read when its board starts, never in a cycle; an operator swaps between them at a
+tick. To try an edited file, restart the board: `rack inject RACK BOARD kill`.
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ from rack.levels.tables import SceneConfig, Table, read_params
 COMMAND_HEAD = (
     RESTS_ON,
     Field("hold", "u1", "1", "1: come to rest and stay, whatever is under way"),
-    Field("words", f"S{PHRASE_BYTES}", "ASCII", "the command with its parameters, as in 'pick block1'"),
+    Field(
+        "words", f"S{PHRASE_BYTES}", "ASCII", "the command with its parameters, as in 'pick block1'"
+    ),
 )
 """First fields of every command to a level of this kind."""
 STATUS_HEAD = (
@@ -64,7 +67,12 @@ STATUS_HEAD = (
     Field("row", "u2", "1", "row that fired in this cycle, from 1; 0: none"),
     Field("fired", f"S{ROW_NAME_BYTES}", "ASCII", "its name"),
     Field("words", f"S{PHRASE_BYTES}", "ASCII", "command in force; empty: none"),
-    Field("ordered", "u4", "1", "serial of an operator's command, if it is in force; 0: it is the level above's"),
+    Field(
+        "ordered",
+        "u4",
+        "1",
+        "serial of an operator's command, if it is in force; 0: it is the level above's",
+    ),
     Field("done", "u4", "1", "newest command of the level above that is done; 0: none"),
 )
 """First fields of the status of every level of this kind: with them a restarted board goes on."""
@@ -82,7 +90,10 @@ class StateTableParams(Table):
     """`[board.<name>.params]`: the state tables of the level."""
 
     tables: dict[Name, Annotated[Path, Key(strict=False)]] = Key(
-        min_length=1, description="TOML files by name, relative to the config; the first is in force at the start"
+        min_length=1,
+        description=(
+            "TOML files by name, relative to the config; the first is in force at the start"
+        ),
     )
 
 
@@ -92,22 +103,29 @@ def vocabulary(
     commands: Mapping[str, Phrase] | None = None,
     plan: type[Table] | None = None,
 ) -> Vocabulary:
-    """Return the vocabulary of a level: its own words and, if it accepts commands, those that come with them."""
+    """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
+    with them."""
     late = Condition(YES_NO, "whether the state has lasted longer than the table's patience")
     found = {**conditions, LATE: late}
     acts = dict(actions)
     if commands:
         found["command"] = Condition(
             ("none", UNKNOWN, *commands),
-            f"the newest command, of an operator or the level above; {UNKNOWN}: the level does not know its words",
+            f"the newest command, of an operator or the level above; {UNKNOWN}: the level does not"
+            " know its words",
         )
-        found["new"] = Condition(YES_NO, f"whether no row has done '{TAKE}' since that command came")
-        acts[TAKE] = Phrase((), "let the newest command be the one in force: the status answers it from now on")
+        found["new"] = Condition(
+            YES_NO, f"whether no row has done '{TAKE}' since that command came"
+        )
+        acts[TAKE] = Phrase(
+            (), "let the newest command be the one in force: the status answers it from now on"
+        )
     return Vocabulary(found, commands or {}, acts, *([plan] if plan is not None else []))
 
 
 class StateTableExecutor(Executor):
-    """Base of the levels: a class declares its `vocabulary`, and has `look`, and `do_<action>` for each action."""
+    """Base of the levels: a class declares its `vocabulary`, and has `look`, and `do_<action>` for
+    each action."""
 
     commands = {
         Operation.HOLD: (),
@@ -139,9 +157,15 @@ class StateTableExecutor(Executor):
         self._words = ""  # command in force
         self._taken: tuple[bool, int] = (False, 0)  # whether it is an operator's, and its serial
         self._done = 0  # newest command of the level above that is done
-        self._newest: tuple[bool, int, str] = (False, 0, "")  # the newest command likewise, and its words
+        self._newest: tuple[bool, int, str] = (
+            False,
+            0,
+            "",
+        )  # the newest command likewise, and its words
         self._kept = ""  # why this level, or the one above, is held; empty: it is not
-        self._recalled = 0  # newest command of an operator that the last status before a restart had answered
+        self._recalled = (
+            0  # newest command of an operator that the last status before a restart had answered
+        )
         self._started = False
 
     @classmethod
@@ -183,16 +207,35 @@ class StateTableExecutor(Executor):
             yield f"params.tables.{name}", files[name].name, why
 
     @classmethod
-    def _unlike(cls, tables: Mapping[str, StateTable], scene: SceneConfig) -> Iterator[tuple[str, str]]:
-        """Yield tables that do not know a command that another one does, and why: the one in force outlives a swap."""
-        known = {name: [*phrases(cls.vocabulary.commands, cls.lexicon(scene, t.plan))] for name, t in tables.items()}
+    def _unlike(
+        cls, tables: Mapping[str, StateTable], scene: SceneConfig
+    ) -> Iterator[tuple[str, str]]:
+        """Yield tables that do not know a command that another one does, and why: the one in force
+        outlives a swap."""
+        known = {
+            name: [*phrases(cls.vocabulary.commands, cls.lexicon(scene, t.plan))]
+            for name, t in tables.items()
+        }
         for name in tables:
-            lacking = {phrase: other for other in tables for phrase in known[other] if phrase not in known[name]}
+            lacking = {
+                phrase: other
+                for other in tables
+                for phrase in known[other]
+                if phrase not in known[name]
+            }
             for phrase, other in lacking.items():
-                yield name, f"does not know '{phrase}', as '{other}' does; all tables of a level know the same commands"
+                yield (
+                    name,
+                    (
+                        f"does not know '{phrase}', as '{other}' does; all tables of a level know"
+                        " the same commands"
+                    ),
+                )
 
     @classmethod
-    def wording(cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig) -> Sequence[str]:
+    def wording(
+        cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig
+    ) -> Sequence[str]:
         """Return the names of the tables, or the commands that the first one's plan permits."""
         tables = read_params(StateTableParams, params).tables
         if what is Operation.TABLE:
@@ -201,7 +244,8 @@ class StateTableExecutor(Executor):
         return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, plan)))
 
     def use(self, name: str) -> None:
-        """Put a table in force. It goes on in the state of the same name; without one, in the state it starts in."""
+        """Put a table in force. It goes on in the state of the same name; without one, in the state
+        it starts in."""
         self.table_name, self.table = name, self.tables[name]
         if self.state not in self.table.rows:
             self.state = self.table.start
@@ -253,7 +297,8 @@ class StateTableExecutor(Executor):
         return bool(self._kept)
 
     def recall(self, read: Ports, write: Ports) -> None:
-        """Continue from the last messages in the level's own mailboxes, after a restart of its board."""
+        """Continue from the last messages in the level's own mailboxes, after a restart of its
+        board."""
         if not read.last_status.is_there:
             return
         last = read.last_status.value
@@ -267,7 +312,9 @@ class StateTableExecutor(Executor):
 
     def _preprocess(self, read: Ports) -> None:
         self.orders.take(read.operator, self._judge)
-        above: Reading | None = next(iter(read.command.values()), None) if "command" in self.inputs else None
+        above: Reading | None = (
+            next(iter(read.command.values()), None) if "command" in self.inputs else None
+        )
         ordered = self.orders.standing is Operation.DO
         if not ordered and above is not None and above.value.id != self._done:
             self._newest = False, above.value.id, self._understood(above.value)
@@ -277,7 +324,9 @@ class StateTableExecutor(Executor):
         if self.orders.standing is Operation.HOLD:
             self._kept = self.orders.keeps(self.context.board)
         elif above is not None and not ordered:
-            self._kept = ABOVE_LOST if above.is_lost else HELD_FROM_ABOVE if above.value.hold else ""
+            self._kept = (
+                ABOVE_LOST if above.is_lost else HELD_FROM_ABOVE if above.value.hold else ""
+            )
         self._rests_on = self.orders.rests_on(above.value.operator if above is not None else 0)
 
     def _understood(self, command: Message) -> str:
@@ -286,7 +335,11 @@ class StateTableExecutor(Executor):
         if command.id == serial and not self._newest[0]:
             return words
         lexicon = self.lexicon(self.context.scene, self.table.plan)
-        return UNKNOWN if objection(command.words, self.vocabulary.commands, lexicon) else command.words
+        return (
+            UNKNOWN
+            if objection(command.words, self.vocabulary.commands, lexicon)
+            else command.words
+        )
 
     def _judge(self, order: Message) -> None:
         """Take up an operator's command for this kind of level."""
@@ -305,7 +358,9 @@ class StateTableExecutor(Executor):
     def _report(self, write: Ports, row: Row | None, values: Mapping[str, str]) -> None:
         """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""
         shown: Message = write.status
-        state, reason = (row.status, row.reason) if row is not None else (State.ERROR, self._no_row(values))
+        state, reason = (
+            (row.status, row.reason) if row is not None else (State.ERROR, self._no_row(values))
+        )
         if self._kept and state is State.EXECUTING:
             state = State.HOLDING
             reason = self._kept
@@ -319,7 +374,13 @@ class StateTableExecutor(Executor):
         shown.state = state
         shown.error = Error.TABLE if state is State.ERROR else Error.NONE
         shown.reason = reason
-        shown.echo = serial if not is_operators else 0 if self.orders.standing is Operation.DO else self._done
+        shown.echo = (
+            serial
+            if not is_operators
+            else 0
+            if self.orders.standing is Operation.DO
+            else self._done
+        )
         shown.table = self.table_name
         shown.checksum = self.table.checksum
         shown.in_state = self.state

@@ -1,6 +1,8 @@
-"""The primitive level as a state table: straight motions in joint space from rest to rest, and the gripper.
+"""The primitive level as a state table: straight motions in joint space from rest to rest, and the
+gripper.
 
-A motion is a smooth stream of set points for the boards that servo the joints, two cycles ahead of the arm.
+A motion is a smooth stream of set points for the boards that servo the joints, two cycles ahead of
+the arm.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 from rack.levels.tables import Positive, Table
 
 LEAD_CYCLES = 2
-"""Cycles from the release that makes a set point to the tick at which it is due: one brings it down, the boards below
-interpolate to it over the second."""
+"""Cycles from the release that makes a set point to the tick at which it is due: one brings it
+down, the boards below interpolate to it over the second."""
 HANDOVER_CYCLES = 4
 """Cycles from the first set point until the boards below must follow."""
 NOWHERE_RAD = 1e-9
@@ -68,7 +70,9 @@ JOINT_MOVE_STATUS = status(
 class PrimitivePlanConfig(Table):
     """`[plan]` of the primitive level's table."""
 
-    settled: Positive = Key(0.01, description="distance from its end at which a joint has arrived, rad")
+    settled: Positive = Key(
+        0.01, description="distance from its end at which a joint has arrived, rad"
+    )
 
 
 class PrimitiveTable(StateTableExecutor):
@@ -83,13 +87,21 @@ class PrimitiveTable(StateTableExecutor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
-    commands = {what: goals for what, goals in StateTableExecutor.commands.items() if what is not Operation.DO}
+    commands = {
+        what: goals
+        for what, goals in StateTableExecutor.commands.items()
+        if what is not Operation.DO
+    }
     vocabulary = vocabulary(
         conditions={
-            "hold": Condition(YES_NO, "whether an operator or the level above holds this one, or its board is lost"),
+            "hold": Condition(
+                YES_NO,
+                "whether an operator or the level above holds this one, or its board is lost",
+            ),
             "arm": Condition(
                 ("arrived", "resting", "moving", "away"),
-                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the joints do not follow",
+                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the"
+                " joints do not follow",
             ),
             "gripper": Condition(("moving", "open", "empty", "holds"), "empty: closed on nothing"),
         },
@@ -99,7 +111,10 @@ class PrimitiveTable(StateTableExecutor):
             "close": Phrase((), "close the gripper"),
         },
         actions={
-            "begin": Phrase((), "begin the motion to the joints of the command in force; while the arm moves, halt"),
+            "begin": Phrase(
+                (),
+                "begin the motion to the joints of the command in force; while the arm moves, halt",
+            ),
             "halt": Phrase((), "ramp to rest"),
             "open": Phrase((), "open the gripper"),
             "close": Phrase((), "close the gripper"),
@@ -118,7 +133,10 @@ class PrimitiveTable(StateTableExecutor):
         self._masses = cell.model.body_subtreemass[cell.bodies].copy()  # kg
         self._point = np.zeros((3, len(cell.home)))  # the newest set point: rad, rad/s, rad/s2
         self._point[0] = cell.home
-        self._goal, self._speed = cell.home.copy(), 1.0  # rad, part of the limits: of the newest command
+        self._goal, self._speed = (
+            cell.home.copy(),
+            1.0,
+        )  # rad, part of the limits: of the newest command
         self._end = cell.home.copy()  # (joints,), rad: where the newest motion ends
         self._curve: Curve | None = None  # None: at rest
         self._from = 0  # tick at which it began
@@ -136,7 +154,8 @@ class PrimitiveTable(StateTableExecutor):
         curves.preload()
 
     def recall(self, read: Ports, write: Ports) -> None:
-        """Continue with the gripper as it is; the arm's motion begins anew from where the boards below hold it."""
+        """Continue with the gripper as it is; the arm's motion begins anew from where the boards
+        below hold it."""
         super().recall(read, write)
         if read.last_status.is_there:
             last = read.last_status.value
@@ -154,7 +173,10 @@ class PrimitiveTable(StateTableExecutor):
             self._target = reading.value.object
         position = self._follow(read)
         due = self._due(tick)
-        if self._curve is not None and (due - self._from) * self.context.tick_s >= self._curve.ends_s:
+        if (
+            self._curve is not None
+            and (due - self._from) * self.context.tick_s >= self._curve.ends_s
+        ):
             self._point[0], self._point[1:], self._curve = self._curve.table[curves.REST], 0.0, None
         away = np.abs(position - self._point[0]).max() > self.table.plan.settled
         self.resting = self._curve is None and not away
@@ -173,7 +195,9 @@ class PrimitiveTable(StateTableExecutor):
         position: Array = statuses[0].position
         gone = any(reading.is_lost or not reading.is_there for reading in readings)
         stopped = gone or any(below.stopped for below in statuses)
-        self.detail = "its board is lost" if gone else next((s.reason for s in statuses if s.reason), "")
+        self.detail = (
+            "its board is lost" if gone else next((s.reason for s in statuses if s.reason), "")
+        )
         idle = any(below.holding for below in statuses) and self._follows > HANDOVER_CYCLES
         if stopped or idle:
             self._follows = 0
@@ -213,7 +237,9 @@ class PrimitiveTable(StateTableExecutor):
     def do_halt(self) -> None:
         """Ramp to rest."""
         if self._curve is not None:
-            self._start(Ramp(self._point[0].copy(), self._point[1].copy(), self._limits.acceleration))
+            self._start(
+                Ramp(self._point[0].copy(), self._point[1].copy(), self._limits.acceleration)
+            )
 
     def _start(self, curve: Curve) -> None:
         self._curve = curve
@@ -246,7 +272,9 @@ class PrimitiveTable(StateTableExecutor):
         command.id = tick // self.context.every + 1
         command.due = due if self._follows else 0
         command.position, command.velocity, command.acceleration = self._point
-        load = Payload(self._masses[self._object] if self._held and self._object >= 0 else 0.0, np.zeros(3))
+        load = Payload(
+            self._masses[self._object] if self._held and self._object >= 0 else 0.0, np.zeros(3)
+        )
         inertia, bias = self._dynamics.terms(self._point[0], self._point[1], load)
         command.inertia = np.diagonal(inertia)
         command.load = bias

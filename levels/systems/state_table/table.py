@@ -5,7 +5,7 @@
     [[row]]
     name = "begin a motion"
     state = "idle"                          # or a list of states
-    when = { command = "move", new = "yes" }  # a condition left out: any value; a list: any of these
+    when = { command = "move", new = "yes" }  # left out: any value; a list: any of these
     next = "moving"
     do = ["take", "begin"]
     status = "executing"
@@ -18,8 +18,8 @@
 
     [plan]                                  # the static plan, as the level declares it
 
-`next = "same"` stays in the state. In every cycle the first row that matches fires, and no other. Rows of a state
-exclude each other, unless the later one says `else`; together they take every case.
+`next = "same"` stays in the state. In every cycle the first row that matches fires, and no other.
+Rows of a state exclude each other, unless the later one says `else`; together they take every case.
 `rack.levels.systems.state_table.checks` sees to that before the launch.
 """
 
@@ -50,7 +50,9 @@ Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$
 
 def _listed(value: Any) -> Any:
     """Return one word as a list of one, and TOML's lists as tuples, which are frozen."""
-    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+    return (
+        (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+    )
 
 
 Words = Annotated[tuple[str, ...], BeforeValidator(_listed)]
@@ -61,19 +63,26 @@ Place = Annotated[Vector, BeforeValidator(_listed)]
 SAME = "same"
 """The `next` of a row that stays in its state."""
 LATE = "late"
-"""The condition that every table may use: whether its state has lasted longer than its `patience`."""
+"""The condition that every table may use: whether its state has lasted longer than its
+`patience`."""
 
 
 class RowConfig(Table):
     """`[[row]]`: one row of a state table."""
 
     name: RowName = Field(description="what the row is for: shown while it fires")
-    state: States = Field(min_length=1, description="the state, or a list of states, in which it may fire")
+    state: States = Field(
+        min_length=1, description="the state, or a list of states, in which it may fire"
+    )
     when: dict[str, Words] = Field({}, description="value, or a list of values, by condition")
-    otherwise: bool = Field(False, alias="else", description="takes what the rows of the state above this one leave")
+    otherwise: bool = Field(
+        False, alias="else", description="takes what the rows of the state above this one leave"
+    )
     # Missing ones are reported with what else is wrong with the table.
     next: Name | None = Field(None, description="next state, or same")
-    do: Words | None = Field(None, description="actions with their parameters, in order; may be an empty list")
+    do: Words | None = Field(
+        None, description="actions with their parameters, in order; may be an empty list"
+    )
     status: str | None = Field(None, description="state shown upwards: " + ", ".join(STATES))
     reason: Reason | None = Field(None, description="shown with status error or holding")
 
@@ -82,7 +91,9 @@ class TableConfig(Table):
     """A state table's file."""
 
     start: Name = Field(description="state in which the table begins")
-    patience: Positive = Field(10.0, description="time in one state after which the condition late is yes, s")
+    patience: Positive = Field(
+        10.0, description="time in one state after which the condition late is yes, s"
+    )
     row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500, description="its rows")
     plan: dict[str, Any] = Field({}, description="the level's static plan")
 
@@ -101,7 +112,9 @@ class Row:
 
     number: int
     name: str
-    when: Mapping[str, frozenset[str]]  # values permitted, by condition; one left out may have any value
+    when: Mapping[
+        str, frozenset[str]
+    ]  # values permitted, by condition; one left out may have any value
     is_else: bool
     next: str
     do: tuple[tuple[str, ...], ...]  # actions: verb and parameters
@@ -115,7 +128,8 @@ class Row:
 
 @dataclass(frozen=True)
 class StateTable:
-    """The rows of a file by state, each state's in their order; `plan` is the level's record of `[plan]`."""
+    """The rows of a file by state, each state's in their order; `plan` is the level's record of
+    `[plan]`."""
 
     start: str
     patience_s: float
@@ -124,7 +138,8 @@ class StateTable:
     checksum: int  # CRC-32 of the file
 
     def decide(self, state: str, values: Mapping[str, str]) -> Row | None:
-        """Return the row that fires; None: no row takes the case, which cannot happen in a table that was checked."""
+        """Return the row that fires; None: no row takes the case, which cannot happen in a table
+        that was checked."""
         for row in self.rows.get(state, ()):
             if row.matches(values):
                 return row
@@ -201,7 +216,9 @@ def _flaws(error: ValidationError | TypeError, place: str, kind: type[Table]) ->
     lines = []
     for entry in error.errors(include_url=False):
         key = ".".join(str(part) for part in entry["loc"])
-        why = {"missing": "missing", "extra_forbidden": f"unknown key; known: {known}"}.get(entry["type"])
+        why = {"missing": "missing", "extra_forbidden": f"unknown key; known: {known}"}.get(
+            entry["type"]
+        )
         lines.append(f"{place}{key}: {why or _wrong(entry['msg'], entry['input'])}")
     return lines
 

@@ -1,4 +1,5 @@
-"""The task level as a state table: a static list of steps, each an object and the place to which it goes."""
+"""The task level as a state table: a static list of steps, each an object and the place to which it
+goes."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ class TaskPlanConfig(Table):
 
 
 class TaskTable(StateTableExecutor):
-    """Sends the commands of its steps to the level below, one after the other, as its table says."""
+    """Sends the commands of its steps to the level below, one after the other, as its table
+    says."""
 
     inputs = {
         "status": Input(MOVE_TABLE_STATUS, "below.status"),
@@ -69,7 +71,8 @@ class TaskTable(StateTableExecutor):
         },
         actions={
             "send": Phrase(
-                (("pick", "place", "home"),), "command the level below, for the object or place of the step"
+                (("pick", "place", "home"),),
+                "command the level below, for the object or place of the step",
             ),
             "next": Phrase((), "go on to the next step"),
         },
@@ -85,7 +88,11 @@ class TaskTable(StateTableExecutor):
     def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
         """Return steps with unknown objects."""
         known = ", ".join(scene.objects) or "none"
-        steps = [(at, step.object) for at, step in enumerate(plan.step) if step.object not in scene.objects]
+        steps = [
+            (at, step.object)
+            for at, step in enumerate(plan.step)
+            if step.object not in scene.objects
+        ]
         return [f"plan.step[{at}].object: unknown '{name}'; objects: {known}" for at, name in steps]
 
     @classmethod
@@ -102,7 +109,8 @@ class TaskTable(StateTableExecutor):
                 for at, step in enumerate(cls.read(path, context.scene).plan.step):
                     if f"place {step.place}" not in known:
                         why = (
-                            f"plan.step[{at}].place: unknown '{step.place}'; '{other.board}' knows: {', '.join(known)}"
+                            f"plan.step[{at}].place: unknown '{step.place}'; '{other.board}' knows:"
+                            f" {', '.join(known)}"
                         )
                         yield f"params.tables.{name}", path.name, why
 
@@ -122,7 +130,10 @@ class TaskTable(StateTableExecutor):
         below = answer_of(read.status, self._sent)
         self.detail = read.status.value.reason
         self.resting = bool(read.status.value.resting)
-        return {"below": below, "step": "more" if self._step < len(self.table.plan.step) else "none"}
+        return {
+            "below": below,
+            "step": "more" if self._step < len(self.table.plan.step) else "none",
+        }
 
     def do_send(self, what: str) -> None:
         """Command the level below."""

@@ -1,7 +1,7 @@
 """The words of a level's state tables: conditions, commands that it accepts, actions.
 
-A level's class declares them; a table, a TOML file, combines them. Every set of words is finite, so whether two rows
-overlap, and which case no row takes, can be decided exactly.
+A level's class declares them; a table, a TOML file, combines them. Every set of words is finite, so
+whether two rows overlap, and which case no row takes, can be decided exactly.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ NAME_BYTES = 24
 PHRASE_BYTES = 64
 """Longest command or action, with its parameters."""
 TAKE = "take"
-"""The action of every level: from now on the newest command is the one in force, and the status answers it."""
+"""The action of every level: from now on the newest command is the one in force, and the status
+answers it."""
 
 
 class Condition(NamedTuple):
@@ -31,7 +32,9 @@ class Condition(NamedTuple):
 class Phrase(NamedTuple):
     """A command that a level accepts, or an action: a word, and the words that may follow it."""
 
-    parameters: tuple[str | tuple[str, ...], ...]  # one set of words each; a name stands for a set of `Lexicon`
+    parameters: tuple[
+        str | tuple[str, ...], ...
+    ]  # one set of words each; a name stands for a set of `Lexicon`
     meaning: str
 
 
@@ -45,7 +48,8 @@ class NoPlan(Table):
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file of a table."""
+    """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file
+    of a table."""
 
     conditions: Mapping[str, Condition]
     commands: Mapping[str, Phrase]

@@ -1,4 +1,5 @@
-"""A trajectory level that follows a queue of motion requests, and the planning level that queues them.
+"""A trajectory level that follows a queue of motion requests, and the planning level that queues
+them.
 
 Names are imported on first use: tools that read the messages need not wait for the levels.
 """

@@ -19,8 +19,9 @@ MAX_REST_RAD_S = 1e-3
 class JointBoards:
     """Decides from the boards' statuses whether they are in step with this level, all or none.
 
-    One that is lost, stopped or left alone lets all fall out of step: none gets set points, so each ramps to rest by
-    itself. They get back into step when all hold at rest; motion continues from there.
+    One that is lost, stopped or left alone lets all fall out of step: none gets set points, so each
+    ramps to rest by itself. They get back into step when all hold at rest; motion continues from
+    there.
     """
 
     def __init__(self, joints: Sequence[str]) -> None:
@@ -48,7 +49,8 @@ class JointBoards:
         return True
 
     def leave(self, why: str) -> None:
-        """Let all fall out of step: they come to rest by themselves, and motion begins again from where they hold."""
+        """Let all fall out of step: they come to rest by themselves, and motion begins again from
+        where they hold."""
         self.in_step = False
         self.awaited = why
 
@@ -73,7 +75,9 @@ class JointBoards:
             mine = status.driven.astype(bool)
             # Written so that NaN does not count as rest.
             resting = (np.abs(status.target_velocity[mine]) <= MAX_REST_RAD_S).all()
-            if self._silent[board] or not (status.holding and resting and np.isfinite(status.target[mine]).all()):
+            if self._silent[board] or not (
+                status.holding and resting and np.isfinite(status.target[mine]).all()
+            ):
                 self.awaited = f"waiting for {board}: it does not hold its joints at rest"
                 return False
             self.position[mine] = status.target[mine]

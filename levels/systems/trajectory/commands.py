@@ -1,13 +1,15 @@
-"""A command environment on the host side: motions as plain Python calls, in a script or at a prompt.
+"""A command environment on the host side: motions as plain Python calls, in a script or at a
+prompt.
 
     move(joints)                  a straight line in joint space
-    line(position, ...)           a straight line of the tool, in the world's frame or that of a body
+    line(position, ...)           a straight line of the tool, in the world's frame or a body's
     stay(seconds), grip(opening)  at rest
     cancel()                      drop everything; the arm ramps to rest
     done(), wait()                whether all is done; wait until it is
 
-A call returns as soon as its request is on its way: requests are queued, and blended. It waits only while the queue is
-full. A request that is lost, with a board that died as it held it, is sent again by the next call that waits.
+A call returns as soon as its request is on its way: requests are queued, and blended. It waits only
+while the queue is full. A request that is lost, with a board that died as it held it, is sent again
+by the next call that waits.
 """
 
 from __future__ import annotations
@@ -23,7 +25,12 @@ from pydantic import Field
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import (
+    MOTION_REQUEST,
+    MOTION_STATUS,
+    MotionKind,
+    RequestEnd,
+)
 from rack.levels.tables import RobotConfig, SceneConfig, Table, read_params
 
 DOWN = (0.0, 1.0, 0.0, 0.0)
@@ -61,7 +68,9 @@ class Motions:
         # No request of a former process has a greater number than it has sent messages.
         self._newest = bus.sent("requests")
         self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
-        self._idle_since: float | None = None  # time since when nothing is under way, though requests are open
+        self._idle_since: float | None = (
+            None  # time since when nothing is under way, though requests are open
+        )
         if self._newest:
             self.cancel()
 
@@ -79,15 +88,21 @@ class Motions:
         guard: float = 0.0,
         **times: float,
     ) -> int:
-        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live` goal follows.
+        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live`
+        goal follows.
 
-        With a `guard`, N m, it ends GUARDED where a joint's torque changes by more: the arm met something.
+        With a `guard`, N m, it ends GUARDED where a joint's torque changes by more: the arm met
+        something.
         """
         if body and body not in self._bodies:
-            raise LevelError(f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}")
+            raise LevelError(
+                f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}"
+            )
         row = self._bodies.index(body) if body else WORLD
         pose = {"position": position, "quaternion": quaternion}
-        return self._request(kind=MotionKind.POSE, body=row, live=live, touch=guard, **pose, **times)
+        return self._request(
+            kind=MotionKind.POSE, body=row, live=live, touch=guard, **pose, **times
+        )
 
     def stay(self, seconds: float) -> int:
         """Stay at the goal before."""
@@ -99,7 +114,9 @@ class Motions:
         if gripper is None:
             raise LevelError("grip: the arm has no gripper")
         wanted = gripper.closed if opening is None else opening
-        return self._request(kind=MotionKind.GRIP, opening=wanted, force=gripper.force if force is None else force)
+        return self._request(
+            kind=MotionKind.GRIP, opening=wanted, force=gripper.force if force is None else force
+        )
 
     def release(self) -> int:
         """Open the gripper."""
@@ -118,10 +135,13 @@ class Motions:
 
     def done(self, request: int | None = None) -> bool:
         """Return whether a request, by default the newest, has ended."""
-        return bool(self._bus.read("motion").value.done >= (self._newest if request is None else request))
+        return bool(
+            self._bus.read("motion").value.done >= (self._newest if request is None else request)
+        )
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
-        """Wait until a request, by default the newest, has ended; False if `until` holds before, or the run ends."""
+        """Wait until a request, by default the newest, has ended; False if `until` holds before, or
+        the run ends."""
         while not self.done(request):
             if until() or self._bus.is_over:
                 return False
@@ -143,11 +163,14 @@ class Motions:
         return self._newest
 
     def _look(self) -> None:
-        """Wait for news; send the requests again that are lost: nothing is under way, and not all are done."""
+        """Wait for news; send the requests again that are lost: nothing is under way, and not all
+        are done."""
         self._bus.wait(LOOK_S)
         status = self._bus.read("motion").value
         now = self._bus.time_s
-        self._open = {number: request for number, request in self._open.items() if number > status.done}
+        self._open = {
+            number: request for number, request in self._open.items() if number > status.done
+        }
         if status.current or not self._open:
             self._idle_since = None
         elif self._idle_since is None:
@@ -178,7 +201,9 @@ class CommandEnvironment(HostProgram):
 
     def run(self, bus: Bus) -> None:
         """Run the script; raises `LevelError` if there is no such file."""
-        found = next((path for folder in sys.path if (path := Path(folder) / self._script).is_file()), None)
+        found = next(
+            (path for folder in sys.path if (path := Path(folder) / self._script).is_file()), None
+        )
         if found is None:
             raise LevelError(f"params.script = {self._script}: not in a folder of python_path")
         runpy.run_path(str(found), {"bus": bus, "program": self, **self.names(bus)}, "__main__")

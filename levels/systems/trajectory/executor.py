@@ -1,4 +1,5 @@
-"""The executor of a trajectory level: follows the motion requests of its queue with a set point every cycle."""
+"""The executor of a trajectory level: follows the motion requests of its queue with a set point
+every cycle."""
 
 from __future__ import annotations
 
@@ -29,12 +30,14 @@ One brings it to the boards that servo joints, which interpolate to it over the 
 
 
 class TrajectoryExecutor(Executor):
-    """Does motion requests in the order of the queue, blended; when it is empty, the arm rests at the last goal.
+    """Does motion requests in the order of the queue, blended; when it is empty, the arm rests at
+    the last goal.
 
-    It needs no board above: what is queued is done. While a board below is lost or stopped, and on an operator's hold,
-    the arm rests; the request under way then goes on from there. A request that cannot be done ends REFUSED, or FAILED
-    on the way: the arm ramps to rest, all others held are CANCELLED, those that come are REFUSED until a CANCEL
-    [assumed]. After a restart the level continues with the requests in its own last messages.
+    It needs no board above: what is queued is done. While a board below is lost or stopped, and on
+    an operator's hold, the arm rests; the request under way then goes on from there. A request that
+    cannot be done ends REFUSED, or FAILED on the way: the arm ramps to rest, all others held are
+    CANCELLED, those that come are REFUSED until a CANCEL [assumed]. After a restart the level
+    continues with the requests in its own last messages.
     """
 
     inputs = {
@@ -46,7 +49,11 @@ class TrajectoryExecutor(Executor):
         "last_state": Input(MOTION_STATE, "own.state"),
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
-    outputs = {"command": JOINT_REFERENCE, "status": Output(MOTION_STATUS, rests_on="boards"), "state": MOTION_STATE}
+    outputs = {
+        "command": JOINT_REFERENCE,
+        "status": Output(MOTION_STATUS, rests_on="boards"),
+        "state": MOTION_STATE,
+    }
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
     work: ClassVar[type[RequestWork]] = RequestWork
@@ -98,10 +105,13 @@ class TrajectoryExecutor(Executor):
             self._work.cancel()
         self._watch(read, cycles)
         hold = self._orders.standing is Operation.HOLD
-        # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the boards hold.
+        # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the
+        # boards hold.
         for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
             if self._boards.in_step:
-                self._work.step((self._due(tick) - late * self.context.every) * self.context.tick_s, hold)
+                self._work.step(
+                    (self._due(tick) - late * self.context.every) * self.context.tick_s, hold
+                )
         self._write_reference(write.command, tick)
         self._write_status(write.status)
         self._save(write.state)
@@ -142,7 +152,11 @@ class TrajectoryExecutor(Executor):
         command.id = tick // self.context.every + 1
         # Out of step the arm's position is not certain: no set point is better than a wrong one.
         command.due = self._due(tick) if self._boards.in_step else 0
-        command.position[:], command.velocity[:], command.acceleration[:] = position, velocity, acceleration
+        command.position[:], command.velocity[:], command.acceleration[:] = (
+            position,
+            velocity,
+            acceleration,
+        )
         terms = self._dynamics.terms(position, velocity)
         command.inertia[:], command.load[:] = terms.inertia.diagonal(), terms.bias
         command.opening, command.force = self._work.grip
@@ -170,7 +184,9 @@ class TrajectoryExecutor(Executor):
         tool = self._ik.tool_at(position)
         status.tool[:] = tool.position
         reached = goal is not None and goal.live and motion.leg is not None and motion.settled
-        status.astray = goal.astray(tool.position, motion.time_s) if goal is not None and reached else 0.0
+        status.astray = (
+            goal.astray(tool.position, motion.time_s) if goal is not None and reached else 0.0
+        )
         if motion.resting:
             self._orders.done()
         self._orders.report(status, agenda.rests_on)
@@ -181,13 +197,25 @@ class TrajectoryExecutor(Executor):
         if self._orders.standing is not Operation.NONE:
             return self._orders.keeps(self.context.board)
         if self._agenda.missing:
-            return f"request {self._agenda.taken + 1} is missing: send all again from there, or a cancel"
-        return "" if self._sight.knows or self._agenda.current is not None else "waiting for the world model"
+            return (
+                f"request {self._agenda.taken + 1} is missing: send all again from there, or a"
+                " cancel"
+            )
+        return (
+            ""
+            if self._sight.knows or self._agenda.current is not None
+            else "waiting for the world model"
+        )
 
     def _save(self, state: Message) -> None:
         agenda = self._agenda
         state.passed = self._work.passed_s
-        newest = agenda.taken, agenda.done, agenda.begun, agenda.goal.id if agenda.goal is not None else 0
+        newest = (
+            agenda.taken,
+            agenda.done,
+            agenda.begun,
+            agenda.goal.id if agenda.goal is not None else 0,
+        )
         if newest != self._saved:
             self._saved = newest
             agenda.save(state)

@@ -1,9 +1,9 @@
 """The goal of a tool path: fixed, or in the frame of a body of the world model that it follows.
 
-A live goal is RCCL's functional transform: its function runs once for every sample, and an age stamp keeps a second
-reader of the same sample from running it again [S7]. The frame is extrapolated from when the body was sensed to the
-sample's time, and smoothed: a body may start with a jolt, an arm cannot. The smoothed frame catches up with a body of
-constant velocity completely.
+A live goal is RCCL's functional transform: its function runs once for every sample, and an age
+stamp keeps a second reader of the same sample from running it again [S7]. The frame is extrapolated
+from when the body was sensed to the sample's time, and smoothed: a body may start with a jolt, an
+arm cannot. The smoothed frame catches up with a body of constant velocity completely.
 """
 
 from __future__ import annotations
@@ -42,10 +42,14 @@ class WorldSight:
         """Return why the world model has no such body; empty: it has."""
         if -1 <= row < len(self._bodies):
             return ""
-        return f"body {row} is not in the world model; permitted: -1 (world) to {len(self._bodies) - 1}"
+        return (
+            f"body {row} is not in the world model; permitted: -1 (world) to"
+            f" {len(self._bodies) - 1}"
+        )
 
     def frame(self, row: int, time_s: float) -> tuple[Pose, Array]:
-        """Return where body `row` should be at `time_s`, and its velocity (3,), m/s; zero for one not seen lately."""
+        """Return where body `row` should be at `time_s`, and its velocity (3,), m/s; zero for one
+        not seen lately."""
         model = self._model
         if model is None:
             raise Unfit("nothing is known of the world")
@@ -58,8 +62,11 @@ class WorldSight:
 class ToolGoal:
     """The goal of one request."""
 
-    def __init__(self, goal: Pose, body: int, live: bool, sight: WorldSight, follow_s: float) -> None:
-        """Follow a live goal with the time constant `follow_s`; `goal` is in the frame of `body`, -1: the world."""
+    def __init__(
+        self, goal: Pose, body: int, live: bool, sight: WorldSight, follow_s: float
+    ) -> None:
+        """Follow a live goal with the time constant `follow_s`; `goal` is in the frame of `body`,
+        -1: the world."""
         self._goal = goal
         self._body = body
         self.live = live and body >= 0
@@ -73,7 +80,8 @@ class ToolGoal:
         self.evaluations = 0
 
     def update(self, time_s: float) -> None:
-        """Evaluate the goal for the sample at `time_s`; again for the same one does nothing. Raises `Unfit`."""
+        """Evaluate the goal for the sample at `time_s`; again for the same one does nothing. Raises
+        `Unfit`."""
         if self._body < 0 or time_s == self._stamp_s or (self._frame is not None and not self.live):
             return
         seen, velocity = self._sight.frame(self._body, time_s)
@@ -91,7 +99,8 @@ class ToolGoal:
         return self._pose
 
     def astray(self, position: Array, time_s: float) -> float:
-        """Return the distance, m, of a tool position at `time_s` from the goal on the body, unsmoothed."""
+        """Return the distance, m, of a tool position at `time_s` from the goal on the body,
+        unsmoothed."""
         return norm((self._sight.frame(self._body, time_s)[0] @ self._goal).position - position)
 
     def _follow(self, seen: Pose, velocity: Array, passed_s: float) -> None:
@@ -104,7 +113,9 @@ class ToolGoal:
         mujoco.mju_subQuat(turn, seen.quaternion, quaternion)
         # The body moves at its velocity in the step that ends at `seen`.
         off = seen.position - velocity * passed_s - frame.position
-        self._velocity = self._velocity + passed_s * pace * (pace * off + 2.0 * (velocity - self._velocity))
+        self._velocity = self._velocity + passed_s * pace * (
+            pace * off + 2.0 * (velocity - self._velocity)
+        )
         self._turning = self._turning + passed_s * pace * (pace * turn - 2.0 * self._turning)
         mujoco.mju_quatIntegrate(quaternion, self._turning, passed_s)
         self._frame = pose(frame.position + passed_s * self._velocity, quaternion)

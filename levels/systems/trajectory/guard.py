@@ -1,7 +1,9 @@
-"""The guard of a motion: a lasting change of a joint's torque, as where the arm meets something, ends it.
+"""The guard of a motion: a lasting change of a joint's torque, as where the arm meets something,
+ends it.
 
-Torques also change when the arm brakes, holds, or goes on after missed cycles. This level sees all of these; a change
-across one of them is no touch: the window begins anew, and only in steady motion.
+Torques also change when the arm brakes, holds, or goes on after missed cycles. This level sees all
+of these; a change across one of them is no touch: the window begins anew, and only in steady
+motion.
 """
 
 from __future__ import annotations
@@ -15,12 +17,14 @@ from rack.levels.algebra import Array
 from rack.levels.level import Reading
 
 LASTS_S = 0.04
-"""Parts of the window, at its begin and end, whose medians are compared: what a late cycle or a short braking leaves
-behind decays within half of it. The window is five times as long: over more, slow motion changes torques by itself."""
+"""Parts of the window, at its begin and end, whose medians are compared: what a late cycle or a
+short braking leaves behind decays within half of it. The window is five times as long: over more,
+slow motion changes torques by itself."""
 
 
 class TouchGuard:
-    """Compares torques, N m, at the end of its window with those at its begin; one sample a cycle."""
+    """Compares torques, N m, at the end of its window with those at its begin; one sample a
+    cycle."""
 
     def __init__(self, period_s: float) -> None:
         self._lasting = max(round(LASTS_S / period_s), 3)

@@ -1,9 +1,10 @@
 """Legs: motions from rest to rest, straight in joint space or of the tool, as functions of time.
 
-A leg of segment time T and half blend time a lasts T + 2a: its speed rises over 2a, stays, and falls over 2a. Its bends
-take at most half the acceleration of every joint, so a leg that begins while the one before it slows down keeps the
-limits. This is the straight path with polynomial transitions of RCCL [recalled]: two legs in sequence, the second begun
-a before the first ends, are one motion with matched position, velocity and acceleration.
+A leg of segment time T and half blend time a lasts T + 2a: its speed rises over 2a, stays, and
+falls over 2a. Its bends take at most half the acceleration of every joint, so a leg that begins
+while the one before it slows down keeps the limits. This is the straight path with polynomial
+transitions of RCCL [recalled]: two legs in sequence, the second begun a before the first ends, are
+one motion with matched position, velocity and acceleration.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ STEP_RAD = 0.1
 """Distance and turn between the poses of a tool path that are tried before it begins."""
 MAX_STEPS = 40
 SAMPLED = 1.15
-"""Factor on speeds and bends of a tool path that were found at its tried poses: between them they may be greater."""
+"""Factor on speeds and bends of a tool path that were found at its tried poses: between them they
+may be greater."""
 
 
 class Unfit(Exception):
@@ -52,7 +54,8 @@ class TimeLaw:
 
     @property
     def nominal_s(self) -> float:
-        """Time at which the goal would be reached at full speed: the middle of a blend into another leg."""
+        """Time at which the goal would be reached at full speed: the middle of a blend into another
+        leg."""
         return self.half_blend_s + self.segment_s
 
     @property
@@ -61,7 +64,8 @@ class TimeLaw:
         return self.nominal_s + self.leaving_s
 
     def leave_within(self, half_blend_s: float) -> None:
-        """Slow down over twice `half_blend_s`; at most the leg's own half blend time, and more than none."""
+        """Slow down over twice `half_blend_s`; at most the leg's own half blend time, and more than
+        none."""
         self.leaving_s = min(half_blend_s, self.half_blend_s)
 
     def part(self, time_s: float) -> float:
@@ -112,11 +116,17 @@ class JointLeg:
 class ToolLeg:
     """A straight line of the tool that turns at a constant rate, to a goal that may move.
 
-    The goal is asked for its pose once for every sample. Inverse kinematics stays on the branch of the start.
+    The goal is asked for its pose once for every sample. Inverse kinematics stays on the branch of
+    the start.
     """
 
     def __init__(
-        self, start: Array, goal: Callable[[], Pose], live: bool, times: Times, solver: tuple[InverseKinematics, Limits]
+        self,
+        start: Array,
+        goal: Callable[[], Pose],
+        live: bool,
+        times: Times,
+        solver: tuple[InverseKinematics, Limits],
     ) -> None:
         """Prepare the way from the joint positions `start`. Raises `Unfit`."""
         self._ik, limits = solver
@@ -137,11 +147,14 @@ class ToolLeg:
         found = self._ik.nearby(pose, near)
         if found is None:
             x, y, z = pose.position
-            raise Unfit(f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f}, {part:.0%} of the way")
+            raise Unfit(
+                f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f}, {part:.0%} of the way"
+            )
         return found
 
     def _try_out(self, start: Array, goal: Pose) -> tuple[Array, Array]:
-        """Return the greatest first and second derivative of the joints by the part of the way, (joints,) each."""
+        """Return the greatest first and second derivative of the joints by the part of the way,
+        (joints,) each."""
         way = norm(goal.position - self._from.position)
         turn = self._from.angle_to(goal)
         steps = min(max(ceil(way / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
@@ -156,23 +169,28 @@ class ToolLeg:
 def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> tuple[TimeLaw, float]:
     """Return the time law of a leg, and the least half blend time in which it may slow down.
 
-    `speed` and `bend` are the first and second derivatives of joint positions by the part of the way, (joints,) each. A
-    segment time that is too short for a limit, or for two blends, is stretched.
+    `speed` and `bend` are the first and second derivatives of joint positions by the part of the
+    way, (joints,) each. A segment time that is too short for a limit, or for two blends, is
+    stretched.
     """
     half = times.half_blend
     most = BLEND_PART * limits.acceleration
     slope = PEAK * speed / half
-    needed = np.maximum(speed / limits.velocity, (slope + np.sqrt(slope * slope + 4.0 * most * bend)) / (2.0 * most))
+    needed = np.maximum(
+        speed / limits.velocity, (slope + np.sqrt(slope * slope + 4.0 * most * bend)) / (2.0 * most)
+    )
     segment = max(float(needed.max()), times.segment, 2.0 * half)
     room = most - bend / (segment * segment)
     return TimeLaw(segment, half), min(half, float((PEAK * speed / segment / room).max()))
 
 
 class Settling:
-    """A ramp to rest of every joint by itself: matched position, velocity and acceleration, then rest."""
+    """A ramp to rest of every joint by itself: matched position, velocity and acceleration, then
+    rest."""
 
     def __init__(self, state: tuple[Array, Array, Array], most: Array, least_s: float) -> None:
-        """Begin at `state`, rad, rad/s, rad/s2, within the accelerations `most`, in `least_s` or more."""
+        """Begin at `state`, rad, rad/s, rad/s2, within the accelerations `most`, in `least_s` or
+        more."""
         self._position, self._velocity, acceleration = state
         # The peak is at most 1.5 |v| / T + |a| / 3, and |a| at the begin.
         self._acceleration = np.clip(acceleration, -most, most)
@@ -188,5 +206,6 @@ class Settling:
         by_velocity = h - h * h * h * (1.0 - 0.5 * h)
         by_acceleration = h * h * (0.5 - h * (2.0 / 3.0 - 0.25 * h))
         return np.asarray(
-            self._position + t * (self._velocity * by_velocity + self._acceleration * t * by_acceleration)
+            self._position
+            + t * (self._velocity * by_velocity + self._acceleration * t * by_acceleration)
         )

@@ -1,4 +1,5 @@
-"""Motion requests, which a planning level or a program queues, and the status of the level that does them."""
+"""Motion requests, which a planning level or a program queues, and the status of the level that
+does them."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.operator import ANSWER, RESTS_ON
 
 HELD = 16
-"""Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than these are open."""
+"""Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than
+these are open."""
 ENDED = 8
 """Ended requests that a status lists."""
 
@@ -20,9 +22,12 @@ class MotionKind(IntEnum):
     JOINTS = 1  # a straight line in joint space, to joint positions
     POSE = 2  # a straight line of the tool, to a pose
     STAY = 3  # stay at the goal before it for `segment`
-    CANCEL = 4  # end the request under way and drop all queued before this one; the arm ramps to rest
+    CANCEL = (
+        4  # end the request under way and drop all queued before this one; the arm ramps to rest
+    )
     GRIP = 5  # bring the gripper to `opening` with at most `force`, at rest
-    COMPLY = 6  # of a server of force and motion alone, like GUARD: see `rack.levels.systems.force.messages`
+    # of a server of force and motion alone, like GUARD: see `rack.levels.systems.force.messages`
+    COMPLY = 6
     GUARD = 7
 
 
@@ -45,26 +50,55 @@ MOTION_REQUEST = command(
     Field("joints", "f8", "rad", "goal of JOINTS", ("joints",)),
     Field("position", "f8", "m", "goal of POSE: tool position, in the frame of `body`", (3,)),
     Field("quaternion", "f8", "1", "goal of POSE: tool orientation, in the frame of `body`", (4,)),
-    Field("body", "i2", "1", "row of the body in the world model in whose frame the goal is; -1: the world"),
-    Field("live", "u1", "1", "1: the goal follows the body; 0: its frame is copied when the request begins"),
-    Field("acceleration", "f8", "s", "half the time of the blend into this request; 0: the level's default"),
-    Field("segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"),
+    Field(
+        "body",
+        "i2",
+        "1",
+        "row of the body in the world model in whose frame the goal is; -1: the world",
+    ),
+    Field(
+        "live",
+        "u1",
+        "1",
+        "1: the goal follows the body; 0: its frame is copied when the request begins",
+    ),
+    Field(
+        "acceleration",
+        "f8",
+        "s",
+        "half the time of the blend into this request; 0: the level's default",
+    ),
+    Field(
+        "segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"
+    ),
     Field("opening", "f8", "m", "gripper joint position to go to, for GRIP"),
     Field("force", "f8", "N", "largest gripper force, for GRIP"),
-    Field("touch", "f8", "N m", "lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard"),
+    Field(
+        "touch",
+        "f8",
+        "N m",
+        "lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard",
+    ),
 )
-"""`id` numbers requests, rising by one from 1 in the order of the queue; one not above those taken is a repetition."""
+"""`id` numbers requests, rising by one from 1 in the order of the queue; one not above those taken
+is a repetition."""
 
 
 def state_of(name: str, request: MessageType) -> MessageType:
-    """Return the type of what a restarted level needs, with its status, to neither repeat nor lose a request."""
+    """Return the type of what a restarted level needs, with its status, to neither repeat nor lose
+    a request."""
     return MessageType(
         name,
         1,
         (
             Field("begun", "u1", "1", "1: the first of `requests` is under way"),
             Field("passed", "f8", "s", "time that it has stayed or gripped"),
-            Field("goal", request, "", "the request at whose goal the arm is, or to which it goes; id 0: none"),
+            Field(
+                "goal",
+                request,
+                "",
+                "the request at whose goal the arm is, or to which it goes; id 0: none",
+            ),
             Field("count", "u2", "1", "requests that follow"),
             Field("requests", request, "", "taken and not ended, oldest first", (HELD,)),
         ),

@@ -1,7 +1,7 @@
 """The commanded motion as samples: the leg under way, plus what is left of the motion before it.
 
-In every cycle the motion is evaluated once, one sample ahead. Velocity and acceleration of a sample are the differences
-of those around it, so they always fit the positions, however these come about.
+In every cycle the motion is evaluated once, one sample ahead. Velocity and acceleration of a sample
+are the differences of those around it, so they always fit the positions, however these come about.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
 
 STOP_PART = 0.85
-"""Part of the acceleration limits that a stop takes: states are known by differences of samples only."""
+"""Part of the acceleration limits that a stop takes: states are known by differences of samples
+only."""
 LEAST_STOP_CYCLES = 5
 """A joint that hardly moves takes so long to stop, for its acceleration to end smoothly."""
 EXCESS = 1.04
-"""Multiple of a limit that a sample may show, as from rounding of inverse kinematics; the planned velocity limits are
-5 % below those of the arm."""
+"""Multiple of a limit that a sample may show, as from rounding of inverse kinematics; the planned
+velocity limits are 5 % below those of the arm."""
 MAX_REST_RAD = 1e-7
 """Samples that differ by less are the same."""
 
@@ -35,7 +36,8 @@ class JointState(NamedTuple):
 
 
 class SampledMotion:
-    """Begins legs, blends them, stops: without a step in position or velocity, within the limits of every joint."""
+    """Begins legs, blends them, stops: without a step in position or velocity, within the limits of
+    every joint."""
 
     def __init__(self, limits: Limits, joints: tuple[str, ...], period_s: float) -> None:
         self._limits = limits
@@ -56,7 +58,8 @@ class SampledMotion:
         self._held_state = self.state
 
     def advance(self, time_s: float) -> None:
-        """Go on to the sample at `time_s`, the next one. Raises `Unfit` with the arm ramping to rest."""
+        """Go on to the sample at `time_s`, the next one. Raises `Unfit` with the arm ramping to
+        rest."""
         self.time_s = time_s
         self._held_state = self.state
         before, here = self._samples[1:]
@@ -69,7 +72,11 @@ class SampledMotion:
         except Unfit:
             # The sample ahead cannot be made: go on from the state before this one.
             _, velocity, acceleration = self._held_state
-            self._settle(JointState(here, velocity + self._period_s * acceleration, acceleration), STOP_PART, 0.0)
+            self._settle(
+                JointState(here, velocity + self._period_s * acceleration, acceleration),
+                STOP_PART,
+                0.0,
+            )
             self._leg = None
             self._look_ahead()
             raise
@@ -79,7 +86,9 @@ class SampledMotion:
         """The present sample."""
         before, here, after = self._samples
         h = self._period_s
-        return JointState(here, (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h))
+        return JointState(
+            here, (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h)
+        )
 
     @property
     def leg(self) -> Leg | None:
@@ -93,15 +102,21 @@ class SampledMotion:
 
     @property
     def settled(self) -> bool:
-        """Whether the leg, if there is one, has reached its goal, and nothing is left of the motion before it."""
+        """Whether the leg, if there is one, has reached its goal, and nothing is left of the motion
+        before it."""
         reached = self._leg is None or self.leg_s >= self._leg.law.ends_s
-        return reached and (self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s)
+        return reached and (
+            self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s
+        )
 
     @property
     def resting(self) -> bool:
         """Whether the present sample is at rest."""
         before, here, after = self._samples
-        return bool((np.abs(after - before) < MAX_REST_RAD).all() and (np.abs(after - here) < MAX_REST_RAD).all())
+        return bool(
+            (np.abs(after - before) < MAX_REST_RAD).all()
+            and (np.abs(after - here) < MAX_REST_RAD).all()
+        )
 
     def stop(self) -> None:
         """Ramp to rest from the present sample."""
@@ -110,7 +125,8 @@ class SampledMotion:
         self._look_ahead()
 
     def begin(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
-        """Begin the leg that `make` makes from where the motion so far ends, which slows down over two half blends.
+        """Begin the leg that `make` makes from where the motion so far ends, which slows down over
+        two half blends.
 
         Raises `Unfit` with the arm ramping to rest.
         """
@@ -118,7 +134,9 @@ class SampledMotion:
             self._rest = self._samples[1]
             self._settling = None
         elif not self.settled or self._leg is not None:
-            self._settle(self.state, BLEND_PART, max(2.0 * half_blend_s, LEAST_STOP_CYCLES * self._period_s))
+            self._settle(
+                self.state, BLEND_PART, max(2.0 * half_blend_s, LEAST_STOP_CYCLES * self._period_s)
+            )
         self._leg = None
         try:
             self._leg, self._begun_s = make(self._rest), self.time_s
@@ -127,7 +145,10 @@ class SampledMotion:
 
     def _settle(self, state: JointState, part: float, least_s: float) -> None:
         least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
-        self._settling, self._settles_s = Settling(state, part * self._limits.acceleration, least_s), self.time_s
+        self._settling, self._settles_s = (
+            Settling(state, part * self._limits.acceleration, least_s),
+            self.time_s,
+        )
         self._rest = self._settling.end
 
     def _look_ahead(self) -> None:
@@ -146,7 +167,8 @@ class SampledMotion:
         return np.asarray(position + (settling.at(time_s - self._settles_s) - settling.end))
 
     def _check(self) -> None:
-        """Raise `Unfit` if the present sample exceeds a limit, as when a live goal is too fast for the arm."""
+        """Raise `Unfit` if the present sample exceeds a limit, as when a live goal is too fast for
+        the arm."""
         _, velocity, acceleration = self.state
         for values, limits, unit in (
             (velocity, self._limits.velocity, "rad/s"),
@@ -157,4 +179,7 @@ class SampledMotion:
                 joint = int((np.abs(values) / limits).argmax())
                 name = self._joints[joint]
                 most = limits[joint]
-                raise Unfit(f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted: {most:.2f}")
+                raise Unfit(
+                    f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted:"
+                    f" {most:.2f}"
+                )

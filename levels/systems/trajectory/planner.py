@@ -1,8 +1,9 @@
-"""The planning level above a trajectory level: makes motion requests of a program, in the background, and queues them.
+"""The planning level above a trajectory level: makes motion requests of a program, in the
+background, and queues them.
 
-RCCL's user program made its motion requests asynchronously [S3], and copied their parameters as it queued them: only
-live goals stay open [assumed]. So does the planner: its plan is the queue. The executor only says how far the program
-is.
+RCCL's user program made its motion requests asynchronously [S3], and copied their parameters as it
+queued them: only live goals stay open [assumed]. So does the planner: its plan is the queue. The
+executor only says how far the program is.
 """
 
 from __future__ import annotations
@@ -36,17 +37,21 @@ from rack.levels.tables import Table, read_params
 BATCH = 2
 """Requests that one plan makes at most."""
 PATIENCE_S = 0.5
-"""Time after which a request that the level below does not report as taken is sent again: it may be lost."""
+"""Time after which a request that the level below does not report as taken is sent again: it may be
+lost."""
 
 
 class PlanningParams(Table):
     """How far the planner goes ahead, in `[board.<name>.params]`."""
 
-    ahead: int = Field(4, ge=1, le=HELD, description="requests that may be queued or under way at the same time")
+    ahead: int = Field(
+        4, ge=1, le=HELD, description="requests that may be queued or under way at the same time"
+    )
 
 
 class RequestExecutor(Executor):
-    """Reports the program done, or the error that ended it. It obeys no operator: the trajectory level does."""
+    """Reports the program done, or the error that ended it. It obeys no operator: the trajectory
+    level does."""
 
     inputs = {"status": Input(MOTION_STATUS, "below.status")}
     outputs = {"status": TASK_STATUS}
@@ -80,12 +85,16 @@ class RequestExecutor(Executor):
 class RequestPlanner(Planner):
     """Makes a request of each step of the program, a few ahead of the arm.
 
-    The request of step k has the id k + 1, so a restarted planner goes on after the newest one that the level below has
-    taken: a request sent twice is done once, and one that was lost is sent again. A tool goal that it finds no joint
-    positions for is queued as it stands: the level below refuses it, with its reason.
+    The request of step k has the id k + 1, so a restarted planner goes on after the newest one that
+    the level below has taken: a request sent twice is done once, and one that was lost is sent
+    again. A tool goal that it finds no joint positions for is queued as it stands: the level below
+    refuses it, with its reason.
     """
 
-    inputs = {"status": Input(MOTION_STATUS, "below.status"), "world": Input(WORLD_MODEL, "world.model")}
+    inputs = {
+        "status": Input(MOTION_STATUS, "below.status"),
+        "world": Input(WORLD_MODEL, "world.model"),
+    }
     output = Output(MOTION_REQUEST, queued=True)
     params = PlanningParams
     program = MotionProgram
@@ -99,9 +108,14 @@ class RequestPlanner(Planner):
         self._home = cell.home
         self._upright = self._ik.tool_at(cell.home).quaternion
         self._bodies = context.scene.bodies
-        self._goals: dict[int, Array] = {}  # joint positions (joints,), rad, at the end of each step planned
+        self._goals: dict[
+            int, Array
+        ] = {}  # joint positions (joints,), rad, at the end of each step planned
         self._sent: int | None = None  # newest request queued; None: not yet known, after a start
-        self._taken = 0, 0  # newest request taken below, and the tick at which it or `_sent` changed
+        self._taken = (
+            0,
+            0,
+        )  # newest request taken below, and the tick at which it or `_sent` changed
         self._begun = 0, 0  # newest request begun below, and the tick at which it was seen
 
     def wanted(self, read: Ports, tick: int) -> bool:
@@ -116,7 +130,11 @@ class RequestPlanner(Planner):
             self._sent = below.taken
         if below.taken != self._taken[0]:
             self._taken = below.taken, tick
-        elif below.taken < self._sent and self._since_s(self._taken, tick) > PATIENCE_S and not read.status.is_lost:
+        elif (
+            below.taken < self._sent
+            and self._since_s(self._taken, tick) > PATIENCE_S
+            and not read.status.is_lost
+        ):
             self._sent = below.taken
             self._taken = (below.taken, tick)
         return self._may_send(self._sent, below.done, tick)
@@ -183,7 +201,8 @@ class RequestPlanner(Planner):
             request.live = step.live
 
     def _goal_before(self, k: int, world: Message) -> Array:
-        """Return joint positions at the end of the step before step k, planning it if need be, as after a restart."""
+        """Return joint positions at the end of the step before step k, planning it if need be, as
+        after a restart."""
         if k == 0:
             return self._home
         if k - 1 not in self._goals:

@@ -8,7 +8,15 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from rack.levels.level import Program
-from rack.levels.tables import Finite, NotNegative, Positive, RobotConfig, SceneConfig, Table, Vector
+from rack.levels.tables import (
+    Finite,
+    NotNegative,
+    Positive,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    Vector,
+)
 
 MAX_REQUESTS = 200
 
@@ -18,8 +26,12 @@ Turn = tuple[Finite, Finite, Finite, Finite]
 class MotionStep(Table):
     """Base of the steps that move the arm."""
 
-    segment: NotNegative = Field(0.0, description="time of the segment, s; 0: from the limits; too short: stretched")
-    acceleration: NotNegative = Field(0.0, description="half the time of the blend into it, s; 0: the level's default")
+    segment: NotNegative = Field(
+        0.0, description="time of the segment, s; 0: from the limits; too short: stretched"
+    )
+    acceleration: NotNegative = Field(
+        0.0, description="half the time of the blend into it, s; 0: the level's default"
+    )
 
 
 class HomeStep(MotionStep):
@@ -34,7 +46,9 @@ class MoveStep(MotionStep):
     do: Literal["move"] = Field("move", description="the kind of step")
     joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
     position: Vector | None = Field(None, description="of the tool, m")
-    quaternion: Turn | None = Field(None, description="of the tool, as w, x, y, z; as at home when not given")
+    quaternion: Turn | None = Field(
+        None, description="of the tool, as w, x, y, z; as at home when not given"
+    )
 
     @model_validator(mode="after")
     def _one_goal(self) -> MoveStep:
@@ -46,7 +60,8 @@ class MoveStep(MotionStep):
 
 
 class LineStep(MotionStep):
-    """Move the tool along a straight line, to a pose in the world or in the frame of a body, which it may follow."""
+    """Move the tool along a straight line, to a pose in the world or in the frame of a body, which
+    it may follow."""
 
     do: Literal["line"] = Field("line", description="the kind of step")
     position: Vector = Field(description="of the tool, m, in the frame of `body`")
@@ -56,7 +71,10 @@ class LineStep(MotionStep):
     body: str | None = Field(
         None, description="object or obstacle in whose frame the goal is; the world when not given"
     )
-    live: bool = Field(False, description="true: the goal follows the body; false: it is copied when the motion begins")
+    live: bool = Field(
+        False,
+        description="true: the goal follows the body; false: it is copied when the motion begins",
+    )
 
     @model_validator(mode="after")
     def _follows_a_body(self) -> LineStep:
@@ -79,7 +97,9 @@ class GripStep(Table):
 
     do: Literal["grip"] = Field("grip", description="the kind of step")
     opening: Finite = Field(description="gripper joint position, m or rad")
-    force: Positive | None = Field(None, description="largest force, N or N m; that of the gripper when not given")
+    force: Positive | None = Field(
+        None, description="largest force, N or N m; that of the gripper when not given"
+    )
     seconds: NotNegative = Field(0.0, description="time that it takes, s; 0: the level's default")
 
 
@@ -100,15 +120,25 @@ class MotionProgram(Program):
         (), max_length=MAX_REQUESTS, description="steps, done in their order"
     )
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Iterator[tuple[str, Any, str]]:
+    def misfits(
+        self, robot: RobotConfig | None, scene: SceneConfig
+    ) -> Iterator[tuple[str, Any, str]]:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
         if robot is None:
             return
         for k, step in enumerate(self.step):
-            if isinstance(step, MoveStep) and step.joints is not None and len(step.joints) != len(robot.joints):
+            if (
+                isinstance(step, MoveStep)
+                and step.joints is not None
+                and len(step.joints) != len(robot.joints)
+            ):
                 why = f"{len(step.joints)} values; permitted: {len(robot.joints)}, one per joint"
                 yield f"step[{k}].joints", list(step.joints), why
-            if isinstance(step, LineStep) and step.body is not None and step.body not in scene.bodies:
+            if (
+                isinstance(step, LineStep)
+                and step.body is not None
+                and step.body not in scene.bodies
+            ):
                 why = f"not in the scene; bodies: {', '.join(scene.bodies) or 'none'}"
                 yield f"step[{k}].body", step.body, why
             if isinstance(step, GripStep) and robot.gripper is None:

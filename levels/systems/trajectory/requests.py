@@ -43,9 +43,24 @@ class MotionRequest(NamedTuple):
         """Return a copy of a request's record."""
         r = record.copy()
         goal = pose(r["position"], r["quaternion"])
-        one = int(r["id"]), int(r["kind"]), np.array(r["joints"]), goal, int(r["body"]), bool(r["live"])
+        one = (
+            int(r["id"]),
+            int(r["kind"]),
+            np.array(r["joints"]),
+            goal,
+            int(r["body"]),
+            bool(r["live"]),
+        )
         times = float(r["acceleration"]), float(r["segment"])
-        return cls(*one, *times, float(r["opening"]), float(r["force"]), float(r["touch"]), int(r["operator"]), r)
+        return cls(
+            *one,
+            *times,
+            float(r["opening"]),
+            float(r["force"]),
+            float(r["touch"]),
+            int(r["operator"]),
+            r,
+        )
 
     @property
     def moves(self) -> bool:
@@ -61,12 +76,21 @@ class MotionRequest(NamedTuple):
         """Return why no arm could do it; empty: it may be possible. `ranges` (joints, 2), rad."""
         if self.kind not in KINDS:
             return f"kind {self.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
-        numbers = self.record["acceleration"], self.record["segment"], self.record["opening"], self.record["force"]
+        numbers = (
+            self.record["acceleration"],
+            self.record["segment"],
+            self.record["opening"],
+            self.record["force"],
+        )
         if not np.isfinite(numbers).all() or self.acceleration < 0.0 or self.segment < 0.0:
-            return f"times {self.acceleration:g} and {self.segment:g} s; permitted: finite, 0 or more"
+            return (
+                f"times {self.acceleration:g} and {self.segment:g} s; permitted: finite, 0 or more"
+            )
         place = self.record["position"]
         turn = self.record["quaternion"]
-        if self.kind == MotionKind.POSE and not (np.isfinite(place).all() and np.isfinite(turn).all() and turn.any()):
+        if self.kind == MotionKind.POSE and not (
+            np.isfinite(place).all() and np.isfinite(turn).all() and turn.any()
+        ):
             return "the pose is not finite, or its quaternion is zero"
         # Written so that NaN is one.
         if not self.touch >= 0.0:
@@ -77,15 +101,19 @@ class MotionRequest(NamedTuple):
             if outside.any():
                 joint = int(outside.argmax())
                 low, high = ranges[joint]
-                return f"joint {joint + 1} to {self.joints[joint]:g} rad; permitted: {low:.3f} to {high:.3f}"
+                return (
+                    f"joint {joint + 1} to {self.joints[joint]:g} rad; permitted: {low:.3f} to"
+                    f" {high:.3f}"
+                )
         return ""
 
 
 class Agenda:
     """Requests taken and not ended, oldest first, and how the last ones ended.
 
-    After an error all are dropped, and those that come are refused until a CANCEL. While one is missing, those after it
-    are left: the sender sees by `taken` where to begin again, or sends a CANCEL.
+    After an error all are dropped, and those that come are refused until a CANCEL. While one is
+    missing, those after it are left: the sender sees by `taken` where to begin again, or sends a
+    CANCEL.
     """
 
     def __init__(self) -> None:
@@ -96,7 +124,9 @@ class Agenda:
         self.rests_on = 0  # newest command of an operator on which a request taken rests
         self.error = Error.NONE
         self.reason = ""
-        self.missing = False  # the request after `taken` was lost, with a board that died as it took it
+        self.missing = (
+            False  # the request after `taken` was lost, with a board that died as it took it
+        )
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
     @property
@@ -129,7 +159,8 @@ class Agenda:
         return cancelled
 
     def _take(self, request: MotionRequest) -> bool:
-        # One sent again, by a planning level that was restarted or that misses it in the status, is not a new one.
+        # One sent again, by a planning level that was restarted or that misses it in the status, is
+        # not a new one.
         if request.id <= self.taken:
             return False
         if request.kind != MotionKind.CANCEL and self.taken and request.id != self.taken + 1:

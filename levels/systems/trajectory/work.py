@@ -21,9 +21,13 @@ from rack.levels.tables import Positive, Table
 class TrajectoryParams(Table):
     """Times of motions and of following, in `[board.<name>.params]`."""
 
-    acceleration: Positive = Field(0.3, description="half the time of a blend, where a request gives none, s")
+    acceleration: Positive = Field(
+        0.3, description="half the time of a blend, where a request gives none, s"
+    )
     gripping: Positive = Field(0.6, description="time of a GRIP, where a request gives none, s")
-    follow: Positive = Field(0.25, description="time constant with which a live goal follows its body, s")
+    follow: Positive = Field(
+        0.25, description="time constant with which a live goal follows its body, s"
+    )
     blind: Positive = Field(0.3, description="time for which a body's motion is extrapolated, s")
 
 
@@ -44,7 +48,9 @@ class RequestWork:
         self.agenda = agenda
         self.motion = motion
         self._tools = tools
-        self.goal: ToolGoal | None = None  # of the leg under way or reached; None: it is one in joint space
+        self.goal: ToolGoal | None = (
+            None  # of the leg under way or reached; None: it is one in joint space
+        )
         self.passed_s = 0.0  # time that the request under way has stayed or gripped
         self.grip = 0.0, 0.0  # opening, m, and force, N, wanted by the last GRIP
         self._interrupted = True  # motion must begin anew from rest
@@ -70,7 +76,8 @@ class RequestWork:
         self.motion.stop()
 
     def end_guarded(self) -> None:
-        """End the request under way, GUARDED: the arm ramps to rest, and goes on from there with the next one."""
+        """End the request under way, GUARDED: the arm ramps to rest, and goes on from there with
+        the next one."""
         self.agenda.end(RequestEnd.GUARDED)
         self.agenda.goal = None  # the arm is not there
         self.cancel()
@@ -112,7 +119,9 @@ class RequestWork:
         return 1.0 - self._left * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
     def _fail(self, how: RequestEnd, reason: str, code: Error = Error.NONE) -> None:
-        self.agenda.fail(how, code or (Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT), reason)
+        self.agenda.fail(
+            how, code or (Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT), reason
+        )
         self.goal = None
         self._left = 1.0
         self._interrupted = False
@@ -140,10 +149,13 @@ class RequestWork:
         return self.passed_s >= self._lasts_s(current)
 
     def _lasts_s(self, request: MotionRequest) -> float:
-        return request.segment or (self._tools.params.gripping if request.kind == MotionKind.GRIP else 0.0)
+        return request.segment or (
+            self._tools.params.gripping if request.kind == MotionKind.GRIP else 0.0
+        )
 
     def _consider(self, request: MotionRequest) -> None:
-        """Begin `request` if its time has come: nothing is under way, or the leg under way is to be blended into it."""
+        """Begin `request` if its time has come: nothing is under way, or the leg under way is to be
+        blended into it."""
         current = self.agenda.current
         leg = self.motion.leg
         if not self._can_begin(request):
@@ -157,7 +169,8 @@ class RequestWork:
                 self._begin(request, half_s)
 
     def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
-        """Return half the time in which `leg` slows down, if now is the time to blend it into `request`."""
+        """Return half the time in which `leg` slows down, if now is the time to blend it into
+        `request`."""
         law = leg.law
         passed_s = self.motion.leg_s
         if passed_s > law.ends_s - 2.0 * law.leaving_s:
@@ -194,13 +207,16 @@ class RequestWork:
             self.grip = request.opening, request.force
 
     def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
-        """Begin the leg to the goal of `request`; the motion so far slows down over twice `half_s`."""
+        """Begin the leg to the goal of `request`; the motion so far slows down over twice
+        `half_s`."""
         params = self._tools.params
         limits = self._tools.limits
         times = Times(segment_s, max(request.acceleration or params.acceleration, half_s))
         goal = None
         if request.kind == MotionKind.POSE:
-            goal = ToolGoal(request.goal, request.body, request.live, self._tools.sight, params.follow)
+            goal = ToolGoal(
+                request.goal, request.body, request.live, self._tools.sight, params.follow
+            )
 
         def make(start: Array) -> Leg:
             if goal is None:

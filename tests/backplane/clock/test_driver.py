@@ -30,8 +30,11 @@ def start(segment: Segment, lead_ns: int = 3 * PERIOD_NS) -> None:
     segment.words[System.EPOCH_NS] = time.monotonic_ns() + lead_ns
 
 
-def given_out(segment: Segment, stop: int, meanwhile: Callable[[int], object] = id) -> list[tuple[int, int]]:
-    """Run the clock in real time up to `stop`; return every tick with the time at which it was decided on."""
+def given_out(
+    segment: Segment, stop: int, meanwhile: Callable[[int], object] = id
+) -> list[tuple[int, int]]:
+    """Run the clock in real time up to `stop`; return every tick with the time at which it was
+    decided on."""
     ticks: list[tuple[int, int]] = []
 
     def ended(tick: int) -> int | None:
@@ -79,9 +82,11 @@ def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
     with in_thread(take):
         ticks = given_out(segment, 40)
     assert any(at < epoch + tick * PERIOD_NS for tick, at in ticks)
-    # A task that waits for a signal is released at the grid point, where the others have found their release.
+    # A task that waits for a signal is released at the grid point, where the others have found
+    # their release.
     assert all(at >= epoch + second * PERIOD_NS and first >= second for first, second, at in made)
-    # One post as the grid begins, one at the end; one more only for a tick of which the clock was late.
+    # One post as the grid begins, one at the end; one more only for a tick of which the clock was
+    # late.
     assert wake_semaphore(segment.rack, "sleeper").value < 2 + len(ticks)
 
 
@@ -89,7 +94,9 @@ def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> N
     segment = make_bus(task("sleeper", wake="timer"))
     start(segment)
     # Every tick is decided on after its grid point.
-    numbers = [tick for tick, _ in given_out(segment, 30, lambda tick: time.sleep(2 * PERIOD_NS * 1e-9))]
+    numbers = [
+        tick for tick, _ in given_out(segment, 30, lambda tick: time.sleep(2 * PERIOD_NS * 1e-9))
+    ]
     assert wake_semaphore(segment.rack, "sleeper").value == 2 + len(numbers) - 1
 
 
@@ -119,7 +126,11 @@ def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> Non
     rows, _ = alarm_ring(segment, CLOCK).drain()
     (late,) = [row for row in rows if row["since"] == held_up[0] + 1]
     assert (late["code"], late["tick"]) == (Alarm.CLOCK_LATE, following)
-    assert (following - held_up[0] - 1) * PERIOD_NS <= late["value"] < (following - held_up[0]) * PERIOD_NS
+    assert (
+        (following - held_up[0] - 1) * PERIOD_NS
+        <= late["value"]
+        < (following - held_up[0]) * PERIOD_NS
+    )
 
 
 class Lagging:
@@ -162,7 +173,9 @@ def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:
     segment = make_bus(task("fast"), task("slow", every=4, slot=3))
     start(segment)
     fast, slow, seen = segment.block("fast"), segment.block("slow"), []
-    ticks = given_out(segment, 40, lambda tick: seen.append((fast[Block.RELEASED], slow[Block.RELEASED])))
+    ticks = given_out(
+        segment, 40, lambda tick: seen.append((fast[Block.RELEASED], slow[Block.RELEASED]))
+    )
     # A tick sees the releases of the tick before it, even across skipped ticks.
     before = [tick for tick, _ in ticks][:-1]
     assert seen == [(-1, -1), *((tick, tick - tick % 4) for tick in before)]
@@ -172,7 +185,9 @@ def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:
 def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
     make_bus: MakeBus, skipped: tuple[int, ...]
 ) -> None:
-    specs = [replace(task(f"t{phase}", every=4, slot=2 + phase), phase=phase) for phase in (0, 1, 3)]
+    specs = [
+        replace(task(f"t{phase}", every=4, slot=2 + phase), phase=phase) for phase in (0, 1, 3)
+    ]
     segment = make_bus(*specs)
     driver = RealtimeDriver(segment, lambda _: None)
     last, found = -1, dict[str, list[int]]()
@@ -181,11 +196,16 @@ def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
             due.release(tick)
             found.setdefault(due.spec.name, []).append(due.block[Block.RELEASED])
         last = tick
-    # A release that fell into skipped ticks comes at the first tick after them, unless a newer one has come too.
+    # A release that fell into skipped ticks comes at the first tick after them, unless a newer one
+    # has come too.
     for spec in specs:
         releases = range(spec.phase, 24, 4)
         made = [next(t for t in range(release, 24 + 4) if t not in skipped) for release in releases]
-        expected = [r for r, m, following in zip(releases, made, [*made[1:], 99], strict=True) if m < following]
+        expected = [
+            r
+            for r, m, following in zip(releases, made, [*made[1:], 99], strict=True)
+            if m < following
+        ]
         assert found[spec.name] == expected
 
 
@@ -241,4 +261,9 @@ def test_executors_go_before_planners_and_the_faster_first() -> None:
         task("right", every=1, slot=5),
         task("left", every=1, slot=4),
     ]
-    assert [t.name for t in by_priority(layout("any", (), tasks))] == ["left", "right", "slow", "planner"]
+    assert [t.name for t in by_priority(layout("any", (), tasks))] == [
+        "left",
+        "right",
+        "slow",
+        "planner",
+    ]

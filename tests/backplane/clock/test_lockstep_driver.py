@@ -26,7 +26,9 @@ pytestmark = pytest.mark.filterwarnings(FORKS)
 HISTORY = 8
 
 
-def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, str, int]], work_s: float) -> None:
+def serve(
+    segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, str, int]], work_s: float
+) -> None:
     """Run a task's cycles slowly, and report each to the clock."""
     block = segment.block(name)
     while (tick := cycle.wait()) is not None:
@@ -37,8 +39,11 @@ def serve(segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, st
         done_semaphore(segment.rack, name).release()
 
 
-def lockstep(segment: Segment, stop: int, one_at_a_time: bool) -> tuple[list[tuple[str, str, int]], list[int]]:
-    """Run lockstep over slow tasks; return the log of their cycles, and the ticks in the order given out."""
+def lockstep(
+    segment: Segment, stop: int, one_at_a_time: bool
+) -> tuple[list[tuple[str, str, int]], list[int]]:
+    """Run lockstep over slow tasks; return the log of their cycles, and the ticks in the order
+    given out."""
     log: list[tuple[str, str, int]] = []
     ticks: list[int] = []
 
@@ -51,7 +56,9 @@ def lockstep(segment: Segment, stop: int, one_at_a_time: bool) -> tuple[list[tup
     # Ready before the first release: a task that is late waits for the next one.
     cycles = {t.name: NextCycle(segment, t.name) for t in segment.layout.tasks}
     threads = [
-        threading.Thread(target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True)
+        threading.Thread(
+            target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True
+        )
         for t in segment.layout.tasks
     ]
     for thread in threads:
@@ -67,16 +74,24 @@ def test_lockstep_makes_every_tick_once(make_bus: MakeBus) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=4, slot=3))
     _, ticks = lockstep(segment, 13, False)
     assert ticks == list(range(14))
-    assert [segment.words[w] for w in (System.TICK, System.STOP_TICK, System.STATE)] == [12, 13, Run.STOPPED]
+    assert [segment.words[w] for w in (System.TICK, System.STOP_TICK, System.STATE)] == [
+        12,
+        13,
+        Run.STOPPED,
+    ]
 
 
 @pytest.mark.parametrize("wake", get_args(Wake))
-def test_a_lockstep_tick_begins_when_every_task_due_has_finished(make_bus: MakeBus, wake: Wake) -> None:
+def test_a_lockstep_tick_begins_when_every_task_due_has_finished(
+    make_bus: MakeBus, wake: Wake
+) -> None:
     segment = make_bus(task("fast", slot=2, wake=wake), task("slow", every=4, slot=5, wake=wake))
     log, _ = lockstep(segment, 12, False)
     every = {"fast": 1, "slow": 4}
     for name, period in every.items():
-        assert [tick for what, who, tick in log if (what, who) == ("begin", name)] == list(range(0, 12, period))
+        assert [tick for what, who, tick in log if (what, who) == ("begin", name)] == list(
+            range(0, 12, period)
+        )
         for tick in range(0, 12 - period, period):
             assert log.index(("end", name, tick)) < log.index(("tick", "clock", tick + period))
 
@@ -84,7 +99,9 @@ def test_a_lockstep_tick_begins_when_every_task_due_has_finished(make_bus: MakeB
 @pytest.mark.parametrize("wake", get_args(Wake))
 def test_one_at_a_time_means_one_after_the_other(make_bus: MakeBus, wake: Wake) -> None:
     planner = task("planner", slot=4, role="planner", wake=wake)
-    segment = make_bus(planner, task("slow", every=2, slot=3, wake=wake), task("fast", slot=2, wake=wake))
+    segment = make_bus(
+        planner, task("slow", every=2, slot=3, wake=wake), task("fast", slot=2, wake=wake)
+    )
     log, _ = lockstep(segment, 6, True)
     expected: list[tuple[str, str, int]] = []
     for tick in range(6):
@@ -132,7 +149,9 @@ def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Each look at it takes a second: it is waited for longer than for any that is dead.
-    quick = SimpleNamespace(monotonic=lambda: 1000 * time.monotonic(), monotonic_ns=time.monotonic_ns, sleep=time.sleep)
+    quick = SimpleNamespace(
+        monotonic=lambda: 1000 * time.monotonic(), monotonic_ns=time.monotonic_ns, sleep=time.sleep
+    )
     monkeypatch.setattr("rack.backplane.clock.lockstep.time", quick)
     segment = make_bus(task("fast"))
     looks = 0

@@ -114,7 +114,9 @@ def test_a_planner_that_comes_late_counts_from_the_end_of_its_slice(bus: Segment
     assert (cycle.wait(), cycle.skipped) == (20, 2)
 
 
-@pytest.mark.parametrize(("newest", "taken", "skipped"), [(4, 4, 0), (12, 4, 0), (16, 8, 1), (40, 32, 7)])
+@pytest.mark.parametrize(
+    ("newest", "taken", "skipped"), [(4, 4, 0), (12, 4, 0), (16, 8, 1), (40, 32, 7)]
+)
 def test_a_planner_takes_a_late_release_as_of_its_tick_within_its_slice(
     make_bus: MakeBus, newest: int, taken: int, skipped: int
 ) -> None:
@@ -125,7 +127,9 @@ def test_a_planner_takes_a_late_release_as_of_its_tick_within_its_slice(
     release(segment, newest)
     assert (cycle.wait(), cycle.skipped) == (taken, skipped)
     # The releases after it come one by one.
-    assert [cycle.wait() for _ in range((newest - taken) // EVERY)] == list(range(taken + EVERY, newest + 1, EVERY))
+    assert [cycle.wait() for _ in range((newest - taken) // EVERY)] == list(
+        range(taken + EVERY, newest + 1, EVERY)
+    )
 
 
 def test_a_restarted_task_waits_for_the_next_release(bus: Segment) -> None:
@@ -138,7 +142,9 @@ def test_a_restarted_task_waits_for_the_next_release(bus: Segment) -> None:
 @WAKES
 def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     found: list[int | None] = [-1]
-    thread = threading.Thread(target=lambda: found.append(NextCycle(bus, "level").wait()), daemon=True)
+    thread = threading.Thread(
+        target=lambda: found.append(NextCycle(bus, "level").wait()), daemon=True
+    )
     thread.start()
     bus.words[System.STATE] = Run.STOPPED
     wake_semaphore(bus.rack, "level").release()
@@ -176,7 +182,9 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
 ) -> None:
     monkeypatch.setattr("rack.backplane.clock.silence.CLOCK_SILENT_S", 0.05)
     looks: list[int] = []
-    monkeypatch.setattr("rack.backplane.clock.silence.state_of", lambda pid: looks.append(pid) or state_of(pid))
+    monkeypatch.setattr(
+        "rack.backplane.clock.silence.state_of", lambda pid: looks.append(pid) or state_of(pid)
+    )
     start_grid(bus)
     cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
     release(bus, 0)
@@ -195,7 +203,10 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
 @pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
     start_grid(bus)
-    cycle, ring = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")), alarm_ring(bus, "level")
+    cycle, ring = (
+        NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
+        alarm_ring(bus, "level"),
+    )
     release(bus, 0)
     cycle.wait()
     with forked(signal.pause) as pid:
@@ -237,7 +248,9 @@ def test_a_sleeping_task_takes_a_release_at_its_grid_point_and_not_before(bus: S
 
 
 @TIMER
-def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one(bus: Segment) -> None:
+def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one(
+    bus: Segment,
+) -> None:
     cycle = NextCycle(bus, "level")
     start_grid(bus, -PERIOD_NS)
     publish(bus, 0)
@@ -245,7 +258,12 @@ def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one
 
     def skip() -> None:
         # As the clock does, only a little ahead of the grid.
-        wait_until(lambda: time.monotonic_ns() > bus.words[System.EPOCH_NS] + 2 * EVERY * PERIOD_NS - PERIOD_NS // 2)
+        wait_until(
+            lambda: (
+                time.monotonic_ns()
+                > bus.words[System.EPOCH_NS] + 2 * EVERY * PERIOD_NS - PERIOD_NS // 2
+            )
+        )
         publish(bus, 2 * EVERY)
 
     with in_thread(skip):
@@ -274,13 +292,15 @@ def test_a_release_that_the_clock_makes_up_for_after_a_skip_wakes_a_sleeping_tas
 
 
 @TIMER
-def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ahead(bus: Segment) -> None:
+def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ahead(
+    bus: Segment,
+) -> None:
     cycle = NextCycle(bus, "level")
     start_grid(bus, -PERIOD_NS)
     publish(bus, 0)
     assert cycle.wait() == 0
-    # The task is kept from its core from its first grid point to shortly before its second: a clock that works ahead
-    # has released both.
+    # The task is kept from its core from its first grid point to shortly before its second: a clock
+    # that works ahead has released both.
     start_grid(bus, 2 * EVERY * PERIOD_NS - PERIOD_NS)
     publish(bus, 2 * EVERY)
     assert (cycle.wait(), cycle.skipped) == (EVERY, 0)
@@ -288,7 +308,9 @@ def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ah
 
 
 @TIMER
-def test_a_late_clock_wakes_a_sleeping_task_with_a_post(bus: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_late_clock_wakes_a_sleeping_task_with_a_post(
+    bus: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
     hour_ns = 3_600_000_000_000
     start_grid(bus, EVERY * hour_ns + hour_ns // 2, hour_ns)

@@ -14,7 +14,9 @@ from tests.backplane.conftest import MakeBus
 CLOCK_NS = 2_500_000
 
 
-@pytest.mark.parametrize(("rate_hz", "ticks"), [(400, 1), (50, 8), (4, 100), (1, 400), (400 / 3, 3), (0.1, 4000)])
+@pytest.mark.parametrize(
+    ("rate_hz", "ticks"), [(400, 1), (50, 8), (4, 100), (1, 400), (400 / 3, 3), (0.1, 4000)]
+)
 def test_a_rate_on_the_grid_is_a_number_of_ticks(rate_hz: float, ticks: int) -> None:
     assert ticks_of(rate_hz, CLOCK_NS, "level") == ticks
 

@@ -99,7 +99,9 @@ def test_a_process_that_gets_no_processor_time_is_never_lost(make_bus: MakeBus) 
 def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.backplane.clock.released_task.LEAST_NS", 4 * RELEASES_MISSED * PERIOD_NS)
+    monkeypatch.setattr(
+        "rack.backplane.clock.released_task.LEAST_NS", 4 * RELEASES_MISSED * PERIOD_NS
+    )
     watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     rung = [watched.release(False) for _ in range(5 * RELEASES_MISSED)]

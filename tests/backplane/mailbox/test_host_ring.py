@@ -80,7 +80,9 @@ def test_a_damaged_message_is_refused_and_the_next_one_is_not(segment: Segment) 
     assert (taken(reader), reader.refused) == ([1, None, 3], 1)
 
 
-def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(segment: Segment) -> None:
+def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(
+    segment: Segment,
+) -> None:
     writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
     for number in range(1, 21):
         writer.message.id = number
@@ -91,7 +93,9 @@ def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(se
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_not_finite_and_unknown_members_of_enums_are_improper(value: float) -> None:
+def test_numbers_that_are_not_finite_and_unknown_members_of_enums_are_improper(
+    value: float,
+) -> None:
     check, message = ProperContent(field_specs(NUMBER, {})), Message(NUMBER.dtype({}))
     assert check(message)
     message.value = np.finfo(float).max
@@ -102,10 +106,16 @@ def test_numbers_that_are_not_finite_and_unknown_members_of_enums_are_improper(v
     assert not check(message)
 
 
-def test_lengths_beyond_those_declared_and_text_that_is_not_ascii_are_improper_and_empty_groups_are_not() -> None:
+def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_groups_not() -> (
+    None
+):
     turn = Field("turn", "f8", "1", "unit", (2,), (0.9, 1.1))
     one = MessageType("one", 1, (Field("name", "S4", "ASCII", "its name"), turn))
-    kind = MessageType("all", 1, (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))))
+    kind = MessageType(
+        "all",
+        1,
+        (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))),
+    )
     check, message = ProperContent(field_specs(kind, {})), Message(kind.dtype({}))
     assert check(message)
     for far, is_proper in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
@@ -115,7 +125,12 @@ def test_lengths_beyond_those_declared_and_text_that_is_not_ascii_are_improper_a
     first["name"] = b"a"
     assert not check(message)
     big = np.finfo(float).max
-    for turned, is_proper in (((0.6, 0.8), True), ((1.0, 0.8), False), ((big, big), False), ((0.0, -1.0), True)):
+    for turned, is_proper in (
+        ((0.6, 0.8), True),
+        ((1.0, 0.8), False),
+        ((big, big), False),
+        ((0.0, -1.0), True),
+    ):
         first["turn"] = turned
         assert check(message) is is_proper
     first["name"] = b"\xff"

@@ -1,4 +1,5 @@
-"""The arithmetic of an inbox: one served at a time, in order of arrival, as many waiting as permitted."""
+"""The arithmetic of an inbox: one served at a time, in order of arrival, as many waiting as
+permitted."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def test_one_that_arrives_while_too_many_wait_is_lost_and_costs_nothing() -> Non
 
 
 @given(ARRIVALS, st.integers(1, 5))
-def test_no_two_services_overlap_and_no_more_wait_than_permitted(pauses: list[tuple[int, int]], depth: int) -> None:
+def test_no_two_services_overlap_and_no_more_wait_than_permitted(
+    pauses: list[tuple[int, int]], depth: int
+) -> None:
     inbox, at, served = Inbox(depth), 0, list[tuple[int, int, int]]()
     for pause, service in pauses:
         at += pause

@@ -7,7 +7,12 @@ from dataclasses import replace
 import pytest
 
 from rack.backplane.layout import InterruptSpec, MailboxSpec, TaskSpec
-from rack.backplane.mailbox.interrupt import BoardInbox, InterruptReader, InterruptWriter, open_inbox
+from rack.backplane.mailbox.interrupt import (
+    BoardInbox,
+    InterruptReader,
+    InterruptWriter,
+    open_inbox,
+)
 from rack.backplane.mailbox.mailbox import Reader, Verdict
 from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.segment import Segment
@@ -22,7 +27,9 @@ SLOT = 9
 """The reading board's."""
 
 
-def box(sender: str, every: int = 1, service_ns: int = 60_000, sent_ns: int = 500_000, depth: int = 16) -> MailboxSpec:
+def box(
+    sender: str, every: int = 1, service_ns: int = 60_000, sent_ns: int = 500_000, depth: int = 16
+) -> MailboxSpec:
     """Return the mailbox of one sender, read by the task `reader`."""
     due, delay = -(-sent_ns // CLOCK_NS), -(-(sent_ns + service_ns) // CLOCK_NS)
     interrupt = InterruptSpec(sent_ns, service_ns, depth, due, every, (SLOT,))
@@ -31,12 +38,17 @@ def box(sender: str, every: int = 1, service_ns: int = 60_000, sent_ns: int = 50
 
 
 def tasks() -> tuple[TaskSpec, ...]:
-    """Return the senders' tasks, in slots opposite to the order of their mailboxes, and the reader's."""
-    return (*(task(name, slot=5 - at) for at, name in enumerate(SENDERS)), task("reader", slot=SLOT))
+    """Return the senders' tasks, in slots opposite to the order of their mailboxes, and the
+    reader's."""
+    return (
+        *(task(name, slot=5 - at) for at, name in enumerate(SENDERS)),
+        task("reader", slot=SLOT),
+    )
 
 
 class Board:
-    """The reading board, and the writers of its mailboxes. A message's id is the tick of its release."""
+    """The reading board, and the writers of its mailboxes. A message's id is the tick of its
+    release."""
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
@@ -48,10 +60,13 @@ class Board:
         inbox = open_inbox(self.segment, "reader")
         assert inbox is not None
         self.inbox: BoardInbox = inbox
-        self.readers = {name: open_reader(self.segment, f"{name}.point", inbox=inbox) for name in SENDERS}
+        self.readers = {
+            name: open_reader(self.segment, f"{name}.point", inbox=inbox) for name in SENDERS
+        }
 
     def send(self, tick: int, *senders: str, now: int | None = None) -> bool:
-        """Write a message of each of these senders, of all by default; say whether all were in time."""
+        """Write a message of each of these senders, of all by default; say whether all were in
+        time."""
         in_time = [self._send(name, tick, now) for name in senders or SENDERS]
         return all(in_time)
 
@@ -82,12 +97,19 @@ def test_a_message_written_in_the_tick_in_which_it_is_due_is_late(make_bus: Make
     # Sent 0.5 ms after the second tick that follows the release, and visible from the third on.
     segment = make_bus(*boxes(every=4, sent_ns=2 * CLOCK_NS + 500_000), *tasks())
     writer = InterruptWriter(segment, "first.point")
-    assert [writer.is_in_time(8, now) for now in (None, 8, 10, 11, 12)] == [True, True, True, False, False]
+    assert [writer.is_in_time(8, now) for now in (None, 8, 10, 11, 12)] == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
     assert [writer.visible_at(8, now) for now in (None, 8, 10, 11, 12)] == [11, 11, 11, 12, 13]
 
 
 def test_one_that_is_served_across_a_release_shows_at_the_next(make_bus: MakeBus) -> None:
-    # Each takes 0.9 ms: from 0.5 ms on the handler is done at 1.4, 2.3 and 3.2 ms, with a release at 2.5.
+    # Each takes 0.9 ms: from 0.5 ms on the handler is done at 1.4, 2.3 and 3.2 ms, with a release
+    # at 2.5.
     board = Board(make_bus(*boxes(service_ns=900_000), *tasks()))
     board.send(0)
     # The sender in the lowest slot comes first.
@@ -145,8 +167,12 @@ def test_a_restarted_reader_continues_as_the_one_before_it(make_bus: MakeBus, id
         found = board.read(tick)
         kept = {r.spec.writer: r.read(tick) for r in readers}
         if tick > 40 + idle:
-            assert found == {name: reading.value.id for name, reading in kept.items() if reading.is_new}
-        assert {name: r.serial for name, r in board.readers.items()} == {r.spec.writer: r.serial for r in readers}
+            assert found == {
+                name: reading.value.id for name, reading in kept.items() if reading.is_new
+            }
+        assert {name: r.serial for name, r in board.readers.items()} == {
+            r.spec.writer: r.serial for r in readers
+        }
 
 
 def test_a_restarted_writer_continues_after_the_last_message(make_bus: MakeBus) -> None:
@@ -173,7 +199,9 @@ def test_a_lost_message_raises_no_interrupt_and_a_damaged_one_does(make_bus: Mak
     assert board.read(4) == {"first": 3}
 
 
-def test_a_forged_message_is_rejected_and_the_true_one_comes_in_its_place(make_bus: MakeBus) -> None:
+def test_a_forged_message_is_rejected_and_the_true_one_comes_in_its_place(
+    make_bus: MakeBus,
+) -> None:
     board = Board(make_bus(*boxes(), *tasks()))
     board.send(0, "first")
     assert board.read(1) == {"first": 0}

@@ -100,7 +100,8 @@ def test_of_several_waiters_one_takes_over_from_a_killed_holder(bus: Segment, tr
 
 
 def cycle(segment: Segment, word: int = REPORT) -> None:
-    """Count in the critical section, by a read and a write that another process in between would spoil."""
+    """Count in the critical section, by a read and a write that another process in between would
+    spoil."""
     lock = MailboxLock(segment, NAME)
     while True:
         if not lock.acquire():
@@ -117,7 +118,8 @@ def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
     workers = [fork(lambda word=word: cycle(bus, word)) for word in reports]
     try:
         wait_until(lambda: all(bus.words[word] > 3_000 for word in reports))
-        # While this process has the lock nobody counts. On a busy machine a waiter whose time is up may get in first.
+        # While this process has the lock nobody counts. On a busy machine a waiter whose time is up
+        # may get in first.
         wait_until(MailboxLock(bus, NAME, BOUND_S).acquire)
         counted = bus.words[COUNT]
     finally:
@@ -131,7 +133,10 @@ def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
 @pytest.mark.parametrize("bystanders", [0, 2])
 def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystanders: int) -> None:
     rng, lock = random.Random(3), MailboxLock(bus, NAME)
-    others = [fork(lambda word=word: cycle(bus, word)) for word in range(REPORT + 1, REPORT + 1 + bystanders)]
+    others = [
+        fork(lambda word=word: cycle(bus, word))
+        for word in range(REPORT + 1, REPORT + 1 + bystanders)
+    ]
     try:
         for _ in range(30):
             bus.words[REPORT] = 0
@@ -168,7 +173,9 @@ def test_a_semaphore_posted_once_too_often_lets_no_second_one_in(bus: Segment) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("opened", [open_writer, MailboxLock], ids=["writer", "lock"])
-def test_a_closed_end_leaves_no_file_open(bus: Segment, opened: Callable[[Segment, str], MailboxLock]) -> None:
+def test_a_closed_end_leaves_no_file_open(
+    bus: Segment, opened: Callable[[Segment, str], MailboxLock]
+) -> None:
     before = descriptors()
     opened(bus, NAME).close()
     assert descriptors() == before

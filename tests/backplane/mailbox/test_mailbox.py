@@ -73,7 +73,9 @@ def test_a_late_message_becomes_visible_at_its_writers_next_boundary(make_bus: M
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(make_bus: MakeBus, seed: int) -> None:
+def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(
+    make_bus: MakeBus, seed: int
+) -> None:
     rng = Random(seed)
     every, within = rng.randint(1, 6), rng.choice((1, 1, 3))
     phase = rng.randrange(every)
@@ -82,11 +84,18 @@ def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(make_b
     visible, tick = [], phase
     for _ in range(16):
         # Written at `now`: often before its slice ends, sometimes well after.
-        now = tick + rng.choice((0, 1, spec.delay - 1, spec.delay, spec.delay + rng.randrange(3 * every)))
+        now = tick + rng.choice(
+            (0, 1, spec.delay - 1, spec.delay, spec.delay + rng.randrange(3 * every))
+        )
         in_time = now < tick + spec.delay
         assert write(writer, tick, now) == in_time
-        # By counting: the end of its slice or, once that has come, the next tick on the writer's grid.
-        due = tick + spec.delay if in_time else next(t for t in range(now + 1, now + 99) if (t - phase) % every == 0)
+        # By counting: the end of its slice or, once that has come, the next tick on the writer's
+        # grid.
+        due = (
+            tick + spec.delay
+            if in_time
+            else next(t for t in range(now + 1, now + 99) if (t - phase) % every == 0)
+        )
         visible.append(due)
         # A late writer takes the newest release.
         tick = max(tick + every * within, now - (now - phase) % every)
@@ -160,7 +169,8 @@ def test_a_message_overwritten_before_it_is_read_is_a_bus_error(make_bus: MakeBu
     assert seen(reader, 1) == (1, NEW)
     for tick in range(1, 30):
         write(writer, tick)
-    # Tick 10 saw message 10, and the slots reach back to 23 only: a later message would not be visible yet.
+    # Tick 10 saw message 10, and the slots reach back to 23 only: a later message would not be
+    # visible yet.
     assert seen(reader, 10) == (1, BUS_ERROR)
     assert (reader.statistics.bus_errors, reader.statistics.corrupt) == (1, 0)
     assert seen(reader, 28) == (28, NEW)
@@ -190,7 +200,9 @@ def test_a_second_writer_is_refused_with_the_first_ones_process(make_bus: MakeBu
     writer = open_writer(segment, NAME)
 
     def second(pid: int) -> bool:
-        with pytest.raises(MailboxError, match=f"'{NAME}' has a writer already, process {pid}; permitted: one"):
+        with pytest.raises(
+            MailboxError, match=f"'{NAME}' has a writer already, process {pid}; permitted: one"
+        ):
             open_writer(segment, NAME)
         return True
 

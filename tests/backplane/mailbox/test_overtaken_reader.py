@@ -1,7 +1,7 @@
 """A reader that is preempted anywhere while its writer laps the ring: it must not report a fault.
 
-The reader is stopped before each single instruction of a read in turn, as the kernel may stop it, and the writer goes
-on meanwhile, up to the middle of a message.
+The reader is stopped before each single instruction of a read in turn, as the kernel may stop it,
+and the writer goes on meanwhile, up to the middle of a message.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ pytestmark = pytest.mark.slow
 DEPTH = 8
 READ_EVERY = 3
 LEAST = 300
-"""Least number of instructions at which a reader is overtaken: one that finds nothing new has fewer."""
+"""Least number of instructions at which a reader is overtaken: one that finds nothing new has
+fewer."""
 CODE = next(iter(rack.backplane.__path__))
 FAULTS = {
     "": set(),
@@ -95,7 +96,8 @@ class Overtaken:
         self.rack.reader.cycle(self.tick - self.tick % READ_EVERY)
 
     def is_overtaken(self, at: int, cycles: int, stops_halfway: bool) -> bool:
-        """Read, and run the writer's cycles before that instruction; False if the read has fewer instructions."""
+        """Read, and run the writer's cycles before that instruction; False if the read has fewer
+        instructions."""
 
         def overtake() -> None:
             self.write(cycles)

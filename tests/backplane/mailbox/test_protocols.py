@@ -52,13 +52,17 @@ def test_a_message_shows_at_once(make_bus: MakeBus, protocol: Protocol) -> None:
 
 
 @pytest.mark.parametrize("protocol", AT_ONCE)
-def test_a_late_message_is_reported_under_every_protocol(make_bus: MakeBus, protocol: Protocol) -> None:
+def test_a_late_message_is_reported_under_every_protocol(
+    make_bus: MakeBus, protocol: Protocol
+) -> None:
     writer = open_writer(make_bus(mailbox(protocol, every=2, delay=4)), NAME)
     assert [writer.write(0, now) for now in (None, 3, 4, 9)] == [True, True, False, False]
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_an_observer_reads_by_its_protocol_and_never_waits(make_bus: MakeBus, protocol: Protocol) -> None:
+def test_an_observer_reads_by_its_protocol_and_never_waits(
+    make_bus: MakeBus, protocol: Protocol
+) -> None:
     segment = make_bus(mailbox(protocol, every=4, delay=4))
     writer, observer = open_writer(segment, NAME), open_observer(segment, NAME)
     writer.write(0)
@@ -94,7 +98,9 @@ def follows(slots: Slots, serial: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_writer_killed_anywhere_leaves_its_last_whole_message(make_bus: MakeBus, protocol: Protocol) -> None:
+def test_a_writer_killed_anywhere_leaves_its_last_whole_message(
+    make_bus: MakeBus, protocol: Protocol
+) -> None:
     segment = make_bus(mailbox(protocol, depth=4))
     reader, slots = open_reader(segment, NAME), Slots(segment, segment.layout.mailbox(NAME))
     rng, latest = random.Random(7), np.iinfo(np.int64).max

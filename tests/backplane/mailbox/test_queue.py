@@ -1,4 +1,5 @@
-"""Queues: each message once and in order, bounded, visible by ticks, whoever is killed and whatever is damaged."""
+"""Queues: each message once and in order, bounded, visible by ticks, whoever is killed and whatever
+is damaged."""
 
 from __future__ import annotations
 
@@ -63,7 +64,9 @@ def test_several_messages_of_a_cycle_are_read_in_order(make_bus: MakeBus) -> Non
 def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
     writer, reader = ends(make_bus(*queue(8)))
     send(writer, 0, 1, 2, 3, 4)
-    assert [ids(reader.take(tick, most)) for tick, most in ((1, 0), (2, 1), (3, 2), (4, -1), (5, 9))] == [
+    assert [
+        ids(reader.take(tick, most)) for tick, most in ((1, 0), (2, 1), (3, 2), (4, -1), (5, 9))
+    ] == [
         [],
         [1],
         [2, 3],
@@ -247,7 +250,8 @@ def take_three(segment: Segment) -> None:
 
 
 def bookkeeping(segment: Segment) -> Iterator[int]:
-    """Yield the addresses of the heads of a queue, of its position, and of the slots in use of both."""
+    """Yield the addresses of the heads of a queue, of its position, and of the slots in use of
+    both."""
     for name, serials in ((NAME, range(1, 6)), (taken_name(NAME), range(1, 3))):
         start = segment.map.mailboxes[name]
         yield from range(start, start + 8 * len(Box))

@@ -40,7 +40,9 @@ def test_messages_before_the_first_read_are_not_judged(link: MakeLink) -> None:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_reader_that_skips_cycles_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
+def test_a_reader_that_skips_cycles_reports_nothing_false(
+    link: MakeLink, protocol: Protocol
+) -> None:
     rack = link(protocol)
     for pause in (1, 2, 18, 100):
         start = rack.reader.seen[-1].tick + 1 if rack.reader.seen else 0
@@ -74,7 +76,9 @@ def test_a_reader_that_finds_everything_overwritten_continues(link: MakeLink) ->
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("late", [1, 2, 18])
-def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(link: MakeLink, protocol: Protocol, late: int) -> None:
+def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(
+    link: MakeLink, protocol: Protocol, late: int
+) -> None:
     rack = link(protocol)
     rack.run(0, 20)
     for tick in range(20, 20 + late):
@@ -124,7 +128,9 @@ def test_a_restarted_reader_reports_nothing_false(link: MakeLink, protocol: Prot
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("published", [False, True])
-def test_a_restarted_writer_is_not_taken_for_a_fault(link: MakeLink, protocol: Protocol, published: bool) -> None:
+def test_a_restarted_writer_is_not_taken_for_a_fault(
+    link: MakeLink, protocol: Protocol, published: bool
+) -> None:
     rack = link(protocol)
     rack.run(0, 50)
     if published:
@@ -153,7 +159,9 @@ def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:
 
 
 @pytest.mark.parametrize("rates", [(1, 8), (1, 24)])
-def test_a_slow_reader_finds_damage_in_messages_it_skips(link: MakeLink, rates: tuple[int, int]) -> None:
+def test_a_slow_reader_finds_damage_in_messages_it_skips(
+    link: MakeLink, rates: tuple[int, int]
+) -> None:
     rack = link(rates=rates)
     rack.run(0, 97)
     rack.writer.cycle(97)

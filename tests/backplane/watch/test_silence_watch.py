@@ -28,7 +28,9 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_writer_that_is_only_late_is_neither_mute_nor_stale(link: MakeLink, protocol: Protocol) -> None:
+def test_a_writer_that_is_only_late_is_neither_mute_nor_stale(
+    link: MakeLink, protocol: Protocol
+) -> None:
     rack = link(protocol)
     rack.run(0, 20)
     for tick in range(20, 60):
@@ -73,7 +75,9 @@ def test_the_clock_may_say_for_a_lost_task_that_it_has_finished(link: MakeLink) 
 
 
 @pytest.mark.parametrize(("number", "state"), [(signal.SIGSTOP, "T"), (signal.SIGKILL, "Z")])
-def test_a_message_whose_writer_is_dead_or_stopped_is_stale(link: MakeLink, number: signal.Signals, state: str) -> None:
+def test_a_message_whose_writer_is_dead_or_stopped_is_stale(
+    link: MakeLink, number: signal.Signals, state: str
+) -> None:
     rack = link()
     rack.writer.close()
 
@@ -133,7 +137,9 @@ def test_a_lost_writer_that_never_wrote_gives_nothing_to_hold(link: MakeLink) ->
 
 
 @pytest.mark.parametrize("rates", [(1, 1), (1, 8), (8, 1)])
-def test_after_a_pause_of_the_clock_no_writer_is_silent(link: MakeLink, rates: tuple[int, int]) -> None:
+def test_after_a_pause_of_the_clock_no_writer_is_silent(
+    link: MakeLink, rates: tuple[int, int]
+) -> None:
     rack = link(rates=rates)
     rack.run(0, 80)
     # It skipped 40 ticks: no task was released, and every message is old.

@@ -62,7 +62,12 @@ def segment(config: MakeConfig, rack_name: str) -> Iterator[Segment]:
 
 
 def heard(
-    segment: Segment, owner: str, alarm: Alarm, subject: int = -1, value: float = 0.0, since: int | None = None
+    segment: Segment,
+    owner: str,
+    alarm: Alarm,
+    subject: int = -1,
+    value: float = 0.0,
+    since: int | None = None,
 ) -> Event:
     """Ring an alarm at tick 400 and return the event that it makes."""
     AlarmWriter(segment, owner).ring(400, alarm, subject, value, since)
@@ -96,22 +101,70 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
     [
         (CLOCK, Alarm.HANG, 2, 4, "'watch' is not responding: 4 releases missed since tick 360"),
         (CLOCK, Alarm.LATE, 0, 1, "'wave' missed its deadline: still running at its next release"),
-        (CLOCK, Alarm.STARVED, 1, 4, "'wave.planner' is not getting its core: 4 releases missed since tick 360"),
-        ("watch", Alarm.STALE, 0, 12, "'wave.status' is stale, 12 ticks (30 ms): its writer 'wave' is dead or stopped"),
-        ("watch", Alarm.MUTE, 0, 3, "'wave.status' is stale, 3 ticks (7.5 ms): 'wave' is running but not writing"),
+        (
+            CLOCK,
+            Alarm.STARVED,
+            1,
+            4,
+            "'wave.planner' is not getting its core: 4 releases missed since tick 360",
+        ),
+        (
+            "watch",
+            Alarm.STALE,
+            0,
+            12,
+            "'wave.status' is stale, 12 ticks (30 ms): its writer 'wave' is dead or stopped",
+        ),
+        (
+            "watch",
+            Alarm.MUTE,
+            0,
+            3,
+            "'wave.status' is stale, 3 ticks (7.5 ms): 'wave' is running but not writing",
+        ),
         ("watch", Alarm.GAP, 0, 2, "'wave.status': 2 messages lost, gap in serials"),
-        ("watch", Alarm.MASQUERADE, 0, 4711, "'wave.status': a message comes from process 4711, which is not"),
+        (
+            "watch",
+            Alarm.MASQUERADE,
+            0,
+            4711,
+            "'wave.status': a message comes from process 4711, which is not",
+        ),
         ("wave", Alarm.CLOCK_STOPPED, -1, 3, "clock stopped: no tick for 3 ticks (7.5 ms)"),
         ("wave", Alarm.CLOCK_SKIPPED, -1, 1, "clock skipped 1 tick"),
         ("wave", Alarm.CLOCK_SKIPPED, -1, 3, "clock skipped 3 ticks"),
         ("wave", Alarm.CLOCK_LATE, -1, 1_300_000, "clock late: tick 1.300 ms late"),
         ("driven", Alarm.SENSOR_RANGE, 1, float("nan"), "sensor elbow out of range: nan rad"),
-        ("driven", Alarm.SENSOR_MODEL, -1, 0.05, "sensor all joints disagrees with the model: off by 0.05"),
-        ("driven", Alarm.ACTUATOR, 7, 0.5, "actuator joint 7 does not produce its commanded torque: off by 0.5"),
-        ("driven", Alarm.COMMAND_LIMIT, 0, 512.25, "torque of shoulder cut to its limit: 512 N m was commanded"),
+        (
+            "driven",
+            Alarm.SENSOR_MODEL,
+            -1,
+            0.05,
+            "sensor all joints disagrees with the model: off by 0.05",
+        ),
+        (
+            "driven",
+            Alarm.ACTUATOR,
+            7,
+            0.5,
+            "actuator joint 7 does not produce its commanded torque: off by 0.5",
+        ),
+        (
+            "driven",
+            Alarm.COMMAND_LIMIT,
+            0,
+            512.25,
+            "torque of shoulder cut to its limit: 512 N m was commanded",
+        ),
         ("driven", Alarm.BRAKES_CLOSED, BY_DEMAND, 0, "brakes engaged: a stop is demanded"),
         ("driven", Alarm.BRAKES_CLOSED, Error.SENSORS, 0, "brakes engaged: sensors"),
-        ("driven", Alarm.BRAKES_CLOSED, NO_TORQUE, 4, "brakes engaged: no torque for 4 ticks (10 ms)"),
+        (
+            "driven",
+            Alarm.BRAKES_CLOSED,
+            NO_TORQUE,
+            4,
+            "brakes engaged: no torque for 4 ticks (10 ms)",
+        ),
         ("driven", Alarm.BRAKES_OPENED, -1, 40, "brakes released after 40 ticks (100 ms)"),
     ],
 )
@@ -132,7 +185,11 @@ def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
 
 def test_a_rejoin_names_the_task(segment: Segment) -> None:
     event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
-    assert (event.board, event.subject, event.text) == ("watch", "watch", "'watch' rejoined after 200 ticks (500 ms)")
+    assert (event.board, event.subject, event.text) == (
+        "watch",
+        "watch",
+        "'watch' rejoined after 200 ticks (500 ms)",
+    )
     assert heard(segment, CLOCK, Alarm.REJOINED, -1, 4).board == CLOCK
 
 
@@ -160,9 +217,17 @@ def test_a_demand_is_a_reaction_and_its_end_a_recovery(
         (2, CLOCK, "", "kill begins"),
     ],
 )
-def test_a_fault_names_its_target(segment: Segment, fault: int, board: str, subject: str, text: str) -> None:
+def test_a_fault_names_its_target(
+    segment: Segment, fault: int, board: str, subject: str, text: str
+) -> None:
     event = heard(segment, CLOCK, Alarm.FAULT_BEGINS, fault)
-    assert (event.code, event.fault, event.board, event.subject, event.text) == ("begins", fault, board, subject, text)
+    assert (event.code, event.fault, event.board, event.subject, event.text) == (
+        "begins",
+        fault,
+        board,
+        subject,
+        text,
+    )
 
 
 def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
@@ -174,7 +239,9 @@ def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
 def test_a_modification_that_failed_is_named_by_its_board(segment: Segment) -> None:
     AlarmWriter(segment, "wave").ring(400, Alarm.MODIFICATION, 1)
     row = alarm_ring(segment, "wave").drain().rows[-1]
-    event = AlarmEvents(segment, JOINTS, str, lambda board, number: f"{board} {number}").of(row, "wave")
+    event = AlarmEvents(segment, JOINTS, str, lambda board, number: f"{board} {number}").of(
+        row, "wave"
+    )
     assert (event.kind, event.code, event.subject) == ("detection", "modification", "wave 1")
     assert event.text == "control modification 'wave 1' failed and was taken out"
 

@@ -60,7 +60,10 @@ def test_without_a_segment_nothing_is_removed(rack_name: str) -> None:
 
 def test_a_live_rack_is_refused_with_its_launcher(spec: Layout) -> None:
     segment = Segment.create(spec, "")
-    with pytest.raises(SegmentError, match=f"rack '{spec.rack}' is already running, launched by process {os.getpid()}"):
+    with pytest.raises(
+        SegmentError,
+        match=f"rack '{spec.rack}' is already running, launched by process {os.getpid()}",
+    ):
         remove_dead(spec.rack)
     assert segment.has_its_name
     segment.close()
@@ -132,7 +135,9 @@ def test_clean_names_racks_removed_and_in_use(spec: Layout, rack_name: str) -> N
         live.close()
 
 
-def test_a_rack_removed_and_launched_meanwhile_is_not_removed(spec: Layout, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
+    spec: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
     leave_dead(spec)
     found = Segment.open(spec.rack)
     assert remove_dead(spec.rack)
@@ -174,7 +179,9 @@ def contend(spec: Layout, start: Segment, word: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trial", range(10))
-def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(spec: Layout, rack_name: str, trial: int) -> None:
+def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(
+    spec: Layout, rack_name: str, trial: int
+) -> None:
     leave_dead(spec)
     start = Segment.create(layout(f"{rack_name}-start"), "")
     words = [300, 301, 302, 303]

@@ -62,7 +62,9 @@ def compute() -> None:
 def run_on(segment: Segment, clock: Clock, seconds: float, *hanging: str) -> None:
     """Let time pass: all tasks but those are released and finish."""
     clock.now_s += seconds
-    tick = segment.words[System.TICK] = segment.words[System.TICK] + round(seconds * 1e9 / PERIOD_NS)
+    tick = segment.words[System.TICK] = segment.words[System.TICK] + round(
+        seconds * 1e9 / PERIOD_NS
+    )
     for name in (FAST, SLOW):
         block = segment.block(name)
         block[Block.RELEASED] = tick
@@ -85,7 +87,9 @@ def test_a_task_that_finishes_nothing_hangs_once(bus: Segment, clock: Clock) -> 
     assert found == [FAST]
 
 
-def test_a_task_that_recovered_and_hangs_again_is_reported_again(bus: Segment, clock: Clock) -> None:
+def test_a_task_that_recovered_and_hangs_again_is_reported_again(
+    bus: Segment, clock: Clock
+) -> None:
     beat, found = Heartbeat(bus), []
     for hanging in ((FAST,), (), (FAST,)):
         run_on(bus, clock, 2 * LOCKSTEP_S, *hanging)

@@ -31,12 +31,15 @@ def running(rack: Rack) -> None:
 
 
 def process_of(rack: Rack, name: str) -> int:
-    """Return the process of a task, of the clock, or of the crate, which is the parent of them all."""
+    """Return the process of a task, of the clock, or of the crate, which is the parent of them
+    all."""
     if name in TASKS:
         return rack.segment.block(name)[Block.PID]
     crate = parent_of(rack.segment.block(TASKS[0])[Block.PID])
     boards = {rack.segment.block(task)[Block.PID] for task in TASKS}
-    return crate if name == "crate" else next(pid for pid in children_of(crate) if pid not in boards)
+    return (
+        crate if name == "crate" else next(pid for pid in children_of(crate) if pid not in boards)
+    )
 
 
 def end_of(rack: Rack) -> Outcome:
@@ -69,7 +72,9 @@ def test_a_killed_process_ends_the_run_with_its_name(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", [*TASKS, "clock", "crate"])
-def test_a_process_killed_before_the_start_ends_the_run_too(config: MakeConfig, victim: str) -> None:
+def test_a_process_killed_before_the_start_ends_the_run_too(
+    config: MakeConfig, victim: str
+) -> None:
     with Rack(config(REALTIME, NEVER)) as rack:
         if victim == "clock":
             rack.start()
@@ -81,7 +86,9 @@ def test_a_process_killed_before_the_start_ends_the_run_too(config: MakeConfig, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("victim", "mode"), [("wave", "realtime"), ("clock", "realtime"), ("wave", "lockstep")])
+@pytest.mark.parametrize(
+    ("victim", "mode"), [("wave", "realtime"), ("clock", "realtime"), ("wave", "lockstep")]
+)
 def test_a_stopped_process_is_reported_as_hanging(
     config: MakeConfig, victim: str, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,7 +104,9 @@ def test_a_stopped_process_is_reported_as_hanging(
 
 
 @pytest.mark.slow
-def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(
+    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("rack.boards.crate.rack.LEAVE_S", 0.2)
     with Rack(config(REALTIME)) as rack:
         rack.start(0.25)
@@ -117,7 +126,8 @@ def test_a_level_that_raises_is_reported_with_its_reason(config: MakeConfig) -> 
     assert "board 'wave' ended: exit status 1" in outcome.faults[0]
     printed = [event.text for event in rack.events if event.kind == "printed"]
     assert any("ValueError: no wave at tick 30" in line for line in printed)
-    # In lockstep it is given up when it would have rejoined, 0.5 s later; the arm gets 0.5 s to come to rest.
+    # In lockstep it is given up when it would have rejoined, 0.5 s later; the arm gets 0.5 s to
+    # come to rest.
     assert outcome.ticks == 30 + 200 + 200
 
 
@@ -137,7 +147,8 @@ def test_an_error_in_the_users_own_code_takes_the_rack_down(config: MakeConfig) 
 
 @pytest.fixture
 def waves(config: MakeConfig, rack_name: str, tmp_path: Path) -> Iterator[tuple[Path, str]]:
-    """The file of a rack in real time, and its name; what a killed launcher has left is removed at the end."""
+    """The file of a rack in real time, and its name; what a killed launcher has left is removed at
+    the end."""
     config()
     yield tmp_path / "waves.toml", f"name={rack_name}"
     remove_dead(rack_name)
@@ -145,7 +156,9 @@ def waves(config: MakeConfig, rack_name: str, tmp_path: Path) -> Iterator[tuple[
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
-def test_a_killed_launcher_takes_every_process_with_it(waves: tuple[Path, str], rack_name: str, mode: str) -> None:
+def test_a_killed_launcher_takes_every_process_with_it(
+    waves: tuple[Path, str], rack_name: str, mode: str
+) -> None:
     with launcher(*waves, f"clock.mode={mode}") as program:
         program.wait_for_launch()
         assert len(program.descendants) >= 4
@@ -167,7 +180,9 @@ def test_a_process_that_the_launcher_forked_does_not_keep_its_rack(waves: tuple[
 
 
 @pytest.mark.slow
-def test_the_next_launch_takes_a_killed_racks_name(config: MakeConfig, waves: tuple[Path, str], rack_name: str) -> None:
+def test_the_next_launch_takes_a_killed_racks_name(
+    config: MakeConfig, waves: tuple[Path, str], rack_name: str
+) -> None:
     with launcher(*waves, REALTIME) as program:
         program.wait_for_launch()
         program.send(signal.SIGKILL)
@@ -180,7 +195,9 @@ def test_the_next_launch_takes_a_killed_racks_name(config: MakeConfig, waves: tu
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_launcher_leaves_no_process(waves: tuple[Path, str], number: signal.Signals) -> None:
+def test_an_interrupted_launcher_leaves_no_process(
+    waves: tuple[Path, str], number: signal.Signals
+) -> None:
     with launcher(*waves, REALTIME) as program:
         program.wait_for_launch()
         program.send(number)
@@ -189,7 +206,9 @@ def test_an_interrupted_launcher_leaves_no_process(waves: tuple[Path, str], numb
 
 
 @pytest.mark.slow
-def test_an_interrupted_launcher_removes_its_segment_itself(waves: tuple[Path, str], rack_name: str) -> None:
+def test_an_interrupted_launcher_removes_its_segment_itself(
+    waves: tuple[Path, str], rack_name: str
+) -> None:
     with launcher(*waves, REALTIME) as program:
         program.wait_for_launch()
         program.send(signal.SIGINT)

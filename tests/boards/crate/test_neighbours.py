@@ -47,8 +47,12 @@ def second(config: MakeConfig, rack: Rack, *settings: str, text: str = PLAIN) ->
 def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack) -> None:
     with pytest.raises(ConfigError) as refused:
         Rack(second(config, first, "board.wave.core=0"), share=False).launch()
-    holder = f"rack '{first.config.name}' (process {os.getpid()}) runs wave on it at real-time priority"
-    wanted = f"core 0, requested by wave: {holder}: stop that rack, choose other cores, or use --share"
+    holder = (
+        f"rack '{first.config.name}' (process {os.getpid()}) runs wave on it at real-time priority"
+    )
+    wanted = (
+        f"core 0, requested by wave: {holder}: stop that rack, choose other cores, or use --share"
+    )
     assert str(refused.value) == wanted
 
 
@@ -82,7 +86,9 @@ def test_waiting_racks_hold_no_core(config: MakeConfig, first: Rack, setting: st
 @pytest.mark.slow
 @needs_fifo
 @needs_two_cores
-def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig, first: Rack) -> None:
+def test_a_board_without_a_core_setting_moves_to_a_free_core(
+    config: MakeConfig, first: Rack
+) -> None:
     with Rack(second(config, first, text=ELSEWHERE), share=False) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
         core = rack.segment.layout.task("wave").core
@@ -91,14 +97,20 @@ def test_a_board_without_a_core_setting_moves_to_a_free_core(config: MakeConfig,
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="needs to drop CAP_SYS_NICE")
+@pytest.mark.skipif(
+    os.getuid() != 0 or not shutil.which("setpriv"), reason="needs to drop CAP_SYS_NICE"
+)
 @pytest.mark.parametrize("policy", ["warn", "refuse"])
-def test_without_real_time_priority_the_config_decides(config: MakeConfig, tmp_path: Path, policy: str) -> None:
+def test_without_real_time_priority_the_config_decides(
+    config: MakeConfig, tmp_path: Path, policy: str
+) -> None:
     path = tmp_path / "config.toml"
     path.write_text(config(*FIFO, f"clock.on_no_realtime={policy}", text=PLAIN).text())
     command = ["setpriv", "--bounding-set", "-sys_nice", "--inh-caps", "-sys_nice", *RACK]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
-    done = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    done = subprocess.run(
+        [*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
     printed = done.stderr if policy == "refuse" else done.stdout
     assert done.returncode == (1 if policy == "refuse" else 0), done.stderr
     assert "SCHED_FIFO refused, ordinary scheduling for wave" in printed

@@ -26,17 +26,29 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.machine import needs_fifo
-from tests.processes import FORKS, RACK, descriptors, exit_status, forked, named, parent_of, wait_until
+from tests.processes import (
+    FORKS,
+    RACK,
+    descriptors,
+    exit_status,
+    forked,
+    named,
+    parent_of,
+    wait_until,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
 SMALL = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=$0 tmpfs /dev/shm && exec "$@"')
 """A command in a /dev/shm of its own, of the size that comes next."""
 USER = ("setpriv", "--reuid=65532", "--inh-caps=+dac_override", "--ambient-caps=+dac_override")
-"""A command as a user who may have no more processes than is permitted, and can read the interpreter all the same."""
+"""A command as a user who may have no more processes than is permitted, and can read the
+interpreter all the same."""
 PLAIN_ROOT = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "--inh-caps=-sys_nice,-ipc_lock")
 """A command without the rights to real-time priorities and to locked memory."""
-as_root = pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="needs root and util-linux")
+as_root = pytest.mark.skipif(
+    os.getuid() != 0 or not shutil.which("setpriv"), reason="needs root and util-linux"
+)
 
 
 def run(rack: Rack, seconds: float | None = None) -> Outcome:
@@ -46,8 +58,14 @@ def run(rack: Rack, seconds: float | None = None) -> Outcome:
 
 def test_a_run_ends_when_its_task_is_done(config: MakeConfig) -> None:
     outcome = run(Rack(config("board.wave.params.done_at=40")))
-    # Written at 40, read by the level that ends the run at 48, visible at 56; then half a second to see it at rest.
-    assert (outcome.cause, outcome.state, outcome.ticks, outcome.worked) == ("task done", "done", 56 + 200, True)
+    # Written at 40, read by the level that ends the run at 48, visible at 56; then half a second to
+    # see it at rest.
+    assert (outcome.cause, outcome.state, outcome.ticks, outcome.worked) == (
+        "task done",
+        "done",
+        56 + 200,
+        True,
+    )
 
 
 def test_a_task_that_ends_in_error_has_failed_with_its_reason(config: MakeConfig) -> None:
@@ -68,7 +86,9 @@ def test_a_task_that_was_never_begun_is_refused_and_any_other_has_failed(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "ticks"), [(0.1, 40), (0.0025, 1), (0.5051, 202)])
-def test_a_run_of_given_length_ends_at_its_exact_tick(config: MakeConfig, seconds: float, ticks: int) -> None:
+def test_a_run_of_given_length_ends_at_its_exact_tick(
+    config: MakeConfig, seconds: float, ticks: int
+) -> None:
     rack = Rack(config())
     outcome = run(rack, seconds)
     assert (outcome.cause, outcome.ticks) == ("time over", ticks)
@@ -83,7 +103,11 @@ def test_events_report_the_run_in_order(config: MakeConfig) -> None:
     run(rack, 0.1)
     assert received == rack.events
     assert [event.kind for event in received if event.kind != "ready"] == ["launch", "start", "end"]
-    assert (received[0].tick, received[-1].tick, received[-1].text) == (-1, 39, "time over after 40 ticks")
+    assert (received[0].tick, received[-1].tick, received[-1].text) == (
+        -1,
+        39,
+        "time over after 40 ticks",
+    )
     assert [event.time_ns for event in received] == sorted(event.time_ns for event in received)
 
 
@@ -99,7 +123,9 @@ def test_boards_are_ready_before_the_clock_runs(config: MakeConfig) -> None:
         words = rack.segment.words
         assert (words[System.STATE], words[System.TICK]) == (Run.STARTING, 0)
         assert UtilityLines(rack.segment).sysfail == []
-        states = {t.name: rack.segment.block(t.name)[Block.STATE] for t in rack.segment.layout.tasks}
+        states = {
+            t.name: rack.segment.block(t.name)[Block.STATE] for t in rack.segment.layout.tasks
+        }
         assert all(TaskState.READY <= state <= TaskState.RUNNING for state in states.values())
         assert rack.run(0.1).cause == "time over"
     states = {t.name: rack.segment.block(t.name)[Block.STATE] for t in rack.segment.layout.tasks}
@@ -109,7 +135,9 @@ def test_boards_are_ready_before_the_clock_runs(config: MakeConfig) -> None:
 def test_after_the_launch_only_the_segment_has_a_name(config: MakeConfig) -> None:
     with Rack(config("protocol.default=lock")) as rack:
         folder = shm_path(rack.config.name).parent
-        assert [p.name for p in folder.iterdir() if rack.config.name in p.name] == [shm_path(rack.config.name).name]
+        assert [p.name for p in folder.iterdir() if rack.config.name in p.name] == [
+            shm_path(rack.config.name).name
+        ]
     assert rack.config.name not in racks()
 
 
@@ -136,7 +164,9 @@ def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -
     assert rack.outcome.cause == "stopped"
 
 
-def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(config: MakeConfig) -> None:
+def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(
+    config: MakeConfig,
+) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
         rack.start()
         words, block = rack.segment.words, rack.segment.block("wave")
@@ -157,7 +187,10 @@ def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(conf
 def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as first:
         first.start(0.25)
-        with pytest.raises(SegmentError, match=f"rack '{first.config.name}' is already running, launched by process"):
+        with pytest.raises(
+            SegmentError,
+            match=f"rack '{first.config.name}' is already running, launched by process",
+        ):
             Rack(config()).launch()
         while first.watch(0.5):
             pass
@@ -166,7 +199,9 @@ def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConf
 
 
 @pytest.mark.slow
-def test_racks_running_together_do_not_affect_each_other(config: MakeConfig, rack_name: str) -> None:
+def test_racks_running_together_do_not_affect_each_other(
+    config: MakeConfig, rack_name: str
+) -> None:
     alone = run(Rack(config()), 0.5)
     pair = [Rack(config(f"name={rack_name}-{end}")) for end in ("a", "b")]
     with pair[0], pair[1]:
@@ -204,10 +239,16 @@ def test_counters_show_the_bus_traffic(config: MakeConfig) -> None:
     run(rack, 0.4)
     wave, watch = (rack.segment.block(name) for name in ("wave", "watch"))
     size = rack.segment.layout.mailbox("wave.status").size
-    assert [wave[w] for w in (Block.CYCLES, Block.WRITES, Block.WRITE_BYTES)] == [160, 160, 160 * size]
+    assert [wave[w] for w in (Block.CYCLES, Block.WRITES, Block.WRITE_BYTES)] == [
+        160,
+        160,
+        160 * size,
+    ]
     # At tick 0 there is nothing yet to read.
     assert [watch[w] for w in (Block.CYCLES, Block.READS, Block.READ_BYTES)] == [20, 20, 19 * size]
-    assert [block[w] for block in (wave, watch) for w in (Block.MISSED, Block.CORRUPT, Block.BUS_ERRORS)] == [0] * 6
+    assert [
+        block[w] for block in (wave, watch) for w in (Block.MISSED, Block.CORRUPT, Block.BUS_ERRORS)
+    ] == [0] * 6
 
 
 def text_of(events: Sequence[Event], kind: str) -> str:
@@ -228,32 +269,55 @@ def run_limited(
     path = folder / "limited.toml"
     path.write_text(config.text())
     command = [*limits, *RACK, "run", str(path), "--seconds", seconds, "--no-record", "--share"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
 
 
 @as_root
 @pytest.mark.parametrize(
     ("limits", "why"),
     [
-        (("prlimit", "--nofile=8"), r"Too many open files: at most 8 open files are permitted \(ulimit -n\)"),
+        (
+            ("prlimit", "--nofile=8"),
+            r"Too many open files: at most 8 open files are permitted \(ulimit -n\)",
+        ),
         (
             ("prlimit", "--nofile=20"),
             r"rack '.*': at most 20 open files are permitted \(ulimit -n\); the rack needs 3\d",
         ),
-        (("prlimit", "--nproc=1", *USER), r"Resource .* unavailable: at most 1 processes are permitted \(ulimit -u\)"),
+        (
+            ("prlimit", "--nproc=1", *USER),
+            r"Resource .* unavailable: at most 1 processes are permitted \(ulimit -u\)",
+        ),
         (
             ("prlimit", "--nproc=2", *USER),
-            r"board 'wave' cannot be forked: Resource .* at most 2 processes are permitted .*; the rack needs 6",
+            (
+                r"board 'wave' cannot be forked: Resource .* at most 2 processes are permitted .*;"
+                r" the rack needs 6"
+            ),
         ),
         (
             ("prlimit", "--nproc=4", *USER),
-            r"board 'clock' cannot be forked: Resource .* at most 4 processes are permitted .*; the rack needs 6",
+            (
+                r"board 'clock' cannot be forked: Resource .* at most 4 processes are permitted .*;"
+                r" the rack needs 6"
+            ),
         ),
         (
             (*SMALL, "half"),
-            r"rack '.*': \d+ bytes of shared memory: No space left .*: /dev/shm has \d+ bytes, \d+ of .*",
+            (
+                r"rack '.*': \d+ bytes of shared memory: No space left .*: /dev/shm has \d+ bytes,"
+                r" \d+ of .*"
+            ),
         ),
-        ((*SMALL, "all"), r"rack '.*': 4 semaphores of 4096 bytes: No space left .*: /dev/shm has \d+ bytes, 0 of .*"),
+        (
+            (*SMALL, "all"),
+            (
+                r"rack '.*': 4 semaphores of 4096 bytes: No space left .*: /dev/shm has \d+ bytes,"
+                r" 0 of .*"
+            ),
+        ),
     ],
 )
 def test_a_limit_of_the_system_is_one_line_with_its_value(
@@ -272,10 +336,17 @@ def test_a_limit_of_the_system_is_one_line_with_its_value(
 
 
 @as_root
-def test_memory_that_could_not_be_locked_is_said_with_its_limit(config: MakeConfig, tmp_path: Path) -> None:
+def test_memory_that_could_not_be_locked_is_said_with_its_limit(
+    config: MakeConfig, tmp_path: Path
+) -> None:
     real_time = config("clock.mode=realtime", text=PLAIN)
     done = run_limited(real_time, tmp_path, "prlimit", f"--memlock={8 << 20}", *PLAIN_ROOT)
-    assert done.stdout.count("memory not locked for wave, watch: the limit is 8388608 bytes, a board maps ") == 1
+    assert (
+        done.stdout.count(
+            "memory not locked for wave, watch: the limit is 8388608 bytes, a board maps "
+        )
+        == 1
+    )
     assert "memory not locked" not in run_limited(real_time, tmp_path).stdout
 
 
@@ -314,7 +385,9 @@ def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(
         assert exit_status(runner) == 0
     assert out.read_text().startswith("1 ")
     # The kernel keeps only the first letters of either name.
-    assert re.search("printed: board '(wave|watch)' cannot be forked: Resource temp", out.read_text())
+    assert re.search(
+        "printed: board '(wave|watch)' cannot be forked: Resource temp", out.read_text()
+    )
 
 
 def users_processes(uid: int) -> int:

@@ -1,4 +1,5 @@
-"""Boards that die or hang rejoin the grid, as their policy permits; in lockstep such a run is repeatable."""
+"""Boards that die or hang rejoin the grid, as their policy permits; in lockstep such a run is
+repeatable."""
 
 from __future__ import annotations
 
@@ -42,7 +43,9 @@ def of(events: Sequence[Event], kind: str, code: str = "") -> list[Event]:
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", TASKS)
 @pytest.mark.parametrize("kind", ["kill", "hang"])
-def test_a_lost_board_is_back_on_the_grid_at_its_tick(config: MakeConfig, victim: str, kind: str) -> None:
+def test_a_lost_board_is_back_on_the_grid_at_its_tick(
+    config: MakeConfig, victim: str, kind: str
+) -> None:
     outcome, events = run(faulty(config(), {"kind": kind, "board": victim, "tick": 100}))
     assert outcome.cause == "time over"
     assert outcome.worked
@@ -59,8 +62,13 @@ def test_a_lost_board_is_back_on_the_grid_at_its_tick(config: MakeConfig, victim
 @pytest.mark.slow
 @pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
 def test_a_run_with_its_faults_repeats(config: MakeConfig, coupling: tuple[str, ...]) -> None:
-    faults = [{"kind": "kill", "board": victim, "tick": 90 + 150 * k} for k, victim in enumerate(TASKS)]
-    faults += [{"kind": "hang", "board": "watch", "tick": 600}, {"kind": "clock-skip", "board": "clock", "tick": 650}]
+    faults = [
+        {"kind": "kill", "board": victim, "tick": 90 + 150 * k} for k, victim in enumerate(TASKS)
+    ]
+    faults += [
+        {"kind": "hang", "board": "watch", "tick": 600},
+        {"kind": "clock-skip", "board": "clock", "tick": 650},
+    ]
     outcomes = [run(faulty(config(*coupling), *faults), 3.0)[0] for _ in range(3)]
     assert len({outcome.digest for outcome in outcomes}) == 1
     assert run(config(*coupling), 3.0)[0].digest != outcomes[0].digest
@@ -83,14 +91,19 @@ def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -
     assert killed.digest == plain.digest
 
 
-def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(config: MakeConfig) -> None:
+def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
+    config: MakeConfig,
+) -> None:
     faults = [{"kind": "kill", "board": "wave", "tick": 50 + 250 * k} for k in range(3)]
     with Rack(faulty(config("supervision.restarts=2"), *faults)) as rack:
         outcome = rack.run(5.0)
         assert rack.segment.words[System.EMERGENCY_STOP] == 1
     assert outcome.cause == "board lost"
     assert "no restarts left" in outcome.faults[0]
-    assert [event.text[:9] for event in of(rack.events, "reaction", "restart")] == ["restart 1", "restart 2"]
+    assert [event.text[:9] for event in of(rack.events, "reaction", "restart")] == [
+        "restart 1",
+        "restart 2",
+    ]
     demand = of(rack.events, "reaction", "demand")[0]
     assert demand.subject == "emergency stop"
     # The third loss, the outage, and half a second in which the arm comes to rest.
@@ -105,8 +118,12 @@ def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0]), ("brake", [2.0, 0.0])])
-def test_a_loss_demands_of_the_arm_as_configured(config: MakeConfig, on_loss: str, demand: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0]), ("brake", [2.0, 0.0])]
+)
+def test_a_loss_demands_of_the_arm_as_configured(
+    config: MakeConfig, on_loss: str, demand: list[float]
+) -> None:
     settled = config(f"board.wave.on_loss={on_loss}")
     _, events = run(faulty(settled, {"kind": "kill", "board": "wave", "tick": 100}))
     found = [event for event in events if event.code == "demand"]
@@ -115,7 +132,10 @@ def test_a_loss_demands_of_the_arm_as_configured(config: MakeConfig, on_loss: st
 
 
 def test_two_boards_lost_at_once_come_back_lower_first(config: MakeConfig) -> None:
-    faults = [{"kind": "kill", "board": victim, "tick": 100} for victim in ("watch", "wave.planner", "wave")]
+    faults = [
+        {"kind": "kill", "board": victim, "tick": 100}
+        for victim in ("watch", "wave.planner", "wave")
+    ]
     outcome, events = run(faulty(config(), *faults))
     assert outcome.worked
     back = of(events, "recovery", "rejoined")
@@ -131,7 +151,9 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
         words = rack.segment.words
         while words[System.TICK] < 200:
             assert rack.watch(0.05)
-        pid = words[System.CLOCK_PID] if victim == "clock" else rack.segment.block(victim)[Block.PID]
+        pid = (
+            words[System.CLOCK_PID] if victim == "clock" else rack.segment.block(victim)[Block.PID]
+        )
         os.kill(pid, signal.SIGKILL)
         while rack.watch(0.1):
             continue
@@ -156,7 +178,9 @@ def test_a_stopped_board_in_real_time_is_detected_within_its_cycles(config: Make
 
 @pytest.mark.slow
 def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) -> None:
-    outcome, events = run(faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120}))
+    outcome, events = run(
+        faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120})
+    )
     (stopped,) = of(events, "detection", "clock_stopped")
     assert stopped.board == "wave"
     # The clock itself may have been late and skipped the fault's tick.
@@ -176,7 +200,9 @@ def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: Make
         os.kill(dead, signal.SIGKILL)
         while not of(rack.events, "recovery", "rejoined"):
             assert rack.watch(0.05)
-        AlarmWriter(rack.segment, "watch").ring(words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 200)
+        AlarmWriter(rack.segment, "watch").ring(
+            words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 200
+        )
         while rack.watch(0.1):
             continue
     assert "watch" in [event.board for event in of(rack.events, "detection", "clock_stopped")]
@@ -205,7 +231,10 @@ def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) 
         while rack.watch(0.1):
             continue
     assert demands == [2, 0]
-    assert [event.kind for event in rack.events if event.code == "demand"] == ["reaction", "recovery"]
+    assert [event.kind for event in rack.events if event.code == "demand"] == [
+        "reaction",
+        "recovery",
+    ]
 
 
 @pytest.mark.slow

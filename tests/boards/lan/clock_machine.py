@@ -1,7 +1,9 @@
-"""One machine of a comparison of clocks: an adapter's clocks on a backplane of their own, without a rack around them.
+"""One machine of a comparison of clocks: an adapter's clocks on a backplane of their own, without a
+rack around them.
 
-`python -m tests.boards.lan.clock_machine NAME OTHER TABLE TRIPS` prints, as JSON, what it has found of the other's
-clock once it has taken so many round trips, and its own grid; it ends when its stdin is closed.
+`python -m tests.boards.lan.clock_machine NAME OTHER TABLE TRIPS` prints, as JSON, what it has found
+of the other's clock once it has taken so many round trips, and its own grid; it ends when its stdin
+is closed.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ def main(name: str, other: str, table: str, trips: int) -> None:
                 has_said = True
                 tick = (time.monotonic_ns() - epoch_ns) // PERIOD_NS
                 clocks.fill(out := Found(), other, tick)
-                sys.stdout.write(json.dumps({"epoch_ns": epoch_ns, "tick": tick, **vars(out)}) + "\n")
+                sys.stdout.write(
+                    json.dumps({"epoch_ns": epoch_ns, "tick": tick, **vars(out)}) + "\n"
+                )
                 sys.stdout.flush()
     finally:
         link.close()

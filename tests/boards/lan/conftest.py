@@ -38,10 +38,18 @@ class Network:
 
 @pytest.fixture(params=["realtime", "lockstep"])
 def segment(rack_name: str, request: pytest.FixtureRequest) -> Iterator[Segment]:
-    """The segment of a rack that imports; its epoch is the origin of all clocks, so that stamps are simulated times."""
-    config = loads(to_toml(override(parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"])))
+    """The segment of a rack that imports; its epoch is the origin of all clocks, so that stamps are
+    simulated times."""
+    config = loads(
+        to_toml(
+            override(parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"])
+        )
+    )
     made = Segment.create(wire(config), config.text())
-    made.words[System.PERIOD_NS], made.words[System.LOCKSTEP] = 2_500_000, request.param == "lockstep"
+    made.words[System.PERIOD_NS], made.words[System.LOCKSTEP] = (
+        2_500_000,
+        request.param == "lockstep",
+    )
     yield made
     made.close()
     unlink(rack_name)

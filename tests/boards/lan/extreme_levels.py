@@ -1,4 +1,5 @@
-"""A level that sends every field of a message type its extremes, one after the other: see `test_extremes`."""
+"""A level that sends every field of a message type its extremes, one after the other: see
+`test_extremes`."""
 
 from __future__ import annotations
 
@@ -18,11 +19,14 @@ Case = tuple[str, bytes, bool]
 
 
 class Extremes(Executor):
-    """Writes each case of `params.cases`, a number of cycles and bytes in hexadecimal, then the last one for ever."""
+    """Writes each case of `params.cases`, a number of cycles and bytes in hexadecimal, then the
+    last one for ever."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._rows = [bytes.fromhex(row) for cycles, row in context.params["cases"] for _ in range(cycles)]
+        self._rows = [
+            bytes.fromhex(row) for cycles, row in context.params["cases"] for _ in range(cycles)
+        ]
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
@@ -39,7 +43,8 @@ class Extremes(Executor):
 
 
 def cases(kind: MessageType, base: Mapping[str, Any]) -> Iterator[Case]:
-    """Yield the base itself, and the base with each field at each of its extremes. A group's are those of its first."""
+    """Yield the base itself, and the base with each field at each of its extremes. A group's are
+    those of its first."""
     plain = filled(kind, base)
     yield "plain", bytes(plain.raw), True
     for path, field in _leaves(kind.fields):
@@ -52,7 +57,11 @@ def cases(kind: MessageType, base: Mapping[str, Any]) -> Iterator[Case]:
             before = at[path[-1]].tobytes()
             at[path[-1]] = value
             if at[path[-1]].tobytes() != before:
-                yield f"{'.'.join(path)} = {value!r}", bytes(message.raw), _is_permitted(field, at[path[-1]])
+                yield (
+                    f"{'.'.join(path)} = {value!r}",
+                    bytes(message.raw),
+                    _is_permitted(field, at[path[-1]]),
+                )
 
 
 def filled(kind: MessageType, base: Mapping[str, Any]) -> Message:
@@ -67,7 +76,9 @@ def filled(kind: MessageType, base: Mapping[str, Any]) -> Message:
     return message
 
 
-def _leaves(fields: Iterable[Field], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Field]]:
+def _leaves(
+    fields: Iterable[Field], path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Field]]:
     for field in fields:
         if isinstance(field.kind, MessageType):
             yield from _leaves(field.kind.fields, (*path, field.name))

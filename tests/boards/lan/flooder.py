@@ -1,7 +1,8 @@
-"""A rack that floods: `python -m tests.boards.lan.flooder NAME ENDPOINT VICTIM` sends what is no message, all the time.
+"""A rack that floods: `python -m tests.boards.lan.flooder NAME ENDPOINT VICTIM` sends what is no
+message, all the time.
 
-It is there as any rack is, and floods its mailbox `pulse.status`; of `calm.status` it sends a proper message now and
-then. It ends with its stdin.
+It is there as any rack is, and floods its mailbox `pulse.status`; of `calm.status` it sends a
+proper message now and then. It ends with its stdin.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ BURST = 64
 def main(name: str, endpoint: str, victim: str) -> None:
     """Flood."""
     exports = {port: {"from": f"{port}.status"} for port in ("pulse", "calm")}
-    link = LanLink(name, LanTable.model_validate({"connect": (endpoint,), "peers": (victim,), "export": exports}))
+    link = LanLink(
+        name,
+        LanTable.model_validate({"connect": (endpoint,), "peers": (victim,), "export": exports}),
+    )
     flood, calm = (link.publish(out_key(name, f"{port}.status")) for port in ("pulse", "calm"))
     dtype = message_dtype(field_specs(PULSE, {}), PULSE.dtype({}).itemsize)
     message, kind, number, due = Message(dtype), kind_of("pulse", 1, dtype), 0, 0

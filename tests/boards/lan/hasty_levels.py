@@ -1,4 +1,5 @@
-"""Levels of racks that give up another one soon: importing them shortens the bound, in the crate that forks boards."""
+"""Levels of racks that give up another one soon: importing them shortens the bound, in the crate
+that forks boards."""
 
 from __future__ import annotations
 

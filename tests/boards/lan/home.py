@@ -1,7 +1,8 @@
 """A rack's link at work, for tests: `python -m tests.boards.lan.home RACK TABLE`, TABLE being JSON.
 
-It takes what comes every 5 ms, as an adapter does in its cycles, and sends a message for each export. To each line on
-stdin it answers with one of JSON: what has come so far. It ends with its stdin.
+It takes what comes every 5 ms, as an adapter does in its cycles, and sends a message for each
+export. To each line on stdin it answers with one of JSON: what has come so far. It ends with its
+stdin.
 """
 
 from __future__ import annotations
@@ -25,15 +26,21 @@ LAUNCH = 7
 
 
 class Home:
-    """The link, and the counts of what has come: by key, all and what was good; questions; tokens."""
+    """The link, and the counts of what has come: by key, all and what was good; questions;
+    tokens."""
 
     def __init__(self, rack: str, table: LanTable) -> None:
         began = time.monotonic()
         self._link = link = LanLink(rack, table)
         self._opened_s = time.monotonic() - began
-        self._arrived = [link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()]
+        self._arrived = [
+            link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()
+        ]
         self._questions = link.answer(ask_keys(rack))
-        self._exports = [(key, link.publish(key)) for key in (out_key(rack, e.source) for e in table.exports.values())]
+        self._exports = [
+            (key, link.publish(key))
+            for key in (out_key(rack, e.source) for e in table.exports.values())
+        ]
         self._changes = link.watch_alive()
         link.declare_alive(LAUNCH)
         self._came, self._good, self._asked = Counter[str](), Counter[str](), Counter[str]()
@@ -53,7 +60,9 @@ class Home:
             question.reply(b"answer", sealer.seal(question.key, HEAD, b"answer"))
         for key, put in self._exports:
             put(b"content", sealer.seal(key, HEAD, b"content"))
-        self._tokens += [f"{rack} {'came' if is_there else 'went'}" for rack, _, is_there in self._changes()]
+        self._tokens += [
+            f"{rack} {'came' if is_there else 'went'}" for rack, _, is_there in self._changes()
+        ]
 
     def state(self) -> dict[str, Any]:
         """Return what has come so far."""

@@ -1,4 +1,5 @@
-"""Levels for tests of the network: one that counts its cycles, and some that read what other racks export."""
+"""Levels for tests of the network: one that counts its cycles, and some that read what other racks
+export."""
 
 from __future__ import annotations
 
@@ -36,7 +37,9 @@ class Echo(Executor):
         """Add what is new, and count the cycles in which the writer is lost."""
         other = read.other
         if other.is_new:
-            write.status.backward += other.value.count <= write.status.count and write.status.total > 0
+            write.status.backward += (
+                other.value.count <= write.status.count and write.status.total > 0
+            )
             write.status.count = other.value.count
             write.status.total += other.value.count
         write.status.lost += other.is_lost

@@ -1,7 +1,8 @@
-"""Several racks at once, for tests of the network: their configs, the racks as processes, and how they ended.
+"""Several racks at once, for tests of the network: their configs, the racks as processes, and how
+they ended.
 
-As a program, `python -m tests.boards.lan.racks CONFIG SECONDS [KEY=VALUE]...` runs one rack and prints its events and
-its outcome, one JSON document a line.
+As a program, `python -m tests.boards.lan.racks CONFIG SECONDS [KEY=VALUE]...` runs one rack and
+prints its events and its outcome, one JSON document a line.
 """
 
 from __future__ import annotations
@@ -53,9 +54,16 @@ rate_hz = 50
 
 
 def rack_text(
-    name: str, listen: str, connect: Iterable[str], other: str = "", *, peers: Iterable[str] = (), lan: str = ""
+    name: str,
+    listen: str,
+    connect: Iterable[str],
+    other: str = "",
+    *,
+    peers: Iterable[str] = (),
+    lan: str = "",
 ) -> str:
-    """Return the config of a rack that exports its pulse, and adds up that of rack `other`, if one is named.
+    """Return the config of a rack that exports its pulse, and adds up that of rack `other`, if one
+    is named.
 
     `lan`: further lines of its `[adapter.lan]`.
     """
@@ -74,7 +82,9 @@ connect = {json.dumps(list(connect))}
 peers = {json.dumps(list(peers))}
 {lan}
 """
-    return f'name = "{name}"\n{BASE}{ECHO if other else ""}{table}{EXPORT}{imported if other else ""}'
+    return (
+        f'name = "{name}"\n{BASE}{ECHO if other else ""}{table}{EXPORT}{imported if other else ""}'
+    )
 
 
 def endpoints(count: int) -> list[str]:
@@ -82,12 +92,17 @@ def endpoints(count: int) -> list[str]:
     return [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
 
 
-def ring_texts(names: Sequence[str], peers: Mapping[str, Iterable[str]] | None = None, lan: str = "") -> list[str]:
-    """Return the configs of racks that all know each other, each of which adds up the pulse of the one before it."""
+def ring_texts(
+    names: Sequence[str], peers: Mapping[str, Iterable[str]] | None = None, lan: str = ""
+) -> list[str]:
+    """Return the configs of racks that all know each other, each of which adds up the pulse of the
+    one before it."""
     at = endpoints(len(names))
     texts = []
     for k, name in enumerate(names):
-        others = [other for other in names if other != name] if peers is None else peers.get(name, ())
+        others = (
+            [other for other in names if other != name] if peers is None else peers.get(name, ())
+        )
         texts.append(rack_text(name, at[k], at[:k], names[k - 1], peers=others, lan=lan))
     return texts
 
@@ -103,7 +118,8 @@ def configs(texts: Iterable[str], folder: Path, *settings: str) -> list[RackConf
 
 
 class Ended(NamedTuple):
-    """A rack that has ended: its outcome, its events, and the last message of each mailbox, by name and field."""
+    """A rack that has ended: its outcome, its events, and the last message of each mailbox, by name
+    and field."""
 
     outcome: Outcome
     events: list[Event]
@@ -121,15 +137,21 @@ def running(racks: Sequence[RackConfig]) -> Iterator[list[Rack]]:
     with ExitStack() as stack:
         # All crates import at once.
         crates = [stack.enter_context(CrateLine()) for _ in racks]
-        yield [stack.enter_context(Rack(config, crate=crate)) for config, crate in zip(racks, crates, strict=True)]
+        yield [
+            stack.enter_context(Rack(config, crate=crate))
+            for config, crate in zip(racks, crates, strict=True)
+        ]
 
 
 def watch(racks: Sequence[Rack], until: Callable[[], object] = lambda: False) -> None:
-    """Supervise racks until all have ended or `until` holds. Raises `TimeoutError` when neither comes."""
+    """Supervise racks until all have ended or `until` holds. Raises `TimeoutError` when neither
+    comes."""
     deadline = time.monotonic() + BOUND_S
     while sum(rack.watch(0.005) for rack in racks) and not until():
         if time.monotonic() > deadline:
-            raise TimeoutError(f"not within {BOUND_S:g} s: {[rack.events[-1].text for rack in racks]}")
+            raise TimeoutError(
+                f"not within {BOUND_S:g} s: {[rack.events[-1].text for rack in racks]}"
+            )
 
 
 def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -> list[Ended]:
@@ -144,8 +166,14 @@ def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -
 def ended(rack: Rack) -> Ended:
     """Return how a rack has ended, which is not closed yet."""
     assert rack.outcome is not None
-    seen = {box.name: open_observer(rack.segment, box.name).peek().value for box in rack.segment.layout.mailboxes}
-    last = {name: {field: getattr(value, field) for field in value.record.dtype.names} for name, value in seen.items()}
+    seen = {
+        box.name: open_observer(rack.segment, box.name).peek().value
+        for box in rack.segment.layout.mailboxes
+    }
+    last = {
+        name: {field: getattr(value, field) for field in value.record.dtype.names}
+        for name, value in seen.items()
+    }
     return Ended(rack.outcome, rack.events, last)
 
 
@@ -159,20 +187,33 @@ class RackProcess:
         *settings: str,
         popen: Callable[..., subprocess.Popen[str]] = subprocess.Popen,
     ) -> None:
-        command = [sys.executable, "-m", "tests.boards.lan.racks", str(config), str(seconds or 0), *settings]
-        self._process = popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        command = [
+            sys.executable,
+            "-m",
+            "tests.boards.lan.racks",
+            str(config),
+            str(seconds or 0),
+            *settings,
+        ]
+        self._process = popen(
+            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         self.pid = self._process.pid
         self.events: list[dict[str, Any]] = []
 
     def await_event(self, kind: str, text: str = "") -> dict[str, Any]:
-        """Return the next event of a kind whose text contains this. Raises `AssertionError` if the rack ends first."""
+        """Return the next event of a kind whose text contains this. Raises `AssertionError` if the
+        rack ends first."""
         for event in self._lines():
             if event.get("kind") == kind and text in event["text"]:
                 return event
-        raise AssertionError(f"no event {kind} '{text}': {self.events} {self._process.communicate()[1]}")
+        raise AssertionError(
+            f"no event {kind} '{text}': {self.events} {self._process.communicate()[1]}"
+        )
 
     def outcome(self) -> dict[str, Any]:
-        """Wait for its end and return its outcome, as in `Outcome`, or the text of the error of its launch."""
+        """Wait for its end and return its outcome, as in `Outcome`, or the text of the error of its
+        launch."""
         for line in self._lines():
             if "kind" not in line:
                 self._process.communicate(timeout=BOUND_S)

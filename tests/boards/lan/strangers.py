@@ -1,7 +1,9 @@
-"""Sessions of others on the network, for tests: `python -m tests.boards.lan.strangers SESSIONS`, SESSIONS being JSON.
+"""Sessions of others on the network, for tests: `python -m tests.boards.lan.strangers SESSIONS`,
+SESSIONS being JSON.
 
-They are plain sessions of zenoh with no rules of their own: each sends, asks and listens as its table says.
-To each line on stdin it answers with one of JSON: what each has got so far. It ends with its stdin.
+They are plain sessions of zenoh with no rules of their own: each sends, asks and listens as its
+table says. To each line on stdin it answers with one of JSON: what each has got so far. It ends
+with its stdin.
 """
 
 from __future__ import annotations
@@ -24,17 +26,31 @@ ASKED_EVERY = 5
 
 
 class Stranger:
-    """One session. `table`: settings, secret, puts (key, bytes, key sealed for), asks, keys to listen to, token."""
+    """One session. `table`: settings, secret, puts (key, bytes, key sealed for), asks, keys to
+    listen to, token."""
 
     def __init__(self, table: dict[str, Any]) -> None:
         config = zenoh.Config()
         off = ("scouting/multicast", "scouting/gossip", "transport/shared_memory")
         quiet = {f"{key}/enabled": False for key in off}
         lasting = {"connect/timeout_ms": -1, "open/return_conditions/connect_scouted": False}
-        # Zenoh takes no connection for 0.1 s after each that fails: strangers that try often would keep the others out.
+        # Zenoh takes no connection for 0.1 s after each that fails: strangers that try often would
+        # keep the others out.
         again = 1000 if table.get("fails") else 50
-        retry = {"connect/retry": {"period_init_ms": again, "period_max_ms": again, "period_increase_factor": 1}}
-        for key, value in {"mode": "peer", **quiet, **lasting, **retry, **table["settings"]}.items():
+        retry = {
+            "connect/retry": {
+                "period_init_ms": again,
+                "period_max_ms": again,
+                "period_increase_factor": 1,
+            }
+        }
+        for key, value in {
+            "mode": "peer",
+            **quiet,
+            **lasting,
+            **retry,
+            **table["settings"],
+        }.items():
             config.insert_json5(key, json.dumps(value))
         self._session = session = zenoh.open(config)
         sealer = Sealer(bytes.fromhex(table.get("secret", "")))
@@ -47,19 +63,26 @@ class Stranger:
         ring = zenoh.handlers.RingChannel(64)
         self._heard = [session.declare_subscriber(key, ring) for key in table.get("listens", [])]
         alive, keys = session.liveliness(), ("**", ALL_ALIVE)
-        self._tokens = [alive.declare_subscriber(key, zenoh.handlers.RingChannel(64), history=True) for key in keys]
+        self._tokens = [
+            alive.declare_subscriber(key, zenoh.handlers.RingChannel(64), history=True)
+            for key in keys
+        ]
         self._token = alive.declare_token(token) if (token := table.get("token")) else None
         self._got = {name: Counter[str]() for name in ("heard", "tokens", "answers")}
 
     def cycle(self) -> None:
         """Send, ask, and take what has come."""
         for key, payload, attachment in self._puts:
-            self._session.put(key, payload, attachment=attachment, allowed_destination=zenoh.Locality.REMOTE)
+            self._session.put(
+                key, payload, attachment=attachment, allowed_destination=zenoh.Locality.REMOTE
+            )
         self._cycles += 1
         for key in self._asks if self._cycles % ASKED_EVERY == 0 else ():
             self._session.get(key, self._on_answer, payload=b"?", timeout=1.0)
         for name, subscribers in (("heard", self._heard), ("tokens", self._tokens)):
-            self._got[name].update(str(sample.key_expr) for one in subscribers for sample in _taken(one))
+            self._got[name].update(
+                str(sample.key_expr) for one in subscribers for sample in _taken(one)
+            )
 
     def _on_answer(self, reply: zenoh.Reply) -> None:
         self._got["answers"][str(reply.ok.key_expr) if reply.ok else "error"] += 1

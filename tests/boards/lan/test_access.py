@@ -19,7 +19,9 @@ def rules(endpoint: str, asks: bool = False, **table: Any) -> Iterator[tuple[str
     """Yield flow, message, key and common name (* for anyone) of all that is allowed."""
     found = access_control("home", LanTable.model_validate({"listen": (endpoint,), **table}), asks)
     assert (found["enabled"], found["default_permission"]) == (True, "deny")
-    subjects = {subject["id"]: subject.get("cert_common_names", ["*"]) for subject in found["subjects"]}
+    subjects = {
+        subject["id"]: subject.get("cert_common_names", ["*"]) for subject in found["subjects"]
+    }
     by_id = {rule["id"]: rule for rule in found["rules"]}
     assert len(by_id) == len(found["rules"])
     for policy in found["policies"]:
@@ -74,20 +76,31 @@ def test_what_goes_out_is_this_racks_own() -> None:
     assert "rack/home/out/pulse/status" in out
 
 
-@pytest.mark.parametrize(("right", "asked"), [("watch", "read"), ("command", "command"), ("stop", "stop")])
+@pytest.mark.parametrize(
+    ("right", "asked"), [("watch", "read"), ("command", "command"), ("stop", "stop")]
+)
 def test_a_right_permits_one_kind_of_question(right: str, asked: str) -> None:
     found = list(rules(TLS, permit={"viewer": [right]}))
-    assert [key for _, message, key, _ in found if message == "query"] == [f"rack/home/ask/{asked}/viewer/**"]
+    assert [key for _, message, key, _ in found if message == "query"] == [
+        f"rack/home/ask/{asked}/viewer/**"
+    ]
     assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]
 
 
 def test_no_message_deletes() -> None:
-    assert not [1 for _, message, *_ in rules(TCP, asks=True, peers=("friend",)) if message == "delete"]
+    assert not [
+        1 for _, message, *_ in rules(TCP, asks=True, peers=("friend",)) if message == "delete"
+    ]
 
 
 def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
-    tables: dict[str, Any] = {"export": {"pulse": {"from": "pulse.status"}}, "permit": {"viewer": ["watch"]}}
-    known, unknown = ({rule[:3] for rule in rules(at, **tables, peers=("friend",))} for at in (TLS, TCP))
+    tables: dict[str, Any] = {
+        "export": {"pulse": {"from": "pulse.status"}},
+        "permit": {"viewer": ["watch"]},
+    }
+    known, unknown = (
+        {rule[:3] for rule in rules(at, **tables, peers=("friend",))} for at in (TLS, TCP)
+    )
     assert known <= unknown
     assert unknown - known <= {rule[:3] for rule in rules(TCP)}
     assert {name for *_, name in rules(TCP, **tables, peers=("friend",))} == {"*"}
@@ -105,6 +118,8 @@ def test_a_token_names_launch_and_cycle(cycle_ns: int) -> None:
     assert launch_and_cycle(alive_key("home", 0xAB, cycle_ns)) == (0xAB, cycle_ns)
 
 
-@pytest.mark.parametrize("launch", ["x", "ab", "-20", f"{1:016x}-", f"{1:016x}-x", f"{1:016x}-{10**18}", f"{1:017x}"])
+@pytest.mark.parametrize(
+    "launch", ["x", "ab", "-20", f"{1:016x}-", f"{1:016x}-x", f"{1:016x}-{10**18}", f"{1:017x}"]
+)
 def test_a_token_that_no_adapter_has_made_is_none(launch: str) -> None:
     assert launch_and_cycle(f"rack/home/alive/{launch}") is None

@@ -1,4 +1,5 @@
-"""The clocks of other racks: the estimator as pure arithmetic, then machines whose clocks truly differ."""
+"""The clocks of other racks: the estimator as pure arithmetic, then machines whose clocks truly
+differ."""
 
 from __future__ import annotations
 
@@ -50,7 +51,11 @@ DELAYS = st.integers(1 * US, 2 * S)
 PING = st.tuples(st.integers(0, 5 * S), DELAYS, st.integers(0, 1 * MS), DELAYS)
 
 
-@given(offset=st.integers(-(10**18), 10**18), rate=st.integers(-DRIFT_PPM, DRIFT_PPM), pings=st.lists(PING, min_size=1))
+@given(
+    offset=st.integers(-(10**18), 10**18),
+    rate=st.integers(-DRIFT_PPM, DRIFT_PPM),
+    pings=st.lists(PING, min_size=1),
+)
 def test_the_true_offset_is_always_within_the_uncertainty(
     offset: int, rate: int, pings: list[tuple[int, int, int, int]]
 ) -> None:
@@ -66,7 +71,9 @@ def test_the_true_offset_is_always_within_the_uncertainty(
         assert found.steps == 0
         assert found.best is not None
         for later in (now, now + 7 * S):
-            assert abs(found.best.offset_ns - (theirs(later) - later)) <= found.best.uncertainty_ns(later)
+            assert abs(found.best.offset_ns - (theirs(later) - later)) <= found.best.uncertainty_ns(
+                later
+            )
 
 
 def trip(at: int, offset: int, there: int = 200 * US, back: int = 200 * US) -> RoundTrip:
@@ -106,7 +113,9 @@ def test_a_slow_answer_does_not_contradict_a_good_estimate() -> None:
     assert found.best.lasted_ns == 400 * US
 
 
-@pytest.mark.parametrize("bad", [RoundTrip(100, 0, 500, 200), RoundTrip(200, 0, 0, 100), RoundTrip(100, 500, 400, 200)])
+@pytest.mark.parametrize(
+    "bad", [RoundTrip(100, 0, 500, 200), RoundTrip(200, 0, 0, 100), RoundTrip(100, 500, 400, 200)]
+)
 def test_what_cannot_be_a_round_trip_is_refused(bad: RoundTrip) -> None:
     found = ClockOffset()
     assert not found.add(bad)
@@ -191,9 +200,20 @@ def test_a_ping_without_the_secret_gets_no_answer(segment: Segment) -> None:
 
 
 @contextmanager
-def machine(names: tuple[str, str], table: dict[str, Any], *within: str) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "tests.boards.lan.clock_machine", *names, json.dumps(table), str(TRIPS)]
-    with subprocess.Popen([*within, *command], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+def machine(
+    names: tuple[str, str], table: dict[str, Any], *within: str
+) -> Iterator[subprocess.Popen[bytes]]:
+    command = [
+        sys.executable,
+        "-m",
+        "tests.boards.lan.clock_machine",
+        *names,
+        json.dumps(table),
+        str(TRIPS),
+    ]
+    with subprocess.Popen(
+        [*within, *command], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
         try:
             yield process
         finally:
@@ -211,8 +231,11 @@ def found(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     return dict(json.loads(process.stdout.readline()))
 
 
-def compared(name: str, port: int, *within: str, through: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what two machines find of each other; the second runs `within` a command, and calls `through` a port."""
+def compared(
+    name: str, port: int, *within: str, through: int | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what two machines find of each other; the second runs `within` a command, and calls
+    `through` a port."""
     names = (f"{name}-a", f"{name}-b")
     here = {"listen": [f"tcp/127.0.0.1:{port}"], "peers": [names[1]], "insecure": True}
     there = {"connect": [f"tcp/127.0.0.1:{through or port}"], "peers": [names[0]], "insecure": True}
@@ -241,7 +264,9 @@ def why_no_time_namespace() -> str:
     """Return why no process can have a clock of its own here; empty where one can."""
     if shutil.which("unshare") is None:
         return "no unshare (util-linux)"
-    done = subprocess.run(["unshare", "--time", "--monotonic", "1", "--fork", "true"], capture_output=True, text=True)
+    done = subprocess.run(
+        ["unshare", "--time", "--monotonic", "1", "--fork", "true"], capture_output=True, text=True
+    )
     return f"no time namespace: {done.stderr.strip() or done.returncode}" if done.returncode else ""
 
 
@@ -249,7 +274,9 @@ def why_no_time_namespace() -> str:
 def test_a_machine_that_is_a_thousand_seconds_ahead_is_found_to_be(rack_name: str) -> None:
     if reason := why_no_time_namespace():
         pytest.skip(reason)
-    one, other = compared(rack_name, free_port(), "unshare", "--time", "--monotonic", str(AHEAD_S), "--fork")
+    one, other = compared(
+        rack_name, free_port(), "unshare", "--time", "--monotonic", str(AHEAD_S), "--fork"
+    )
     assert abs(one["offset"] - AHEAD_S) <= one["uncertainty"] < 1.0
     assert abs(other["offset"] + AHEAD_S) <= other["uncertainty"] < 1.0
     check_grids(one, other)
@@ -275,7 +302,9 @@ def slow_one_way(port: int) -> Iterator[int]:
             with suppress(OSError):
                 while near := open_sockets.enter_context(server.accept()[0]):
                     try:
-                        far = open_sockets.enter_context(socket.create_connection(("127.0.0.1", port)))
+                        far = open_sockets.enter_context(
+                            socket.create_connection(("127.0.0.1", port))
+                        )
                     except ConnectionRefusedError:  # not listening yet
                         near.close()
                         continue

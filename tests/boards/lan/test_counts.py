@@ -10,7 +10,8 @@ from rack.boards.lan.envelope import Envelope
 
 
 def head(number: int, launch: int = 7, serial: int = 0) -> Envelope:
-    """Return the head of the message of that number; each is of a later write than the one before."""
+    """Return the head of the message of that number; each is of a later write than the one
+    before."""
     return Envelope(1, launch, serial or 3 * number, number, 0, 0, 0)
 
 
@@ -28,7 +29,14 @@ def test_messages_in_order_are_all_new() -> None:
 
 def test_what_is_missing_is_counted_and_what_comes_late_is_disorder_once() -> None:
     found, count = order()
-    assert [found.admits(head(number)) for number in (1, 4, 3, 3, 4, 5)] == [True, True, False, False, False, True]
+    assert [found.admits(head(number)) for number in (1, 4, 3, 3, 4, 5)] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
     assert (count.missing, count.disordered, count.repeated) == (2, 1, 2)
 
 
@@ -69,7 +77,9 @@ def test_a_reader_resumed_without_launches_goes_on() -> None:
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
-def test_every_message_is_new_disordered_or_repeated_and_what_never_came_is_the_rest(numbers: list[int]) -> None:
+def test_every_message_is_new_disordered_or_repeated_and_what_never_came_is_the_rest(
+    numbers: list[int],
+) -> None:
     found, count = order()
     first = numbers[0]
     came = [number for number in numbers if number >= first]

@@ -34,7 +34,9 @@ def folder(made: Path, tmp_path: Path) -> Path:
 
 def flaws(folder: Path, rack: str = "cell", *addresses: str) -> list[str]:
     """Return what is wrong, without the folder's name."""
-    return [str(flaw).removeprefix(f"{folder}/") for flaw in Credentials(folder, rack).flaws(addresses)]
+    return [
+        str(flaw).removeprefix(f"{folder}/") for flaw in Credentials(folder, rack).flaws(addresses)
+    ]
 
 
 def test_a_set_as_made_has_no_flaws(made: Path) -> None:
@@ -44,7 +46,9 @@ def test_a_set_as_made_has_no_flaws(made: Path) -> None:
 
 def test_every_missing_file_is_named(tmp_path: Path) -> None:
     why = "missing; see rack lan certificates --help"
-    assert flaws(tmp_path) == [f"{name}: {why}" for name in ("authority.pem", "cell.pem", "cell-key.pem", "secret")]
+    assert flaws(tmp_path) == [
+        f"{name}: {why}" for name in ("authority.pem", "cell.pem", "cell-key.pem", "secret")
+    ]
 
 
 def test_a_file_that_cannot_be_read_is_named(folder: Path) -> None:
@@ -101,7 +105,9 @@ def test_what_is_not_pem_is_refused(folder: Path, name: str, content: bytes) -> 
     assert f"{name}: no {kind} in PEM form" in flaws(folder)
 
 
-@pytest.mark.parametrize("content", [b"", b"short", bytes(31), bytes(33), b"ab" * 31, b"xy" * 32, b"\xff" * 64])
+@pytest.mark.parametrize(
+    "content", [b"", b"short", bytes(31), bytes(33), b"ab" * 31, b"xy" * 32, b"\xff" * 64]
+)
 def test_a_secret_has_32_bytes(folder: Path, content: bytes) -> None:
     (folder / "secret").write_bytes(content)
     assert flaws(folder) == ["secret: no secret; permitted: 32 bytes, or 64 digits"]
@@ -115,7 +121,8 @@ def test_a_secret_may_be_hexadecimal(folder: Path) -> None:
 
 
 def signed(folder: Path, begins: timedelta, ends: timedelta, chain: bool = False) -> Iterator[str]:
-    """Put a certificate with other dates, or of an authority below the set's, in place of the rack's."""
+    """Put a certificate with other dates, or of an authority below the set's, in place of the
+    rack's."""
     old = x509.load_pem_x509_certificate((folder / "cell.pem").read_bytes())
     issuer = x509.load_pem_x509_certificate((folder / "authority.pem").read_bytes())
     key = serialization.load_pem_private_key((folder / "authority-key.pem").read_bytes(), None)
@@ -124,13 +131,24 @@ def signed(folder: Path, begins: timedelta, ends: timedelta, chain: bool = False
     if chain:
         own = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "below")])
-        builder = x509.CertificateBuilder().subject_name(name).issuer_name(issuer.subject).public_key(own.public_key())
-        dated = builder.serial_number(1).not_valid_before(now).not_valid_after(now + timedelta(days=1))
+        builder = (
+            x509.CertificateBuilder()
+            .subject_name(name)
+            .issuer_name(issuer.subject)
+            .public_key(own.public_key())
+        )
+        dated = (
+            builder.serial_number(1).not_valid_before(now).not_valid_after(now + timedelta(days=1))
+        )
         issuer, key = dated.sign(key, hashes.SHA256()), own
         below = [issuer]
     builder = x509.CertificateBuilder().subject_name(old.subject).issuer_name(issuer.subject)
     builder = builder.public_key(old.public_key()).serial_number(2)
-    new = builder.not_valid_before(now + begins).not_valid_after(now + ends).sign(key, hashes.SHA256())
+    new = (
+        builder.not_valid_before(now + begins)
+        .not_valid_after(now + ends)
+        .sign(key, hashes.SHA256())
+    )
     pem = b"".join(one.public_bytes(serialization.Encoding.PEM) for one in (new, *below))
     (folder / "cell.pem").write_bytes(pem)
     yield from flaws(folder)

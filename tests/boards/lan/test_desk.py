@@ -1,4 +1,5 @@
-"""The desk of a network adapter: what it answers, refuses and drops, and how much of it in a cycle."""
+"""The desk of a network adapter: what it answers, refuses and drops, and how much of it in a
+cycle."""
 
 from __future__ import annotations
 
@@ -71,7 +72,12 @@ class Line:
         return take
 
     def ask(
-        self, what: str, payload: bytes = b"", asker: str = "operator", version: int = VERSION, again: int = 0
+        self,
+        what: str,
+        payload: bytes = b"",
+        asker: str = "operator",
+        version: int = VERSION,
+        again: int = 0,
     ) -> None:
         """Ask a proper question, `again` the one of that number."""
         self._number += 1
@@ -85,7 +91,10 @@ class Line:
 
     def _opener(self, key: str) -> Callable[[bytes, bytes], None]:
         def reply(payload: bytes, envelope: bytes) -> None:
-            head, answer = self.sealer.opened(answer_key(key), envelope, payload), DeskAnswer.unpacked(payload)
+            head, answer = (
+                self.sealer.opened(answer_key(key), envelope, payload),
+                DeskAnswer.unpacked(payload),
+            )
             assert isinstance(head, Envelope)
             assert answer is not None
             self.answers.append(Got(head, answer))
@@ -98,7 +107,9 @@ class Bench:
 
     def __init__(self, segment: Segment) -> None:
         self.segment, self.findings, self.tick = segment, list[Finding](), 40
-        self.desk = Desk(segment, OwnGrid(segment, 8), Permit(RIGHTS, ("other", *RIGHTS)), self.findings)  # type: ignore[arg-type]
+        self.desk = Desk(
+            segment, OwnGrid(segment, 8), Permit(RIGHTS, ("other", *RIGHTS)), self.findings
+        )  # type: ignore[arg-type]
         self.line = Line(segment.rack)
         self.desk.open(self.line, LAUNCH)  # type: ignore[arg-type]
         self.cycle()
@@ -145,7 +156,11 @@ def test_stretches_of_the_segment_are_answered_in_their_order(bench: Bench) -> N
     answer = bench.asked("read", packed_stretches(wanted))
     assert answer.code is Code.GRANTED
     assert answer.content == b"".join(bytes(bench.segment.view(*stretch)) for stretch in wanted)
-    assert (bench.desk.count.answered, bench.desk.count.refused, bench.desk.count.dropped) == (1, 0, 0)
+    assert (bench.desk.count.answered, bench.desk.count.refused, bench.desk.count.dropped) == (
+        1,
+        0,
+        0,
+    )
 
 
 def test_an_answer_belongs_to_its_question_and_to_this_launch(bench: Bench) -> None:
@@ -178,7 +193,9 @@ def test_what_is_outside_the_segment_or_too_much_is_refused(bench: Bench, stretc
         ("operator", "reset", Code.AT_THE_RACK),
     ],
 )
-def test_everybody_may_do_what_the_config_permits(bench: Bench, asker: str, what: str, code: Code) -> None:
+def test_everybody_may_do_what_the_config_permits(
+    bench: Bench, asker: str, what: str, code: Code
+) -> None:
     assert bench.asked(what, HEAD, asker).code is code
     assert not bench.segment.words[System.EMERGENCY_STOP]
 
@@ -221,7 +238,9 @@ def test_a_flood_costs_a_cycle_no_more_than_its_bounds(bench: Bench) -> None:
     assert sum(sizes) - sizes[-1] < BYTES_A_CYCLE <= sum(sizes)
     waiting.clear()
     for _ in range(100):
-        bench.line.put(Question(question_key(bench.segment.rack, "read", "x"), b"", b"", lambda *answer: None))
+        bench.line.put(
+            Question(question_key(bench.segment.rack, "read", "x"), b"", b"", lambda *answer: None)
+        )
     before = bench.desk.count.dropped
     assert bench.cycle() == []
     assert bench.desk.count.dropped - before == QUESTIONS_A_CYCLE
@@ -233,7 +252,9 @@ def test_an_emergency_stop_comes_before_a_flood_and_is_found_once(bench: Bench) 
     bench.line.ask("stop")
     assert bench.cycle()[0].head.serial == 101
     assert bench.segment.words[System.EMERGENCY_STOP] == 1
-    assert [(finding.alarm.name, finding.subject) for finding in bench.findings] == [("REMOTE_STOP", 1)]
+    assert [(finding.alarm.name, finding.subject) for finding in bench.findings] == [
+        ("REMOTE_STOP", 1)
+    ]
     bench.line.ask("stop")
     assert bench.cycle()[0].answer.code is Code.GRANTED
     assert len(bench.findings) == 1
@@ -276,7 +297,9 @@ def test_commands_that_waited_while_the_rack_was_held_are_dropped_and_a_stop_is_
     assert not OperatorTable(bench.segment).waiting()
 
 
-def test_the_command_of_a_client_that_is_gone_is_withdrawn(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_of_a_client_that_is_gone_is_withdrawn(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 1_000_000_000
     monkeypatch.setattr(desks.time, "monotonic_ns", lambda: now)
     bench.asked("give", packed_request(bench.command(tick=10_000)))
@@ -297,9 +320,13 @@ def test_commands_that_make_no_sense_are_refused(bench: Bench) -> None:
     assert bench.asked("give", b"").code is Code.NOT_VALID
     assert bench.asked("give", packed_request(Request(9999, good.message))).code is Code.NOT_VALID
     assert bench.asked("give", packed_request(Request(0, good.message))).code is Code.NOT_VALID
-    assert bench.asked("give", packed_request(Request(good.mailbox, good.message[:-1]))).code is Code.NOT_VALID
     assert (
-        bench.asked("give", packed_request(Request(good.mailbox, b"\xff" * len(good.message)))).code is Code.NOT_VALID
+        bench.asked("give", packed_request(Request(good.mailbox, good.message[:-1]))).code
+        is Code.NOT_VALID
+    )
+    assert (
+        bench.asked("give", packed_request(Request(good.mailbox, b"\xff" * len(good.message)))).code
+        is Code.NOT_VALID
     )
     assert not OperatorTable(bench.segment).waiting()
 

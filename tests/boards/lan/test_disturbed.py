@@ -1,4 +1,5 @@
-"""Two racks on a network that loses packets, is cut, and where one is killed: nothing is lost unseen, or taken twice.
+"""Two racks on a network that loses packets, is cut, and where one is killed: nothing is lost
+unseen, or taken twice.
 
 In real time, with TLS, each rack on a machine of its own.
 """
@@ -35,7 +36,8 @@ CYCLE_TICKS = 8
 AWAY_TICKS = 600
 LOSS = 0.05
 RETRANSMIT = "rto_min 5ms"
-"""Shortest time after which TCP sends a packet again. Linux waits as long as the lease; see configs/cell/scale.md."""
+"""Shortest time after which TCP sends a packet again. Linux waits as long as the lease; see
+configs/cell/scale.md."""
 
 
 class Counts(NamedTuple):
@@ -71,7 +73,9 @@ class LabRack:
         endpoint = f"tls/{lab.address(0)}:{PORT}"
         listen, connect = (endpoint, []) if machine == 0 else ("", [endpoint])
         certificates = f'certificates = "{folder}"'
-        self._config.write_text(rack_text(self.name, listen, connect, self._other, lan=certificates))
+        self._config.write_text(
+            rack_text(self.name, listen, connect, self._other, lan=certificates)
+        )
         self.process: RackProcess
 
     def start(self) -> None:
@@ -102,7 +106,8 @@ class LabRack:
         return Counts(*counted, *seen)
 
     def heard(self) -> tuple[int, int]:
-        """Return the count last heard from the other rack, and how often one was not above that before it."""
+        """Return the count last heard from the other rack, and how often one was not above that
+        before it."""
         status = self._peek("echo.status")
         return int(status.count), int(status.backward)
 
@@ -130,7 +135,9 @@ def lab() -> Iterator[Lab]:
 def racks(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LabRack, LabRack]]:
     folder = tmp_path_factory.mktemp("racks")
     names = f"disturbed-{folder.stat().st_ino}-a", f"disturbed-{folder.stat().st_ino}-b"
-    make_credentials(folder / "set", {name: [lab.address(k)] for k, name in enumerate(names)}, days=1)
+    make_credentials(
+        folder / "set", {name: [lab.address(k)] for k, name in enumerate(names)}, days=1
+    )
     pair = LabRack(lab, 0, names, folder / "set"), LabRack(lab, 1, names, folder / "set")
     with ExitStack() as stack:
         for rack in pair:
@@ -142,7 +149,9 @@ def racks(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[
 
 
 @pytest.mark.slow
-def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(lab: Lab, racks: tuple[LabRack, LabRack]) -> None:
+def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(
+    lab: Lab, racks: tuple[LabRack, LabRack]
+) -> None:
     before = [rack.counts() for rack in racks]
     lab.lose(1, LOSS)
     for rack in racks:
@@ -150,7 +159,11 @@ def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(lab: Lab, ra
     lab.lose(1, 0.0)
     for rack, first in zip(racks, before, strict=True):
         now = rack.counts()
-        assert (now.missing, now.losses, now.launches) == (first.missing, first.losses, first.launches)
+        assert (now.missing, now.losses, now.launches) == (
+            first.missing,
+            first.losses,
+            first.launches,
+        )
         assert (now.refused, now.unknown_launch, now.repeated, now.disordered) == (0, 0, 0, 0)
         # All that were sent until the newest that was taken.
         assert now.number - first.number == now.accounted - first.accounted
@@ -185,7 +198,9 @@ def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_
 
 
 @pytest.mark.slow
-def test_a_killed_rack_is_lost_and_its_next_launch_is_told_from_it(racks: tuple[LabRack, LabRack]) -> None:
+def test_a_killed_rack_is_lost_and_its_next_launch_is_told_from_it(
+    racks: tuple[LabRack, LabRack],
+) -> None:
     killed, other = racks[1], racks[0]
     before, count = other.counts(), other.heard()[0]
     killed.process.end()

@@ -1,4 +1,5 @@
-"""What levels read of another rack's mailbox: verdicts, loss and age, whatever the network does to its messages."""
+"""What levels read of another rack's mailbox: verdicts, loss and age, whatever the network does to
+its messages."""
 
 from __future__ import annotations
 
@@ -33,13 +34,19 @@ class Importing:
     """The adapter's import `lan.other`, and a level that reads it."""
 
     def __init__(self, segment: Segment, goes_on: bool = False) -> None:
-        self.segment, self.peer, self.network = segment, PeerRack("two", goes_on=goes_on, offset_ns=0), Network()
+        self.segment, self.peer, self.network = (
+            segment,
+            PeerRack("two", goes_on=goes_on, offset_ns=0),
+            Network(),
+        )
         self.grid = OwnGrid(segment, EVERY)
         config = loads(segment.config)
         assert config.adapter.lan is not None
         self.table = config.adapter.lan.imports["other"]
         self.spec = segment.layout.mailbox("lan.other")
-        self.kind = kind_of(self.spec.message, self.spec.version, message_dtype(self.spec.fields, self.spec.size))
+        self.kind = kind_of(
+            self.spec.message, self.spec.version, message_dtype(self.spec.fields, self.spec.size)
+        )
         self.key, self.sealer = out_key("two", "pulse.status"), Sealer()
         self.status = Message(status_of((), ("other",)).dtype({}))
         self.task = ReadingTask()
@@ -60,14 +67,20 @@ class Importing:
         self.open()
         self.entry.resume(self.status.import_other, tick)
 
-    def send(self, number: int, written: int, count: int | None = None, launch: int = LAUNCH, **head: int) -> None:
+    def send(
+        self, number: int, written: int, count: int | None = None, launch: int = LAUNCH, **head: int
+    ) -> None:
         """Let a message arrive, written there at the time of our tick `written`."""
         message = Message(message_dtype(self.spec.fields, self.spec.size))
         message.count = number if count is None else count
         time_ns = self.grid.time_ns(written)
-        envelope = Envelope(self.kind, launch, number, number, written, time_ns, time_ns)._replace(**head)
+        envelope = Envelope(self.kind, launch, number, number, written, time_ns, time_ns)._replace(
+            **head
+        )
         payload = bytes(message.raw)
-        self.network.come.append(Arrived(self.key, self.sealer.seal(self.key, envelope, payload), payload))
+        self.network.come.append(
+            Arrived(self.key, self.sealer.seal(self.key, envelope, payload), payload)
+        )
 
     def cycle(self, tick: int) -> None:
         """Do the adapter's cycle of `tick`."""
@@ -111,7 +124,10 @@ def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importin
     assert importing.read(3 + MAX_AGE) == (OLD, 77, True)
     importing.cycle(56)
     assert importing.entry.is_old(56)
-    assert (importing.status.import_other["age"], importing.status.import_other["age_s"]) == (54, 54 * 0.0025)
+    assert (importing.status.import_other["age"], importing.status.import_other["age_s"]) == (
+        54,
+        54 * 0.0025,
+    )
     importing.send(2, written=60)
     importing.cycle(64)
     assert importing.read(72) == (NEW, 2, False)
@@ -132,7 +148,13 @@ def test_the_newest_of_several_is_passed(importing: Importing) -> None:
         importing.send(number, written=number)
     importing.cycle(8)
     assert importing.read(16) == (NEW, 5, False)
-    assert importing.counts() == {"taken": 1, "missing": 1, "disordered": 1, "repeated": 2, "superseded": 1}
+    assert importing.counts() == {
+        "taken": 1,
+        "missing": 1,
+        "disordered": 1,
+        "repeated": 2,
+        "superseded": 1,
+    }
     assert importing.read(17)[0] is OLD
 
 
@@ -152,14 +174,21 @@ def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> 
     assert importing.read(16) == (NEW, 4, False)
 
 
-def test_a_number_of_any_size_leaves_the_count_of_what_is_missing_at_its_greatest(importing: Importing) -> None:
+def test_a_number_of_any_size_leaves_the_count_of_what_is_missing_at_its_greatest(
+    importing: Importing,
+) -> None:
     for number in (1, 1 << 32, (1 << 62) - 1):
         importing.send(number, written=2)
         importing.cycle(8)
-    assert (importing.status.import_other["taken"], importing.status.import_other["missing"]) == (3, (1 << 32) - 1)
+    assert (importing.status.import_other["taken"], importing.status.import_other["missing"]) == (
+        3,
+        (1 << 32) - 1,
+    )
 
 
-def test_a_lost_rack_is_lost_at_once_until_its_first_message_after_that(importing: Importing) -> None:
+def test_a_lost_rack_is_lost_at_once_until_its_first_message_after_that(
+    importing: Importing,
+) -> None:
     importing.send(1, written=2)
     importing.cycle(8)
     assert importing.read(16) == (NEW, 1, False)
@@ -243,7 +272,9 @@ def test_an_adapter_restarted_while_a_rack_is_lost_knows_that_it_is(importing: I
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
-def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(importing: Importing) -> None:
+def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(
+    importing: Importing,
+) -> None:
     peer = importing.peer
     importing.send(900, written=2)
     importing.cycle(8)
@@ -267,7 +298,9 @@ def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(importin
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
-def test_messages_of_a_launch_whose_token_never_comes_are_bounded_and_forgotten(importing: Importing) -> None:
+def test_messages_of_a_launch_whose_token_never_comes_are_bounded_and_forgotten(
+    importing: Importing,
+) -> None:
     for number in range(1, 100):
         importing.send(number, written=4, launch=NEXT)
     importing.cycle(8)
@@ -291,7 +324,9 @@ def test_a_message_whose_age_is_unknown_waits_for_the_clocks(importing: Importin
 
 
 @pytest.mark.parametrize("segment", ["lockstep"], indirect=True)
-def test_in_lockstep_nothing_that_differs_from_run_to_run_is_on_record(importing: Importing) -> None:
+def test_in_lockstep_nothing_that_differs_from_run_to_run_is_on_record(
+    importing: Importing,
+) -> None:
     importing.send(1, written=2)
     importing.cycle(8)
     assert importing.read(16) == (NEW, 1, False)
@@ -306,7 +341,9 @@ def test_a_clock_that_is_ahead_makes_nothing_younger_than_now(importing: Importi
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
-def test_what_was_written_before_the_first_tick_here_is_as_old_as_it_is(importing: Importing) -> None:
+def test_what_was_written_before_the_first_tick_here_is_as_old_as_it_is(
+    importing: Importing,
+) -> None:
     importing.send(1, written=-20)
     importing.cycle(8)
     assert importing.status.import_other["age"] == 28

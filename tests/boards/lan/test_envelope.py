@@ -1,4 +1,5 @@
-"""Envelopes: what was sealed comes out as it went in; whatever else comes from the network is refused and counted."""
+"""Envelopes: what was sealed comes out as it went in; whatever else comes from the network is
+refused and counted."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ MOST = 256
 KEY = "rack/cell/out/task/status"
 HEAD = Envelope(1, 2, 3, 4, 5, 6, 7)
 WORDS, SIGNED = st.integers(0, 2**64 - 1), st.integers(-(2**63), 2**63 - 1)
-HEADS = st.builds(Envelope, WORDS, WORDS, WORDS, WORDS, SIGNED, SIGNED, SIGNED, st.integers(0, 2**32 - 1))
+HEADS = st.builds(
+    Envelope, WORDS, WORDS, WORDS, WORDS, SIGNED, SIGNED, SIGNED, st.integers(0, 2**32 - 1)
+)
 PAYLOADS = st.binary(max_size=MOST)
 SEALER = Sealer(b"s" * 32, MOST)
 
@@ -28,7 +31,9 @@ def test_what_was_sealed_is_opened_unchanged(key: str, head: Envelope, payload: 
 
 
 @given(st.text(), st.none() | st.binary(max_size=2 * HEAD_BYTES), st.binary(max_size=2 * MOST))
-def test_arbitrary_input_raises_nothing_and_never_passes(key: str, envelope: bytes | None, payload: bytes) -> None:
+def test_arbitrary_input_raises_nothing_and_never_passes(
+    key: str, envelope: bytes | None, payload: bytes
+) -> None:
     assert isinstance(SEALER.opened(key, envelope, payload), Flaw)
 
 
@@ -38,7 +43,9 @@ def test_no_bit_of_envelope_or_payload_can_change(data: st.DataObject, payload: 
     whole = bytearray(envelope + payload)
     bit = data.draw(st.integers(0, 8 * len(whole) - 1))
     whole[bit // 8] ^= 1 << bit % 8
-    assert isinstance(SEALER.opened(KEY, bytes(whole[:HEAD_BYTES]), bytes(whole[HEAD_BYTES:])), Flaw)
+    assert isinstance(
+        SEALER.opened(KEY, bytes(whole[:HEAD_BYTES]), bytes(whole[HEAD_BYTES:])), Flaw
+    )
 
 
 @given(st.data())
@@ -52,13 +59,17 @@ def test_a_message_with_another_end_is_no_message(data: st.DataObject) -> None:
 
 
 @given(st.text(), st.text(), PAYLOADS)
-def test_a_message_replayed_under_another_key_is_unsigned(key: str, other: str, payload: bytes) -> None:
+def test_a_message_replayed_under_another_key_is_unsigned(
+    key: str, other: str, payload: bytes
+) -> None:
     assume(key != other)
     assert SEALER.opened(other, SEALER.seal(key, HEAD, payload), payload) is Flaw.UNSIGNED
 
 
 @given(st.text(min_size=1), PAYLOADS)
-def test_the_end_of_a_key_cannot_pass_for_the_beginning_of_a_payload(key: str, payload: bytes) -> None:
+def test_the_end_of_a_key_cannot_pass_for_the_beginning_of_a_payload(
+    key: str, payload: bytes
+) -> None:
     moved = key[-1].encode() + payload
     assume(len(moved) <= MOST)
     assert SEALER.opened(key[:-1], SEALER.seal(key, HEAD, payload), moved) is Flaw.UNSIGNED

@@ -1,4 +1,5 @@
-"""Two racks in real time, on one machine's loopback: boards and racks die and come back, and nothing is taken twice."""
+"""Two racks in real time, on one machine's loopback: boards and racks die and come back, and
+nothing is taken twice."""
 
 from __future__ import annotations
 
@@ -63,8 +64,11 @@ def written(segment: Segment, mailbox: str) -> np.ndarray:
 
 
 def awaited(rack: RackProcess, since: int, kind: str, text: str) -> dict[str, Any]:
-    """Return an event of a kind whose text contains this, after the first `since`: clock and adapter ring apart."""
-    past = [event for event in rack.events[since:] if event["kind"] == kind and text in event["text"]]
+    """Return an event of a kind whose text contains this, after the first `since`: clock and
+    adapter ring apart."""
+    past = [
+        event for event in rack.events[since:] if event["kind"] == kind and text in event["text"]
+    ]
     return past[0] if past else rack.await_event(kind, text)
 
 
@@ -153,9 +157,14 @@ def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Pa
 
 @needs_fifo
 @pytest.mark.alone
-def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(rack_name: str, tmp_path: Path) -> None:
+def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(
+    rack_name: str, tmp_path: Path
+) -> None:
     (config,) = configs(
-        [rack_text(rack_name, endpoints(1)[0], [])], tmp_path, "adapter.lan.priority=37", "board.pulse.priority=36"
+        [rack_text(rack_name, endpoints(1)[0], [])],
+        tmp_path,
+        "adapter.lan.priority=37",
+        "board.pulse.priority=36",
     )
     with Rack(config) as rack:
         pid = rack.segment.block("lan")[Block.PID]
@@ -184,7 +193,9 @@ def flooding(name: str, endpoint: str, victim: str) -> Iterator[None]:
 
 
 @pytest.mark.alone
-def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(rack_name: str, tmp_path: Path) -> None:
+def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(
+    rack_name: str, tmp_path: Path
+) -> None:
     (at,) = endpoints(1)
     calm = """
 [adapter.lan.import.calm]
@@ -193,15 +204,20 @@ type = "lan_levels:PULSE"
 rate_hz = 50
 max_age_ms = 1000
 """
-    (config,) = configs([rack_text(rack_name, at, [], "flood", lan="lease_ms = 1000") + calm], tmp_path)
+    (config,) = configs(
+        [rack_text(rack_name, at, [], "flood", lan="lease_ms = 1000") + calm], tmp_path
+    )
     with Rack(config) as rack, flooding("flood", at, rack_name):
         rack.start(SECONDS)
 
         def goes_on() -> bool:
             rack.watch(0.01)
-            # The clocks are not compared, so the calm messages wait, and the next one overtakes each.
+            # The clocks are not compared, so the calm messages wait, and the next one overtakes
+            # each.
             entry = newest(rack.segment, "lan.status")
-            return entry.import_other["refused"] > 20 * UNREAD and entry.import_calm["superseded"] > 10
+            return (
+                entry.import_other["refused"] > 20 * UNREAD and entry.import_calm["superseded"] > 10
+            )
 
         wait_until(goes_on)
         rows = written(rack.segment, "lan.status")
@@ -214,14 +230,18 @@ max_age_ms = 1000
     assert rows["import_other"]["taken"][-1] == 0
 
 
-def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(rack_name: str) -> None:
+def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(
+    rack_name: str,
+) -> None:
     text = rack_text(rack_name, "", []).replace("[clock]", '[clock]\nmode = "lockstep"')
     text += '[[fault]]\nkind = "kill"\nboard = "lan"\ntick = 100\n'
     ended = []
     for _ in range(2):
         with Rack(loads(text)) as rack:
             outcome = rack.run(1.5)
-            ended.append((outcome.digest, int(newest(rack.segment, "lan.status").export_pulse["sent"])))
+            ended.append(
+                (outcome.digest, int(newest(rack.segment, "lan.status").export_pulse["sent"]))
+            )
             assert [event.board for event in rack.events if event.code == "rejoined"] == ["lan"]
             rows = written(rack.segment, "lan.status")["export_pulse"]["sent"].astype(int)
     assert ended[0] == ended[1]
@@ -231,7 +251,8 @@ def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(
 
 
 def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
-    """Run a rack whose adapter switches its demand at a tick; return ticks and texts of what the arm must do."""
+    """Run a rack whose adapter switches its demand at a tick; return ticks and texts of what the
+    arm must do."""
     with rack:
         rack.segment.words[System.PEER_STOP] = switch(demand_from, is_on)
         rack.run(0.5)
@@ -239,7 +260,14 @@ def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
 
 
 def test_the_clock_follows_the_adapter_at_its_tick(rack_name: str) -> None:
-    text = rack_text(rack_name, "", []).partition("[adapter.lan]")[0].replace("[clock]", '[clock]\nmode = "lockstep"')
+    text = (
+        rack_text(rack_name, "", [])
+        .partition("[adapter.lan]")[0]
+        .replace("[clock]", '[clock]\nmode = "lockstep"')
+    )
     stop = "the arm must ramp to rest, then brake: a rack that it works with is lost"
     assert words(100, True, Rack(loads(text))) == [(100, stop)]
-    assert words(100, False, Rack(loads(text))) == [(0, stop), (100, "arm released: no stop is requested")]
+    assert words(100, False, Rack(loads(text))) == [
+        (0, stop),
+        (100, "arm released: no stop is requested"),
+    ]

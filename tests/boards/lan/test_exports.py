@@ -21,7 +21,11 @@ class Exporting:
     def __init__(self, segment: Segment) -> None:
         config = loads(segment.config)
         assert config.adapter.lan is not None
-        self.segment, self.table, self.network = segment, config.adapter.lan.exports["pulse"], Network()
+        self.segment, self.table, self.network = (
+            segment,
+            config.adapter.lan.exports["pulse"],
+            Network(),
+        )
         self.writer = open_writer(segment, "pulse.status")
         self.status = Message(status_of(("pulse",), ()).dtype({}))
         self.open()
@@ -56,7 +60,9 @@ def test_each_new_message_is_sent_once(segment: Segment) -> None:
     assert heads[1].stamp_ns == 16 * 2_500_000
 
 
-def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(segment: Segment) -> None:
+def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(
+    segment: Segment,
+) -> None:
     exporting = Exporting(segment)
     for tick in (0, 8):
         exporting.writer.write(tick)

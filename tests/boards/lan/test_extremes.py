@@ -1,4 +1,5 @@
-"""Every field of every type that shipped racks import, at its extremes, into the boards that read it: none ends."""
+"""Every field of every type that shipped racks import, at its extremes, into the boards that read
+it: none ends."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from rack.boards.config import CONFIGS, load, resolve
 from rack.boards.config.schema import RackConfig
 from rack.levels.messages import Error
 from rack.levels.operator import Goal
-from rack.levels.systems.cell.messages import CELL_ORDER, CELL_REPORT, OrderAction, OrderVerb, Response
+from rack.levels.systems.cell.messages import (
+    CELL_ORDER,
+    CELL_REPORT,
+    OrderAction,
+    OrderVerb,
+    Response,
+)
 from rack.levels.systems.cell.program import CellProgram
 from rack.levels.systems.cell.shared_bodies import SHARED_BODIES
 from rack.tools.viewer.window import free_port
@@ -25,19 +32,31 @@ FOLDER = CONFIGS / "cell"
 ORDER = "rack.levels.systems.cell.messages:CELL_ORDER"
 REPORT = "rack.levels.systems.cell.messages:CELL_REPORT"
 BODIES = "rack.levels.systems.cell.shared_bodies:SHARED_BODIES"
-POSE = {"action": OrderAction.GOTO, "goal": Goal.POSE, "position": (0.45, -0.3, 0.7), "quaternion": (0, 1, 0, 0)}
+POSE = {
+    "action": OrderAction.GOTO,
+    "goal": Goal.POSE,
+    "position": (0.45, -0.3, 0.7),
+    "quaternion": (0, 1, 0, 0),
+}
 ACTIONS: Sequence[Mapping[str, Any]] = (
     POSE,
     {**POSE, "goal": Goal.DIRECTION, "direction": (0, 0, -1), "by": 500.0},
     {"action": OrderAction.GOTO, "goal": Goal.JOINTS, "count": 6, "joints": 0.1},
-    {"action": OrderAction.TRANSFER, "object": b"part", "position": (0.62, 0.0, 0.475), "lift": 0.1, "turned": 1},
+    {
+        "action": OrderAction.TRANSFER,
+        "object": b"part",
+        "position": (0.62, 0.0, 0.475),
+        "lift": 0.1,
+        "turned": 1,
+    },
 )
 PLANNED = 14
 """Cycles at 10 Hz in which an order is rehearsed."""
 
 
 class Sender(NamedTuple):
-    """A rack that stands in for one: its level's board, port and type, and what it sends: cycles and case."""
+    """A rack that stands in for one: its level's board, port and type, and what it sends: cycles
+    and case."""
 
     rack: str
     mailbox: str
@@ -88,12 +107,15 @@ rate_hz = {self.rate_hz}
 
 
 def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
-    """Return the config of a shipped rack under a name of its own, where `cell` stands in its name."""
+    """Return the config of a shipped rack under a name of its own, where `cell` stands in its
+    name."""
     for path in FOLDER.glob("*.toml"):
         text = re.sub(r'"cell(?=["/-])', f'"{name}', path.read_text().replace('"../', '"'))
         (folder / path.name).write_text(text)
     endpoint = f'adapter.lan.listen=["tcp/127.0.0.1:{listen}"]'
-    return load(folder / f"{file}.toml", ["clock.mode=lockstep", endpoint, "adapter.lan.connect=[]"])
+    return load(
+        folder / f"{file}.toml", ["clock.mode=lockstep", endpoint, "adapter.lan.connect=[]"]
+    )
 
 
 def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) -> Ended:
@@ -108,9 +130,12 @@ def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) 
 
 
 def check(found: Ended, counts: Mapping[str, int]) -> None:
-    """All boards live, no stop is latched, and exactly what no type permits is refused, import by import."""
+    """All boards live, no stop is latched, and exactly what no type permits is refused, import by
+    import."""
     assert not found.outcome.faults, found.texts
-    assert not [event.text for event in found.events if event.kind in ("died", "detection")], found.texts
+    assert not [event.text for event in found.events if event.kind in ("died", "detection")], (
+        found.texts
+    )
     imports = {port: found.last["lan.status"][f"import_{port}"] for port in counts}
     assert {port: int(entry["refused"]) for port, entry in imports.items()} == counts
     assert all(entry["taken"] > 0 for entry in imports.values())
@@ -118,7 +143,10 @@ def check(found: Ended, counts: Mapping[str, int]) -> None:
 
 def test_all_types_that_shipped_racks_import_are_tried() -> None:
     texts = [path.read_text() for path in CONFIGS.rglob("*.toml")]
-    found = [re.findall(r"\[adapter\.lan\.import\.[^]]*\][^[]*?\ntype = \"(.*)\"", text) for text in texts]
+    found = [
+        re.findall(r"\[adapter\.lan\.import\.[^]]*\][^[]*?\ntype = \"(.*)\"", text)
+        for text in texts
+    ]
     assert {name for names in found for name in names} == {ORDER, REPORT, BODIES}
 
 
@@ -148,12 +176,20 @@ def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
 
 
 def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_path: Path) -> None:
-    body = {"name": b"part", "claim": 3, "owner": b"other", "position": (0.6, 0.1, 0.475), "quaternion": (1, 0, 0, 0)}
+    body = {
+        "name": b"part",
+        "claim": 3,
+        "owner": b"other",
+        "position": (0.6, 0.1, 0.475),
+        "quaternion": (1, 0, 0, 0),
+    }
     found = cases(SHARED_BODIES, {"rack": b"other", "bodies": body})
     first = ("plain", "bodies.position", "bodies.quaternion")
-    # At 0 the part is in the pedestal, an unintended contact. Last: greater claims, after which this one is not heard.
+    # At 0 the part is in the pedestal, an unintended contact. Last: greater claims, after which
+    # this one is not heard.
     tried = sorted(
-        (one for one in found if one[0] != "bodies.position = 0.0"), key=lambda one: one[0].split()[0] not in first
+        (one for one in found if one[0] != "bodies.position = 0.0"),
+        key=lambda one: one[0].split()[0] not in first,
     )
     listen, senders = free_port(), orders_and_bodies(rack_name, (), [(5, one) for one in tried])
     ended = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
@@ -165,12 +201,16 @@ def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Pat
     cell = real("cell", rack_name, tmp_path, listen)
     checksum = CellProgram.model_validate(resolve(cell).config.task).checksum
     answer = {"program": checksum, "echo": 1000}
-    rows = [*cases(CELL_REPORT, answer), *cases(CELL_REPORT, {**answer, "response": Response.DOING, "moves": 2})]
+    rows = [
+        *cases(CELL_REPORT, answer),
+        *cases(CELL_REPORT, {**answer, "response": Response.DOING, "moves": 2}),
+    ]
     # Last: a refusal that is permitted ends the program.
     refusal = {**answer, "response": Response.REFUSED, "error": Error.NO_PATH, "reason": b"no"}
     rows += sorted(cases(CELL_REPORT, refusal), key=lambda case: case[0] != "error = 65535")
     senders = [
-        Sender(f"{rack_name}-{arm}", "task.report", REPORT, 10, [(2, c) for c in rows]) for arm in ("puma", "k1607")
+        Sender(f"{rack_name}-{arm}", "task.report", REPORT, 10, [(2, c) for c in rows])
+        for arm in ("puma", "k1607")
     ]
     found = run(cell, listen, senders, tmp_path)
     check(found, {sender.rack.removeprefix(f"{rack_name}-"): sender.refused for sender in senders})

@@ -20,21 +20,32 @@ TESTS = Path(__file__).parents[2]
 MISTAKES = {
     "a rate that does not divide": (
         ["adapter.lan.import.other.rate_hz=15"],
-        "adapter.lan.import.other.rate_hz = 15.0: exchange: 15 Hz does not divide the 50 Hz of the adapter; "
-        "nearest: 12.5 Hz (every 4 cycles), 16.67 Hz (every 3 cycles)",
+        (
+            "adapter.lan.import.other.rate_hz = 15.0: exchange: 15 Hz does not divide the 50 Hz of"
+            " the adapter; nearest: 12.5 Hz (every 4 cycles), 16.67 Hz (every 3 cycles)"
+        ),
     ),
     "a rate above the adapter's": (
         ["adapter.lan.rate_hz=20", "adapter.lan.export.pulse.rate_hz=10"],
-        "adapter.lan.import.other.rate_hz = 50.0: exchange: 50 Hz does not divide the 20 Hz of the adapter; "
-        "nearest: 20 Hz (every 1 cycle)",
+        (
+            "adapter.lan.import.other.rate_hz = 50.0: exchange: 50 Hz does not divide the 20 Hz of"
+            " the adapter; nearest: 20 Hz (every 1 cycle)"
+        ),
     ),
     "the adapter's rate": (
-        ["adapter.lan.rate_hz=33", "adapter.lan.import.other.rate_hz=33", "adapter.lan.export.pulse.rate_hz=33"],
+        [
+            "adapter.lan.rate_hz=33",
+            "adapter.lan.import.other.rate_hz=33",
+            "adapter.lan.export.pulse.rate_hz=33",
+        ],
         "adapter.lan.rate_hz: level 'lan': 33 Hz does not divide the 400 Hz clock",
     ),
     "a rate beyond 50 Hz": (
         ["adapter.lan.import.other.rate_hz=60"],
-        "adapter.lan.import.other.rate_hz = 60: should be less than or equal to 50; rate of the exchange",
+        (
+            "adapter.lan.import.other.rate_hz = 60: should be less than or equal to 50; rate of the"
+            " exchange"
+        ),
     ),
     "a rate off the grid of a board that is exported": (
         ["board.pulse.rate_hz=33"],
@@ -42,37 +53,67 @@ MISTAKES = {
     ),
     "a servo loop": (
         ["board.pulse.rate_hz=400"],
-        'adapter.lan.export.pulse.from = "pulse.status": written at 400 Hz, and a loop that fast must not wait for a '
-        "network; permitted: up to 50 Hz: over a network goes what the task and elemental-move levels exchange",
+        (
+            'adapter.lan.export.pulse.from = "pulse.status": written at 400 Hz, and a loop that'
+            " fast must not wait for a network; permitted: up to 50 Hz: over a network goes what"
+            " the task and elemental-move levels exchange"
+        ),
     ),
     "no such mailbox": (
         ["adapter.lan.export.pulse.from=pulse.pulse"],
-        'adapter.lan.export.pulse.from = "pulse.pulse": no such mailbox; mailboxes: pulse.status, echo.status',
+        (
+            'adapter.lan.export.pulse.from = "pulse.pulse": no such mailbox; mailboxes:'
+            " pulse.status, echo.status"
+        ),
     ),
     "a mailbox of the adapter": (
         ["adapter.lan.export.again={ from = 'lan.other' }"],
-        'adapter.lan.export.again.from = "lan.other": written by the adapter itself; permitted: mailboxes that',
+        (
+            'adapter.lan.export.again.from = "lan.other": written by the adapter itself; permitted:'
+            " mailboxes that"
+        ),
     ),
     "a queue": (
         [
             f"python_path=['{TESTS / 'boards'}', '{TESTS / 'boards/lan'}']",
-            "board.sender={ slot = 9, rate_hz = 50, executor = 'queue_levels:Asking', params = { burst = 1 } }",
+            (
+                "board.sender={ slot = 9, rate_hz = 50, executor = 'queue_levels:Asking', params ="
+                " { burst = 1 } }"
+            ),
             "adapter.lan.export.again={ from = 'sender.requests' }",
         ],
-        'adapter.lan.export.again.from = "sender.requests": a queue gives each message once, to its one reader here',
+        (
+            'adapter.lan.export.again.from = "sender.requests": a queue gives each message once, to'
+            " its one reader here"
+        ),
     ),
     "a rack itself": (
-        ["adapter.lan.import.own={ from = 'one/pulse.status', type = 'lan_levels:PULSE', max_age_ms = 500 }"],
-        'adapter.lan.import.own.from = "one/pulse.status": a mailbox of this rack itself: levels here read it',
+        [
+            "adapter.lan.import.own={ from = 'one/pulse.status', type = 'lan_levels:PULSE',"
+            " max_age_ms = 500 }"
+        ],
+        (
+            'adapter.lan.import.own.from = "one/pulse.status": a mailbox of this rack itself:'
+            " levels here read it"
+        ),
     ),
-    "a peer itself": (["adapter.lan.peers=['one']"], 'adapter.lan.peers = "one": the name of this rack itself'),
+    "a peer itself": (
+        ["adapter.lan.peers=['one']"],
+        'adapter.lan.peers = "one": the name of this rack itself',
+    ),
     "peers alike": (
         ["adapter.lan.peers=['a-b', 'a_b']"],
-        "adapter.lan.peers = ['a-b', 'a_b']: these names differ in '-' and '_' alone, so their mailboxes lan.peer_a_b",
+        (
+            "adapter.lan.peers = ['a-b', 'a_b']: these names differ in '-' and '_' alone, so their"
+            " mailboxes lan.peer_a_b"
+        ),
     ),
     "an unknown type": (
         ["adapter.lan.import.other.type=lan_levels:PLUSE"],
-        "adapter.lan.import.other.type = \"lan_levels:PLUSE\": module 'lan_levels' has no message type 'PLUSE'",
+        (
+            "adapter.lan.import.other.type = \"lan_levels:PLUSE\": module 'lan_levels' has no"
+            " message type 'PLUSE'"
+        ),
     ),
     "an unknown module": (
         ["adapter.lan.import.other.type=lan_lewels:PULSE"],
@@ -80,8 +121,8 @@ MISTAKES = {
     ),
     "a type with sizes of an arm": (
         [
-            "adapter.lan.import.more={ from = 'two/servo.command', type = 'rack.levels.messages:JOINT_SET_POINT', "
-            "max_age_ms = 500 }"
+            "adapter.lan.import.more={ from = 'two/servo.command', type ="
+            " 'rack.levels.messages:JOINT_SET_POINT', max_age_ms = 500 }"
         ],
         'adapter.lan.import.more.type = "rack.levels.messages:JOINT_SET_POINT": ',
     ),
@@ -91,27 +132,41 @@ MISTAKES = {
     ),
     "too short an age": (
         ["adapter.lan.import.other.rate_hz=10"],
-        "adapter.lan.import.other.max_age_ms = 100.0: between two exchanges it gets as old as one of them and a cycle "
-        "of the adapter, 120 ms; permitted: no less",
+        (
+            "adapter.lan.import.other.max_age_ms = 100.0: between two exchanges it gets as old as"
+            " one of them and a cycle of the adapter, 120 ms; permitted: no less"
+        ),
     ),
     "an import twice": (
         [
-            "adapter.lan.import.again={ from = 'two/pulse.status', type = 'lan_levels:PULSE', rate_hz = 50, "
-            "max_age_ms = 500 }"
+            "adapter.lan.import.again={ from = 'two/pulse.status', type = 'lan_levels:PULSE',"
+            " rate_hz = 50, max_age_ms = 500 }"
         ],
-        'adapter.lan.import = "two/pulse.status": listed 2 times: other, again; any number of levels may read',
+        (
+            'adapter.lan.import = "two/pulse.status": listed 2 times: other, again; any number of'
+            " levels may read"
+        ),
     ),
     "an export twice": (
         ["adapter.lan.export.again={ from = 'pulse.status' }"],
         'adapter.lan.export = "pulse.status": listed 2 times: pulse, again',
     ),
     "a port of the adapter's own": (
-        ["adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms = 500 }"],
+        [
+            "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms ="
+            " 500 }"
+        ],
         "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
     ),
     "a port of a peer": (
-        ["adapter.lan.import.peer_two={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms = 500 }"],
-        "adapter.lan.import.peer_two: the adapter writes what it knows of rack 'two' under this name; rename the port",
+        [
+            "adapter.lan.import.peer_two={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms"
+            " = 500 }"
+        ],
+        (
+            "adapter.lan.import.peer_two: the adapter writes what it knows of rack 'two' under this"
+            " name; rename the port"
+        ),
     ),
     "a board of its name": (
         ["board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
@@ -123,21 +178,32 @@ MISTAKES = {
     ),
     "a board that is the adapter": (
         ["board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }"],
-        'board.net.executor = "rack.boards.lan.adapter:LanAdapter": permitted: [adapter.lan], which makes its board',
+        (
+            'board.net.executor = "rack.boards.lan.adapter:LanAdapter": permitted: [adapter.lan],'
+            " which makes its board"
+        ),
     ),
-    "a slot that is taken": (["adapter.lan.slot=2"], "adapter.lan.slot = 2: already taken by board.pulse.slot"),
+    "a slot that is taken": (
+        ["adapter.lan.slot=2"],
+        "adapter.lan.slot = 2: already taken by board.pulse.slot",
+    ),
     "a slot that it has taken": (
         ["board.late={ slot = 5, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
         "adapter.lan.slot = 5: already taken by board.late.slot",
     ),
     "a priority below a neighbour's": (
         ["clock.mode=realtime", "adapter.lan.priority=40", "board.pulse.priority=40"],
-        "adapter.lan.priority = 40: must be above that of the other boards on core 0, pulse 40: else they keep it",
+        (
+            "adapter.lan.priority = 40: must be above that of the other boards on core 0, pulse 40:"
+            " else they keep it"
+        ),
     ),
     "determinism in real time": (
         ["clock.mode=realtime", "protocol.strict=true"],
-        "adapter.lan: what other racks send makes a run depend on timing, refused by protocol.strict = true; "
-        'permitted: clock.mode = "lockstep"',
+        (
+            "adapter.lan: what other racks send makes a run depend on timing, refused by"
+            ' protocol.strict = true; permitted: clock.mode = "lockstep"'
+        ),
     ),
     "an unknown key": (
         ["adapter.lan.lisen=['tcp/127.0.0.1:7555']"],
@@ -145,7 +211,10 @@ MISTAKES = {
     ),
     "an unknown rule": (
         ["adapter.lan.on_peer_loss=brake"],
-        "adapter.lan.on_peer_loss = \"brake\": should be 'hold', 'stop' or 'go on'; while a rack that was there",
+        (
+            "adapter.lan.on_peer_loss = \"brake\": should be 'hold', 'stop' or 'go on'; while a"
+            " rack that was there"
+        ),
     ),
 }
 
@@ -207,8 +276,10 @@ def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.delitem(__import__("sys").modules, f"rack.boards.lan.{module}", raising=False)
     with pytest.raises(ConfigError) as error:
         resolved()
-    assert str(error.value) == (
-        "adapter.lan: an exchange with other racks needs eclipse-zenoh: pip install 'nasrem-rack[lan]'"
+    assert (
+        str(error.value)
+        == "adapter.lan: an exchange with other racks needs eclipse-zenoh: pip install"
+        " 'nasrem-rack[lan]'"
     )
 
 

@@ -67,7 +67,8 @@ def test_a_link_that_connects_does_not_listen() -> None:
 
 
 def test_opening_waits_for_no_peer() -> None:
-    """A restarted board would come back late: zenoh by itself waits for a peer that is not there."""
+    """A restarted board would come back late: zenoh by itself waits for a peer that is not
+    there."""
 
     def opened_s() -> float:
         with home(connect=[f"tcp/127.0.0.1:{free_port()}"]) as program:
@@ -93,7 +94,11 @@ def crowd(site: Site, stack: ExitStack) -> None:
 
 def test_a_crowd_at_the_door_does_not_disturb_who_is_in(site: Site) -> None:
     with ExitStack() as stack, running("strangers", json.dumps({"friend": friend(site)})) as others:
-        wait_until(lambda: others.state()["friend"]["heard"] and "friend came" in site.home.state()["tokens"])
+        wait_until(
+            lambda: (
+                others.state()["friend"]["heard"] and "friend came" in site.home.state()["tokens"]
+            )
+        )
         before = site.home.state()["tokens"]
         crowd(site, stack)
         good, heard = site.home.state()["good"][PULSE], others.state()["friend"]["heard"][OWN]
@@ -103,14 +108,18 @@ def test_a_crowd_at_the_door_does_not_disturb_who_is_in(site: Site) -> None:
 
 
 def test_with_a_crowd_at_the_door_a_rack_still_goes_out_to_its_friends(site: Site) -> None:
-    """The door itself opens late: zenoh takes no connection for 0.1 s after each failed handshake."""
+    """The door itself opens late: zenoh takes no connection for 0.1 s after each failed
+    handshake."""
     listening = {f"{way}/endpoints": [] for way in ("listen", "connect")}
     listening["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]
     outside = friend(site)
     outside["settings"] |= listening
     with ExitStack() as stack:
         crowd(site, stack)
-        came, good = site.home.state()["tokens"].count("friend came"), site.home.state()["good"].get(PULSE, 0)
+        came, good = (
+            site.home.state()["tokens"].count("friend came"),
+            site.home.state()["good"].get(PULSE, 0),
+        )
         others = stack.enter_context(running("strangers", json.dumps({"friend": outside})))
         wait_until(lambda: others.state()["friend"]["heard"])
         wait_until(lambda: site.home.state()["good"].get(PULSE, 0) > good + 10)

@@ -1,4 +1,5 @@
-"""Racks in lockstep step as one: equal runs whatever the machine does, and clear words where they cannot."""
+"""Racks in lockstep step as one: equal runs whatever the machine does, and clear words where they
+cannot."""
 
 from __future__ import annotations
 
@@ -13,7 +14,16 @@ from rack.backplane.words import Block, System
 from rack.boards.crate import patience
 from rack.levels.peer import Presence, peer_port
 from rack.tools.live.holds import Holds
-from tests.boards.lan.racks import Ended, configs, ended, ring_texts, run_together, running, started, watch
+from tests.boards.lan.racks import (
+    Ended,
+    configs,
+    ended,
+    ring_texts,
+    run_together,
+    running,
+    started,
+    watch,
+)
 from tests.processes import forked, runs, wait_until
 
 pytestmark = pytest.mark.slow
@@ -38,7 +48,9 @@ def names(rack_name: str) -> list[str]:
 
 def digests(found: Sequence[Ended]) -> list[str]:
     """Return the digests of racks, each of which ran to its end."""
-    assert [one.outcome.cause for one in found] == ["time over"] * len(found), [one.texts for one in found]
+    assert [one.outcome.cause for one in found] == ["time over"] * len(found), [
+        one.texts for one in found
+    ]
     return [one.outcome.digest for one in found]
 
 
@@ -48,7 +60,9 @@ def load() -> None:
         pass
 
 
-def test_three_racks_repeat_whatever_the_order_of_launches_and_the_load(names: list[str], tmp_path: Path) -> None:
+def test_three_racks_repeat_whatever_the_order_of_launches_and_the_load(
+    names: list[str], tmp_path: Path
+) -> None:
     racks = configs(ring_texts(names), tmp_path, STEPPED)
     first = run_together(racks, [1.0, 1.0, 1.0])
     with forked(load), forked(load):
@@ -60,13 +74,16 @@ def test_three_racks_repeat_whatever_the_order_of_launches_and_the_load(names: l
         # In its first cycle an adapter finds nothing to export.
         assert counts["taken"] == 49
         assert not any(
-            counts[name] for name in ("missing", "repeated", "late", "refused", "unknown_launch", "superseded")
+            counts[name]
+            for name in ("missing", "repeated", "late", "refused", "unknown_launch", "superseded")
         )
         assert one.last["echo.status"]["total"] == sum(range(48))
         assert one.last["echo.status"]["lost"] == 0
 
 
-def test_a_rack_that_ends_earlier_is_lost_at_the_same_tick_each_time(names: list[str], tmp_path: Path) -> None:
+def test_a_rack_that_ends_earlier_is_lost_at_the_same_tick_each_time(
+    names: list[str], tmp_path: Path
+) -> None:
     racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
     found = [run_together(racks, [0.75, 0.3]) for _ in range(2)]
     assert digests(found[0]) == digests(found[1])
@@ -77,7 +94,9 @@ def test_a_rack_that_ends_earlier_is_lost_at_the_same_tick_each_time(names: list
     assert first.last["echo.status"]["lost"] > 0
 
 
-def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(names: list[str], tmp_path: Path) -> None:
+def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(
+    names: list[str], tmp_path: Path
+) -> None:
     texts = ring_texts(names[:2])
     racks = configs([texts[0], texts[1] + KILL], tmp_path, STEPPED)
     found = [run_together(racks, [1.0, 1.0]) for _ in range(2)]
@@ -124,7 +143,11 @@ def test_a_rack_started_anew_takes_no_part_and_says_why(names: list[str], tmp_pa
             rack.segment.words[System.HOLD_AT] = 0
             outcome = other.outcome()
             assert outcome["cause"] == "board lost"
-            assert any(f"rack '{names[0]}' " in event["text"] for event in other.events if event["kind"] == "printed")
+            assert any(
+                f"rack '{names[0]}' " in event["text"]
+                for event in other.events
+                if event["kind"] == "printed"
+            )
         watch([rack])
         assert ended(rack).outcome.cause == "time over"
 
@@ -170,9 +193,14 @@ def test_a_rack_held_by_the_host_holds_the_others(names: list[str], tmp_path: Pa
         ("clock.mode=realtime", "rack '{}' runs in real time, this one in lockstep"),
     ],
 )
-def test_racks_of_different_clocks_say_so_and_end(names: list[str], tmp_path: Path, setting: str, text: str) -> None:
+def test_racks_of_different_clocks_say_so_and_end(
+    names: list[str], tmp_path: Path, setting: str, text: str
+) -> None:
     texts = ring_texts(names[:2])
-    racks = [*configs(texts[:1], tmp_path, STEPPED), *configs(texts[1:], tmp_path, STEPPED, setting)]
+    racks = [
+        *configs(texts[:1], tmp_path, STEPPED),
+        *configs(texts[1:], tmp_path, STEPPED, setting),
+    ]
     first, _ = run_together(racks, [1.0, 0.5])
     assert first.outcome.cause == "board lost"
     assert text.format(names[1]) in first.texts

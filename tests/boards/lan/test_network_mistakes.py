@@ -18,7 +18,9 @@ TLS = "tls/127.0.0.1:7447"
 SHAPE = "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535"
 
 
-def mistakes(folder: Path, listen: str = "", lan: str = "", connect: tuple[str, ...] = ()) -> list[str]:
+def mistakes(
+    folder: Path, listen: str = "", lan: str = "", connect: tuple[str, ...] = ()
+) -> list[str]:
     """Return the mistakes of a rack with this endpoint and further lines of `[adapter.lan]`."""
     path = folder / "rack.toml"
     path.write_text(rack_text("cell", listen, connect, peers=["puma"], lan=lan))
@@ -39,15 +41,25 @@ def test_loopback_needs_no_tls(tmp_path: Path, endpoint: str) -> None:
 
 @pytest.mark.parametrize(
     "endpoint",
-    ["tcp/10.0.0.1:7447", "tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/cell.local:7447", "tcp/localhost.cell:7447"],
+    [
+        "tcp/10.0.0.1:7447",
+        "tcp/0.0.0.0:7447",
+        "tcp/[::]:7447",
+        "tcp/cell.local:7447",
+        "tcp/localhost.cell:7447",
+    ],
 )
-def test_beyond_loopback_tcp_is_refused_unless_asked_for_by_name(tmp_path: Path, endpoint: str) -> None:
+def test_beyond_loopback_tcp_is_refused_unless_asked_for_by_name(
+    tmp_path: Path, endpoint: str
+) -> None:
     why = (
-        "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an address of loopback, or by "
-        "name, adapter.lan.insecure = true"
+        "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an address of"
+        " loopback, or by name, adapter.lan.insecure = true"
     )
     assert mistakes(tmp_path, endpoint) == [f'adapter.lan.listen[0] = "{endpoint}": {why}']
-    assert mistakes(tmp_path, connect=(endpoint,)) == [f'adapter.lan.connect[0] = "{endpoint}": {why}']
+    assert mistakes(tmp_path, connect=(endpoint,)) == [
+        f'adapter.lan.connect[0] = "{endpoint}": {why}'
+    ]
     assert mistakes(tmp_path, endpoint, "insecure = true") == []
 
 
@@ -80,13 +92,18 @@ def test_what_looks_like_an_address_must_be_one(tmp_path: Path, host: str) -> No
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
     (line,) = mistakes(tmp_path, TLS)
-    assert line == "adapter.lan.certificates: missing; TLS needs them: see rack lan certificates --help"
+    assert (
+        line
+        == "adapter.lan.certificates: missing; TLS needs them: see rack lan certificates --help"
+    )
 
 
 def test_flaws_of_all_files_come_with_the_other_mistakes(tmp_path: Path) -> None:
     (tmp_path / "certs").mkdir()
     lines = mistakes(tmp_path, TLS, 'certificates = "certs"', connect=("tcp/127.0.0.1:7448",))
-    assert lines[0].startswith('adapter.lan.connect[0] = "tcp/127.0.0.1:7448": without TLS, which others have')
+    assert lines[0].startswith(
+        'adapter.lan.connect[0] = "tcp/127.0.0.1:7448": without TLS, which others have'
+    )
     files = ("authority.pem", "cell.pem", "cell-key.pem", "secret")
     why = f"missing; see rack lan certificates --help; in {tmp_path}/certs"
     assert lines[1:] == [f"adapter.lan.certificates: {name}: {why}" for name in files]
@@ -145,8 +162,16 @@ def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
     for listen, lan, note in (
         (near, "", ""),
         (TLS, own, ""),
-        (far, "insecure = true", f"without TLS: whoever reaches {far} may read and forge what is exchanged"),
-        (far, f"insecure = true\n{own}", f"without TLS: whoever reaches {far} may read what is exchanged"),
+        (
+            far,
+            "insecure = true",
+            f"without TLS: whoever reaches {far} may read and forge what is exchanged",
+        ),
+        (
+            far,
+            f"insecure = true\n{own}",
+            f"without TLS: whoever reaches {far} may read what is exchanged",
+        ),
     ):
         assert mistakes(tmp_path, listen, lan) == []
         assert network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])

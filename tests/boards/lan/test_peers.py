@@ -30,7 +30,12 @@ def test_a_rack_is_there_from_its_token_to_the_end_of_it() -> None:
     peer.comes(OLD, 5)
     assert (peer.presence, peer.since, peer.launches, alarms(peer)) == (Presence.THERE, 5, 1, [])
     peer.goes(OLD, 9)
-    assert (peer.presence, peer.since, peer.losses, alarms(peer)) == (Presence.LOST, 9, 1, [Alarm.PEER_LOST])
+    assert (peer.presence, peer.since, peer.losses, alarms(peer)) == (
+        Presence.LOST,
+        9,
+        1,
+        [Alarm.PEER_LOST],
+    )
 
 
 def test_a_partition_is_not_a_restart() -> None:
@@ -67,7 +72,9 @@ def test_of_two_tokens_seen_at_once_the_one_that_stays_is_there() -> None:
         assert (peer.launch, peer.is_there, peer.launches) == (NEW, True, 2)
 
 
-def test_a_new_launch_after_a_loss_is_a_restart_even_if_the_old_token_was_never_seen_to_go() -> None:
+def test_a_new_launch_after_a_loss_is_a_restart_even_if_the_old_token_was_never_seen_to_go() -> (
+    None
+):
     peer = PeerRack("b")
     peer.comes(OLD, 5)
     peer.goes(OLD, 9)
@@ -94,9 +101,19 @@ def test_a_restarted_adapter_goes_on_with_the_same_launch() -> None:
     peer = PeerRack("b")
     peer.comes(OLD, 5)
     after = restarted(peer, 100)
-    assert (after.presence, after.launch, after.launches, after.since) == (Presence.THERE, OLD, 1, 5)
+    assert (after.presence, after.launch, after.launches, after.since) == (
+        Presence.THERE,
+        OLD,
+        1,
+        5,
+    )
     after.comes(OLD, 50)
-    assert (after.presence, after.launches, after.losses, alarms(after)) == (Presence.THERE, 1, 0, [])
+    assert (after.presence, after.launches, after.losses, alarms(after)) == (
+        Presence.THERE,
+        1,
+        0,
+        [],
+    )
     assert after.confirm_by < 0
 
 
@@ -131,7 +148,7 @@ def test_alarms_name_the_rack_by_its_number_and_strangers_are_no_peers() -> None
     assert [peer.rack for peer in peers] == ["a", "b"]
 
 
-def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_and_an_adapter_started_anew_adds_nothing() -> None:
+def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_alone_also_after_a_restart() -> None:
     message = Message(PEER.dtype({}))
     written = []
     for launch, restarted_at in ((OLD, 400), (NEW, 160)):
@@ -147,7 +164,12 @@ def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_and_an_adapter_start
             assert [finding.alarm for finding in found] == [Alarm.PEER_LOST] * (tick == 600)
             peers["b"].fill(message, is_lockstep=True)
             rows.append(bytes(message.raw))
-        assert (message.presence, message.since, message.launches, message.losses) == (Presence.LOST, 600, 1, 1)
+        assert (message.presence, message.since, message.launches, message.losses) == (
+            Presence.LOST,
+            600,
+            1,
+            1,
+        )
         written.append(rows)
     assert written[0] == written[1]
 

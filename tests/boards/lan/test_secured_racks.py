@@ -20,11 +20,15 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def names(rack_name: str, tmp_path: Path) -> list[str]:
-    """Two racks with certificates; the second connects to the first. Their configs are rack-0.toml and rack-1.toml."""
+    """Two racks with certificates; the second connects to the first. Their configs are rack-0.toml
+    and rack-1.toml."""
     names = [f"{rack_name}-{end}" for end in "ab"]
     make_credentials(tmp_path / "certs", {name: ["127.0.0.1"] for name in names}, 1)
     at, own = endpoints(1)[0].replace("tcp", "tls"), 'certificates = "certs"'
-    texts = [rack_text(names[0], at, (), names[1], lan=own), rack_text(names[1], "", (at,), names[0], lan=own)]
+    texts = [
+        rack_text(names[0], at, (), names[1], lan=own),
+        rack_text(names[1], "", (at,), names[0], lan=own),
+    ]
     configs(texts, tmp_path)
     return names
 
@@ -51,6 +55,8 @@ def test_racks_exchange_mailboxes(names: list[str], tmp_path: Path) -> None:
             assert rack.outcome()["cause"] == "stopped"
 
 
-def test_a_rack_under_another_name_needs_another_certificate(names: list[str], tmp_path: Path) -> None:
+def test_a_rack_under_another_name_needs_another_certificate(
+    names: list[str], tmp_path: Path
+) -> None:
     with started(tmp_path / "rack-0.toml", 1.0, f"name={names[0]}x") as process:
         assert f"{names[0]}x.pem: missing" in process.outcome()["error"]

@@ -1,4 +1,5 @@
-"""Strangers on the network: a rack over TLS, and sessions that are not what they should be, in other processes."""
+"""Strangers on the network: a rack over TLS, and sessions that are not what they should be, in
+other processes."""
 
 from __future__ import annotations
 
@@ -21,7 +22,13 @@ from tests.processes import BOUND_S, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 MOST = 1000
-IMPORTED = ("friend/pulse.status", "liar/pulse.status", "liar/second.status", "mole/pulse.status", "heavy/pulse.status")
+IMPORTED = (
+    "friend/pulse.status",
+    "liar/pulse.status",
+    "liar/second.status",
+    "mole/pulse.status",
+    "heavy/pulse.status",
+)
 NAMES = ("friend", "liar", "mole", "heavy", "viewer", "nobody")
 OWN, TOKEN = "rack/home/out/pulse/status", "rack/home/alive/0000000000000007"
 READ, COMMAND, STOP = (f"rack/home/ask/{what}/viewer" for what in ("read", "command", "stop"))
@@ -40,7 +47,9 @@ class Program:
 
     def __init__(self, module: str, *arguments: str) -> None:
         command = [sys.executable, "-m", f"tests.boards.lan.{module}", *arguments]
-        self._process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         self.pid = self._process.pid
 
     def state(self) -> dict[str, Any]:
@@ -84,7 +93,9 @@ class Site:
         """Return settings of a session that shows the certificate of a name."""
         own = Credentials(self.folder / folder, name)
         files = {"certificate": str(own.certificate), "private_key": str(own.key)}
-        shown = {f"{side}_{key}": file for side in ("connect", "listen") for key, file in files.items()}
+        shown = {
+            f"{side}_{key}": file for side in ("connect", "listen") for key, file in files.items()
+        }
         return self._over("tls", {"enable_mtls": True, **shown})
 
     def bare(self, protocol: str) -> dict[str, Any]:
@@ -97,12 +108,16 @@ class Site:
 
     def _over(self, protocol: str, tls: dict[str, Any]) -> dict[str, Any]:
         tls = {"root_ca_certificate": str(self.folder / "set/authority.pem"), **tls}
-        return {"connect/endpoints": [f"{protocol}/127.0.0.1:{self.port}"], "transport/link/tls": tls}
+        return {
+            "connect/endpoints": [f"{protocol}/127.0.0.1:{self.port}"],
+            "transport/link/tls": tls,
+        }
 
 
 @contextmanager
 def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
-    """Run a rack that imports from friend, liar, mole and heavy; viewer may watch, friend may stop it."""
+    """Run a rack that imports from friend, liar, mole and heavy; viewer may watch, friend may stop
+    it."""
     for each in ("set", "forged"):
         addresses = {name: ["127.0.0.1"] for name in ("home", *NAMES)}
         make_credentials(folder / each, {**addresses, "impostor": ["127.9.9.9"]}, 1)
@@ -143,7 +158,12 @@ def friend(site: Site) -> dict[str, Any]:
 def sessions(site: Site) -> dict[str, dict[str, Any]]:
     """Return a friend's session and those of strangers."""
     secret = {"secret": site.secret()}
-    eager = {**secret, "puts": [(pulse("friend"), 99, pulse("friend"))], "listens": ["**", OWN], "asks": [STRANGER]}
+    eager = {
+        **secret,
+        "puts": [(pulse("friend"), 99, pulse("friend"))],
+        "listens": ["**", OWN],
+        "asks": [STRANGER],
+    }
     own = [(pulse(name), 99, pulse(name)) for name in ("nobody", "viewer", "home")]
     liar, second = pulse("liar"), out_key("liar", "second.status")
     lies = [(liar, 100, None), (liar, MOST + 1, liar), (second, 100, liar), *eager["puts"], *own]
@@ -157,9 +177,18 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
         "plain": {"settings": site.bare("tcp"), "fails": True, **eager},
         "forged": {"settings": site.mutual("friend", "forged"), "fails": True, **eager},
         "nobody": {"settings": site.mutual("nobody"), **eager, "puts": [*eager["puts"], *own]},
-        "viewer": {"settings": site.mutual("viewer"), **eager, "puts": [*eager["puts"], *own], "asks": asks},
+        "viewer": {
+            "settings": site.mutual("viewer"),
+            **eager,
+            "puts": [*eager["puts"], *own],
+            "asks": asks,
+        },
         "liar": {"settings": site.mutual("liar"), **secret, "puts": [*lies, (liar, 100, liar)]},
-        "mole": {"settings": site.mutual("mole"), "puts": [(pulse("mole"), 9, pulse("mole"))], "secret": "00" * 32},
+        "mole": {
+            "settings": site.mutual("mole"),
+            "puts": [(pulse("mole"), 9, pulse("mole"))],
+            "secret": "00" * 32,
+        },
         "heavy": {"settings": site.mutual("heavy"), **secret, "puts": heavy},
         "impostor": {"settings": impostor, **eager},
     }
@@ -251,21 +280,33 @@ def test_a_friend_may_come_over_quic(tmp_path: Path) -> None:
     with at_home(tmp_path, "quic") as site:
         settings = site.mutual("friend") | {"connect/endpoints": [f"quic/127.0.0.1:{site.port}"]}
         assert site.home.state()["came"] == {}
-        with running("strangers", json.dumps({"friend": {**friend(site), "settings": settings}})) as others:
-            wait_until(lambda: all(others.state()["friend"][got] for got in ("heard", "answers", "tokens")))
+        with running(
+            "strangers", json.dumps({"friend": {**friend(site), "settings": settings}})
+        ) as others:
+            wait_until(
+                lambda: all(others.state()["friend"][got] for got in ("heard", "answers", "tokens"))
+            )
             wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
 
 
 @pytest.mark.slow
 def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:
-    mole, lies = pulse("mole"), [(out_key(name, "pulse.status"), 9, None) for name in ("nobody", "home")]
+    mole, lies = (
+        pulse("mole"),
+        [(out_key(name, "pulse.status"), 9, None) for name in ("nobody", "home")],
+    )
     with at_home(tmp_path, "tcp") as site:
         both = {
             "friend": {**friend(site), "settings": site.bare("tcp")},
             "mole": {"settings": site.bare("tcp"), "puts": [(mole, 9, mole), *lies]},
         }
         with running("strangers", json.dumps(both)) as others:
-            wait_until(lambda: site.home.state()["came"].get(mole, 0) > ROUNDS and others.state()["friend"]["answers"])
+            wait_until(
+                lambda: (
+                    site.home.state()["came"].get(mole, 0) > ROUNDS
+                    and others.state()["friend"]["answers"]
+                )
+            )
             wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
             home = site.home.state()
     assert set(home["came"]) == {mole, pulse("friend")}

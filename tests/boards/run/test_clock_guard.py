@@ -32,7 +32,9 @@ def rung(segment: Segment) -> list[tuple[int, int, float]]:
     return [(int(row["tick"]), int(row["since"]), float(row["value"])) for row in rows]
 
 
-def test_a_skip_is_reported_in_the_first_cycle_released_after_it(make_bus: MakeBus) -> None:  # noqa: F811
+def test_a_skip_is_reported_in_the_first_cycle_released_after_it(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(task("level", every=4))
     guard, driver = guard_of(segment), RealtimeDriver(segment, lambda _: None)
     driver.count_skipped(5, 2)
@@ -44,7 +46,9 @@ def test_a_skip_is_reported_in_the_first_cycle_released_after_it(make_bus: MakeB
     assert guard.reported == segment.words[System.CLOCK_SKIPPED] == 2
 
 
-def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(make_bus: MakeBus) -> None:  # noqa: F811
+def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(task("level", every=4))
     guard, driver = guard_of(segment), RealtimeDriver(segment, lambda _: None)
     driver.count_skipped(1, 1)
@@ -55,7 +59,9 @@ def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(make_bus: 
     assert rung(segment)[1:] == [(16, 9, 3.0)]
 
 
-def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(make_bus: MakeBus) -> None:  # noqa: F811
+def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = time.monotonic_ns() + PERIOD_NS

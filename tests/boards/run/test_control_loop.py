@@ -33,7 +33,8 @@ MakeBench = Callable[..., "Bench"]
 
 
 class Bench:
-    """A wired rack whose tasks are cycled by the test; the clock stands at tick 0 and a tick lasts an hour."""
+    """A wired rack whose tasks are cycled by the test; the clock stands at tick 0 and a tick lasts
+    an hour."""
 
     def __init__(self, plan: Resolved) -> None:
         self.plan = plan
@@ -50,12 +51,19 @@ class Bench:
         """Return a task, ready to cycle."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == name)
         if name.endswith(".planner"):
-            return PlannerLoop(self.segment, wiring, find_class(wiring.target, Planner)(wiring.context))
-        return VirtualControlLoop(self.segment, wiring, find_class(wiring.target, Executor)(wiring.context))
+            return PlannerLoop(
+                self.segment, wiring, find_class(wiring.target, Planner)(wiring.context)
+            )
+        return VirtualControlLoop(
+            self.segment, wiring, find_class(wiring.target, Executor)(wiring.context)
+        )
 
     def flags(self, name: str) -> list[Flag]:
         """Return the trouble in every cycle of a task so far."""
-        return [Flag(int(flags)) & TROUBLE for flags in trace_ring(self.segment, name).drain().rows["flags"]]
+        return [
+            Flag(int(flags)) & TROUBLE
+            for flags in trace_ring(self.segment, name).drain().rows["flags"]
+        ]
 
 
 @pytest.fixture
@@ -80,7 +88,11 @@ def test_a_cycle_in_time_has_no_trouble(bench: MakeBench) -> None:
         rack.to(tick)
         wave.cycle(tick)
     assert rack.flags("wave") == [Flag(0)] * 3
-    assert [rack.segment.block("wave")[w] for w in (Block.CYCLES, Block.DONE, Block.MISSED)] == [3, 2, 0]
+    assert [rack.segment.block("wave")[w] for w in (Block.CYCLES, Block.DONE, Block.MISSED)] == [
+        3,
+        2,
+        0,
+    ]
 
 
 def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
@@ -163,7 +175,9 @@ def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
 
 
 @pytest.mark.parametrize(("now", "trouble"), [(5, Flag.SKIPPED), (10, Flag.SKIPPED | Flag.MISSED)])
-def test_a_release_without_a_plan_is_traced_after_skipped_ones(bench: MakeBench, now: int, trouble: Flag) -> None:
+def test_a_release_without_a_plan_is_traced_after_skipped_ones(
+    bench: MakeBench, now: int, trouble: Flag
+) -> None:
     rack = bench("board.wave.params.plan_every=4")
     planner = rack.task("wave.planner")
     planner.cycle(0)
@@ -173,7 +187,12 @@ def test_a_release_without_a_plan_is_traced_after_skipped_ones(bench: MakeBench,
     planner.cycle(5)
     assert rack.flags("wave.planner") == [Flag(0), trouble]
     block = rack.segment.block("wave.planner")
-    assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.SKIPPED)] == [2, 1, 5, 1]
+    assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.SKIPPED)] == [
+        2,
+        1,
+        5,
+        1,
+    ]
 
 
 def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:

@@ -30,7 +30,9 @@ def test_tight_and_loose_write_the_same_in_lockstep(config: MakeConfig) -> None:
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 @pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
-def test_executor_and_planner_are_two_processes(config: MakeConfig, mode: str, coupling: tuple[str, ...]) -> None:
+def test_executor_and_planner_are_two_processes(
+    config: MakeConfig, mode: str, coupling: tuple[str, ...]
+) -> None:
     with Rack(config(f"clock.mode={mode}", *coupling)) as rack:
         tasks = [rack.segment.layout.task(name) for name in ("wave", "wave.planner")]
         pids = [rack.segment.block(task.name)[Block.PID] for task in tasks]
@@ -78,8 +80,12 @@ def test_a_rack_without_planners_runs(config: MakeConfig) -> None:
 def test_a_tight_planner_runs_below_its_executor(config: MakeConfig, protocol: str) -> None:
     settings = (*PRIORITIES, "board.wave.planner_priority=5", f"protocol.default={protocol}")
     with Rack(config("clock.mode=realtime", *settings)) as rack:
-        pids = {name: rack.segment.block(name)[Block.PID] for name in ("wave", "wave.planner", "watch")}
-        assert {name: os.sched_getscheduler(pid) for name, pid in pids.items()} == dict.fromkeys(pids, os.SCHED_FIFO)
+        pids = {
+            name: rack.segment.block(name)[Block.PID] for name in ("wave", "wave.planner", "watch")
+        }
+        assert {name: os.sched_getscheduler(pid) for name, pid in pids.items()} == dict.fromkeys(
+            pids, os.SCHED_FIFO
+        )
         got = {name: os.sched_getparam(pid).sched_priority for name, pid in pids.items()}
         assert got == {"wave": 20, "wave.planner": 5, "watch": 19}
         assert got == {name: rack.segment.block(name)[Block.PRIORITY] for name in pids}

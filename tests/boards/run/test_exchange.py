@@ -1,4 +1,5 @@
-"""The exchange of a board: ports read in every n-th cycle or asynchronously, and the record of ages and arrivals."""
+"""The exchange of a board: ports read in every n-th cycle or asynchronously, and the record of ages
+and arrivals."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def written(rack: Rack, seconds: float = SECONDS) -> Written:
 
 
 def newest(tick: int, delay: int) -> int:
-    """Return the release of the wave's newest message that is visible at a tick; negative: none is."""
+    """Return the release of the wave's newest message that is visible at a tick; negative: none
+    is."""
     every, phase = WAVE
     return tick - delay - (tick - delay - phase) % every
 
@@ -90,7 +92,9 @@ def test_a_level_sees_the_last_reading_as_old_until_the_next_exchange(config: Ma
         made = seen["tick"] - record[f"{port}_age"]
         values = np.where(taken < 0, 0.0, 0.5 * made)
         assert seen["message"]["value"][:, at].tolist() == values.tolist()
-        verdicts = np.where(taken < 0, Verdict.NONE, np.where(taken == seen["tick"], Verdict.NEW, Verdict.OLD))
+        verdicts = np.where(
+            taken < 0, Verdict.NONE, np.where(taken == seen["tick"], Verdict.NEW, Verdict.OLD)
+        )
         assert seen["message"]["verdict"][:, at].tolist() == verdicts.tolist()
         assert not seen["message"]["lost"][:, at].any()
 
@@ -100,7 +104,9 @@ def test_a_snapshot_shows_the_messages_in_use(config: MakeConfig) -> None:
     with Rack(config(text=TEXT)) as rack:
         rack.run(SECONDS)
         found = RackMonitor(rack.segment).look()
-    assert found.exchanges == {"notes": {port: PortAge(*model(port)[-1]) for port in ("plain", "sparse", "early")}}
+    assert found.exchanges == {
+        "notes": {port: PortAge(*model(port)[-1]) for port in ("plain", "sparse", "early")}
+    }
 
 
 @pytest.mark.slow
@@ -125,7 +131,9 @@ QUEUE = (
 
 
 @pytest.mark.slow
-def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(config: MakeConfig) -> None:
+def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(
+    config: MakeConfig,
+) -> None:
     with Rack(config("clock.mode=realtime", text=TEXT)) as rack:
         rack.run(SECONDS)
         rows = Written.on(rack.segment).messages["notes.exchange"]
@@ -138,7 +146,9 @@ def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(config
 
 
 @pytest.mark.slow
-def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(config: MakeConfig) -> None:
+def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(
+    config: MakeConfig,
+) -> None:
     with Rack(config(*QUEUE, text=NO_TABLE)) as rack:
         rack.run(1.5)
         assert [event for event in rack.events if event.kind == "detection"] == []
@@ -154,7 +164,8 @@ def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(conf
 def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
     wanted = "board.notes.exchange={ status = { asynchronous = true } }"
     with pytest.raises(
-        ConfigError, match=r"^board.notes.exchange.status.asynchronous = true: 'wave.status' is a queue"
+        ConfigError,
+        match=r"^board.notes.exchange.status.asynchronous = true: 'wave.status' is a queue",
     ):
         resolve(config(*QUEUE[:2], wanted, text=NO_TABLE))
 
@@ -162,7 +173,9 @@ def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
 def killed(config: MakeConfig, victim: str) -> Any:
     """Return the rows of the reader's record and status after the death of a board at tick 41."""
     plain = config("supervision.lockstep_restart_s=0.1", text=TEXT)
-    rack = Rack(plain.model_copy(update={"fault": (FaultConfig(kind="kill", board=victim, tick=41),)}))
+    rack = Rack(
+        plain.model_copy(update={"fault": (FaultConfig(kind="kill", board=victim, tick=41),)})
+    )
     return written(rack, 2 * SECONDS).messages
 
 
@@ -190,8 +203,11 @@ def test_a_lost_writer_shows_between_two_exchanges(config: MakeConfig) -> None:
     assert not rows["message"]["lost"][rows["tick"] > 41 + 40 + 3 * NOTES[0] * SPARSE[0]].any()
 
 
-def test_a_level_that_writes_a_mailbox_of_that_name_cannot_have_an_exchange(config: MakeConfig) -> None:
+def test_a_level_that_writes_a_mailbox_of_that_name_cannot_have_an_exchange(
+    config: MakeConfig,
+) -> None:
     with pytest.raises(
-        ConfigError, match=r"^board.notes.exchange: the executor writes a mailbox of that name itself; "
+        ConfigError,
+        match=r"^board.notes.exchange: the executor writes a mailbox of that name itself; ",
     ):
         resolve(config("board.notes.executor='exchange_levels:Exchanging'", text=TEXT))

@@ -1,4 +1,5 @@
-"""Racks whose boards interrupt each other: what arrives, what is lost, what it costs, and that runs repeat."""
+"""Racks whose boards interrupt each other: what arrives, what is lost, what it costs, and that runs
+repeat."""
 
 from __future__ import annotations
 
@@ -51,9 +52,11 @@ OVERLOADED = "protocol.interrupt.fixed_us=900"
 
 
 class Heard(NamedTuple):
-    """A run: its digest, what the hub had of each board in each cycle, shape (TICKS, BOARDS), and its counts.
+    """A run: its digest, what the hub had of each board in each cycle, shape (TICKS, BOARDS), and
+    its counts.
 
-    `counts` are interrupts served and lost, and the most that waited; `full` the events of a full inbox.
+    `counts` are interrupts served and lost, and the most that waited; `full` the events of a full
+    inbox.
     """
 
     digest: str
@@ -72,11 +75,17 @@ def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()
         outcome = rack.run(SECONDS)
         written, block = Written.on(rack.segment), rack.segment.block("hub")
         heard = written.messages["hub.status"]["message"]
-        counts = (block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST], block[Block.INTERRUPTS_WAITING])
+        counts = (
+            block[Block.INTERRUPTS],
+            block[Block.INTERRUPTS_LOST],
+            block[Block.INTERRUPTS_WAITING],
+        )
         full = [event.text for event in rack.events if event.code == "inbox_full"]
         interrupt = rack.segment.layout.mailbox("figure0.status").interrupt
         assert interrupt is not None
-    return Heard(outcome.digest, heard["cycle"], heard["lost"], counts, full, interrupt.service_ns, written)
+    return Heard(
+        outcome.digest, heard["cycle"], heard["lost"], counts, full, interrupt.service_ns, written
+    )
 
 
 def test_every_message_arrives_in_an_inbox_with_room(config: MakeConfig) -> None:
@@ -94,7 +103,9 @@ def test_a_full_inbox_loses_the_messages_of_the_last_slots(config: MakeConfig) -
     assert (found.cycle[1:, 2:] == np.arange(TICKS - 1)[:, None]).all()
     assert (found.cycle[:, :2] == -1).all()
     assert found.counts == (3 * (TICKS - 1), 2 * (TICKS - 1), 2)
-    assert sorted(found.full) == [f"inbox is full: 1 message in 'figure{at}.status' lost" for at in (0, 1)]
+    assert sorted(found.full) == [
+        f"inbox is full: 1 message in 'figure{at}.status' lost" for at in (0, 1)
+    ]
 
 
 def test_an_overloaded_handler_delays_what_it_does_not_lose(config: MakeConfig) -> None:
@@ -103,15 +114,21 @@ def test_an_overloaded_handler_delays_what_it_does_not_lose(config: MakeConfig) 
     ages = np.arange(50, TICKS)[:, None] - known[:, known[-1] >= 0]
     assert ages.max() > 1
     served, lost, waiting = found.counts
-    # Three take longer than a tick: one is still served when the next burst comes, and of that two may wait.
+    # Three take longer than a tick: one is still served when the next burst comes, and of that two
+    # may wait.
     assert served == pytest.approx(2.5 * TICKS, abs=3)
     assert served + lost == pytest.approx(BOARDS * TICKS, abs=3 * BOARDS)
     assert waiting == 2
 
 
 @pytest.mark.parametrize("settings", [(SMALL,), (OVERLOADED,)], ids=["burst", "overload"])
-def test_runs_with_a_full_inbox_and_killed_boards_repeat(config: MakeConfig, settings: tuple[str, ...]) -> None:
-    faults = tuple(FaultConfig(kind="kill", board=board, tick=tick) for board, tick in (("figure4", 20), ("hub", 31)))
+def test_runs_with_a_full_inbox_and_killed_boards_repeat(
+    config: MakeConfig, settings: tuple[str, ...]
+) -> None:
+    faults = tuple(
+        FaultConfig(kind="kill", board=board, tick=tick)
+        for board, tick in (("figure4", 20), ("hub", 31))
+    )
     quick = "supervision.lockstep_restart_s=0.02"
     first, second = (run(config, quick, *settings, faults=faults) for _ in range(2))
     assert first.digest == second.digest
@@ -131,7 +148,13 @@ def test_a_restarted_reader_finds_its_inbox_as_it_was(config: MakeConfig) -> Non
 def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConfig) -> None:
     faults = tuple(
         FaultConfig(kind=kind, board="figure3", tick=tick, cycles=10)  # type: ignore[arg-type]
-        for kind, tick in (("drop", 10), ("delay", 25), ("corrupt", 40), ("reorder", 55), ("babble", 70))
+        for kind, tick in (
+            ("drop", 10),
+            ("delay", 25),
+            ("corrupt", 40),
+            ("reorder", 55),
+            ("babble", 70),
+        )
     )
     first, second = (run(config, faults=faults) for _ in range(2))
     assert first.digest == second.digest

@@ -40,7 +40,11 @@ def test_ten_runs_in_lockstep_have_one_digest(config: MakeConfig) -> None:
 
 @pytest.mark.slow
 def test_the_digest_distinguishes_runs(config: MakeConfig) -> None:
-    settings = ("board.wave.params.done_at=90", "board.wave.within_cycles=5", "board.wave.params.plan_every=3")
+    settings = (
+        "board.wave.params.done_at=90",
+        "board.wave.within_cycles=5",
+        "board.wave.params.plan_every=3",
+    )
     digests = {digest(Rack(config(*extra))) for extra in [(), *((one,) for one in settings)]}
     assert len(digests) == 1 + len(settings)
 
@@ -77,7 +81,9 @@ def test_under_time_slice_a_level_reads_by_ticks_alone(config: MakeConfig) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
-def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig, coupling: tuple[str, ...]) -> None:
+def test_real_time_is_lockstep_up_to_its_first_miss(
+    config: MakeConfig, coupling: tuple[str, ...]
+) -> None:
     exact = Rack(config(*coupling))
     lockstep = written(exact)
     for _ in range(3):
@@ -90,12 +96,17 @@ def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig, coupling
         if same == TICKS:
             assert rack.outcome.digest == exact.outcome.digest
             return
-        assert rack.segment.words[System.CLOCK_SKIPPED] + counted(rack, Block.MISSED, Block.SKIPPED) > 0
+        assert (
+            rack.segment.words[System.CLOCK_SKIPPED] + counted(rack, Block.MISSED, Block.SKIPPED)
+            > 0
+        )
 
 
 def counted(rack: Rack, *words: Block) -> int:
     """Return the sum of these words over all tasks."""
-    return sum(rack.segment.block(task.name)[word] for task in rack.segment.layout.tasks for word in words)
+    return sum(
+        rack.segment.block(task.name)[word] for task in rack.segment.layout.tasks for word in words
+    )
 
 
 @pytest.mark.slow
@@ -126,7 +137,10 @@ def test_a_late_message_shows_from_the_next_boundary(config: MakeConfig) -> None
 
 @pytest.mark.slow
 def test_a_run_is_unchanged_up_to_its_first_late_cycle(config: MakeConfig) -> None:
-    lockstep, realtime = written(Rack(config(text=PLAIN))), written(Rack(config(*SLOW, LATE, text=PLAIN)))
+    lockstep, realtime = (
+        written(Rack(config(text=PLAIN))),
+        written(Rack(config(*SLOW, LATE, text=PLAIN))),
+    )
     same = realtime.first_miss(TICKS)
     assert same <= 40
     assert realtime.until(same) == lockstep.until(same)
@@ -172,7 +186,9 @@ def test_speed_scales_the_grid_but_not_the_run(config: MakeConfig, speed: float)
 
 @pytest.mark.slow
 def test_simulated_time_is_the_tick_whatever_the_boards_miss(config: MakeConfig) -> None:
-    rack = Rack(config(REALTIME, "board.wave.params={ trouble = 'late', at = 40, ticks = 40 }", text=PLAIN))
+    rack = Rack(
+        config(REALTIME, "board.wave.params={ trouble = 'late', at = 40, ticks = 40 }", text=PLAIN)
+    )
     with rack:
         outcome = rack.run(SECONDS)
     assert outcome.ticks == TICKS

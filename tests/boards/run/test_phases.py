@@ -1,4 +1,5 @@
-"""Phases of boards: a static cyclic schedule on one core, what boards see across phases, and restarts."""
+"""Phases of boards: a static cyclic schedule on one core, what boards see across phases, and
+restarts."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ executor = "wave_levels:{kind}"
 budget = {{ process_ms = {process_ms} }}
 """
 MINOR = {"wave": (2, 0, 1.5), "left": (4, 1, 2.2), "right": (4, 3, 2.2)}
-"""A minor cycle of two ticks of 2.5 ms: the wave in the first, the watches in the second in turn."""
+"""A minor cycle of two ticks of 2.5 ms: the wave in the first, the watches in the second in
+turn."""
 
 
 def cyclic(phases: bool = True) -> str:
@@ -64,8 +66,11 @@ def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConf
     assert first.outcome is not None
     assert again.outcome is not None
     assert first.outcome.digest == again.outcome.digest
-    # In lockstep a cycle ends before its deadline, not always before the next tick: the order is that of the releases.
-    released = sorted((int(row["tick"]), name) for name, rows in found.cycles.items() for row in rows)
+    # In lockstep a cycle ends before its deadline, not always before the next tick: the order is
+    # that of the releases.
+    released = sorted(
+        (int(row["tick"]), name) for name, rows in found.cycles.items() for row in rows
+    )
     assert released == [(tick, ("wave", "left", "wave", "right")[tick % 4]) for tick in range(100)]
 
 
@@ -81,7 +86,9 @@ def test_messages_are_visible_by_ticks_whatever_the_phases(config: MakeConfig) -
             assert row["message"]["value"] == expected
 
 
-def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(config: MakeConfig) -> None:
+def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
+    config: MakeConfig,
+) -> None:
     def is_whole(phases: bool) -> bool:
         rack = config("board.wave.priority=2", "board.left.priority=1", text=cyclic(phases))
         chart = simulate(rack_timing(rack, wire(rack)).tasks, 400_000_000)
@@ -123,9 +130,13 @@ def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
         assert len(rows) + block[Block.SKIPPED] == (last - phase) // every + 1
 
 
-def test_gantt_draws_the_cyclic_schedule_without_preemption(config: MakeConfig, tmp_path: Path) -> None:
+def test_gantt_draws_the_cyclic_schedule_without_preemption(
+    config: MakeConfig, tmp_path: Path
+) -> None:
     found = config(text=cyclic())
-    gantt = gantt_of(Subject(found, wire(found), None, tmp_path), WindowOptions(), {}, lambda part: None)
+    gantt = gantt_of(
+        Subject(found, wire(found), None, tmp_path), WindowOptions(), {}, lambda part: None
+    )
     text = gantt.text()
     rows = [line.split()[-1] for line in text.splitlines() if line.startswith("core 0 ")]
     # One stretch of each job, from its release on: the first of the watch "right" is at tick 3.

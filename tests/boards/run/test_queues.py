@@ -1,4 +1,5 @@
-"""Queues through the ports of two tasks: fullness and order by ticks alone, alarms, and faults of messages."""
+"""Queues through the ports of two tasks: fullness and order by ticks alone, alarms, and faults of
+messages."""
 
 from __future__ import annotations
 
@@ -78,10 +79,15 @@ class QueueLink:
             self.taken += [message.id for message in (*reading.earlier, reading.value)]
         return reading
 
-    def run(self, first: int, last: int, bursts: Callable[[int], int], reader_first: bool = False) -> None:
+    def run(
+        self, first: int, last: int, bursts: Callable[[int], int], reader_first: bool = False
+    ) -> None:
         """Do the ticks from `first` up to and without `last`."""
         for tick in range(first, last):
-            steps = [lambda tick=tick: self.write(tick, bursts(tick)), lambda tick=tick: self.read(tick)]
+            steps = [
+                lambda tick=tick: self.write(tick, bursts(tick)),
+                lambda tick=tick: self.read(tick),
+            ]
             due = [step for step, every in zip(steps, self.rates, strict=True) if tick % every == 0]
             for step in reversed(due) if reader_first else due:
                 step()
@@ -94,7 +100,13 @@ class QueueLink:
         """Write with this fault from now on."""
         values = [p.default or 0.0 for p in KINDS[kind].parameters]
         entry = FaultTable(self.segment).add(
-            Injection(KINDS[kind].number, 0, -1, seed=7, parameters=(*parameters, *values[len(parameters) :]))
+            Injection(
+                KINDS[kind].number,
+                0,
+                -1,
+                seed=7,
+                parameters=(*parameters, *values[len(parameters) :]),
+            )
         )
         self.ports.apply([(kind, entry)])
         return entry
@@ -152,7 +164,9 @@ def test_order_and_fullness_depend_on_ticks_alone(
     runs = []
     for reader_first in (False, True):
         tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
-        segment = Segment.create(layout(f"test-queue-{id(bursts)}", queue(capacity, rates), tasks), "")
+        segment = Segment.create(
+            layout(f"test-queue-{id(bursts)}", queue(capacity, rates), tasks), ""
+        )
         semaphores.create(segment.layout)
         rack = QueueLink(segment)
         try:
@@ -217,12 +231,18 @@ def test_silence_of_the_writer_proves_nothing_but_its_loss_counts(link: MakeQueu
     assert rack.alarms("reader") == []
 
 
-FOUND = {"drop": (Alarm.GAP, (0.5,)), "corrupt": (Alarm.DAMAGED, (0.5, 3)), "delay": (Alarm.HELD_BACK, (3,))}
+FOUND = {
+    "drop": (Alarm.GAP, (0.5,)),
+    "corrupt": (Alarm.DAMAGED, (0.5, 3)),
+    "delay": (Alarm.HELD_BACK, (3,)),
+}
 
 
 @pytest.mark.parametrize("kind", FOUND)
 @pytest.mark.parametrize("rates", [(1, 1), (1, 4), (4, 1)])
-def test_a_fault_of_messages_is_found_and_the_order_goes_on(link: MakeQueue, kind: str, rates: tuple[int, int]) -> None:
+def test_a_fault_of_messages_is_found_and_the_order_goes_on(
+    link: MakeQueue, kind: str, rates: tuple[int, int]
+) -> None:
     alarm, parameters = FOUND[kind]
     rack = link(16, rates)
     rack.run(0, 16, lambda tick: 2)
@@ -239,7 +259,9 @@ def test_a_fault_of_messages_is_found_and_the_order_goes_on(link: MakeQueue, kin
 
 
 @pytest.mark.parametrize("kind", ["mute", "reorder", "babble"])
-def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(link: MakeQueue, kind: str) -> None:
+def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(
+    link: MakeQueue, kind: str
+) -> None:
     rack = link()
     entry = rack.fault(kind)
     rack.run(0, 8, lambda tick: 1)

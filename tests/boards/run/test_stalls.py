@@ -1,4 +1,5 @@
-"""Processes in real time that lose their cores anywhere, for 5 to 45 ms: none of this counts as a fault."""
+"""Processes in real time that lose their cores anywhere, for 5 to 45 ms: none of this counts as a
+fault."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ SECONDS = 2.0
 ROUND = 16
 """Slots that a writer fills in 40 ms, while its reader is stalled."""
 STALLS = 12
-"""Stalls, at least, that each process must have had: sent in a little more than half of the time."""
+"""Stalls, at least, that each process must have had: sent in a little more than half of the
+time."""
 
 
 @pytest.fixture
@@ -48,8 +50,11 @@ class Stalls:
         self._arm()
 
 
-def cycle(every: int, epoch: int, seed: int, work: Callable[[int, Callable[[], int]], object]) -> bool:
-    """Do `work` on the grid until the time is over; missed releases are skipped. Return whether there were stalls."""
+def cycle(
+    every: int, epoch: int, seed: int, work: Callable[[int, Callable[[], int]], object]
+) -> bool:
+    """Do `work` on the grid until the time is over; missed releases are skipped. Return whether
+    there were stalls."""
 
     def now() -> int:
         return (time.monotonic_ns() - epoch) // CLOCK_NS

@@ -1,4 +1,5 @@
-"""The system controller at a tick: boards that are lost and come back, and what it then demands of the arm."""
+"""The system controller at a tick: boards that are lost and come back, and what it then demands of
+the arm."""
 
 from __future__ import annotations
 
@@ -97,7 +98,9 @@ def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> Non
     assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
 
 
-def test_the_emergency_stop_engages_brakes_until_it_is_released(make_bus: MakeBus) -> None:  # noqa: F811
+def test_the_emergency_stop_engages_brakes_until_it_is_released(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     rack = Controlled(make_bus(*BOARDS))
     assert rack.demand(0) is Demand.NONE
     rack.words[System.EMERGENCY_STOP] = 1
@@ -121,8 +124,11 @@ def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come
     assert rack.words[System.STOP_TICK] == 14
 
 
-def ends_at(segment: Segment, state: State, written: int, until: int, **changed: object) -> list[int | None]:
-    """Return when the run ends, as known at each tick, after one status of the level that ends it."""
+def ends_at(
+    segment: Segment, state: State, written: int, until: int, **changed: object
+) -> list[int | None]:
+    """Return when the run ends, as known at each tick, after one status of the level that ends
+    it."""
     over = EndOfRun(segment, wiring(ends_run="task.status", **changed))
     found = []
     for tick in range(until):
@@ -141,12 +147,18 @@ def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State)
     assert found == [None] * 7 + [16] * 5
 
 
-def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:  # noqa: F811
+def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), State.EXECUTING, 5, 60)
     # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
     assert found == [None] * 47 + [56] * 13
 
 
-def test_a_run_of_given_length_ends_there_whatever_its_task_does(make_bus: MakeBus) -> None:  # noqa: F811
-    found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99)
+def test_a_run_of_given_length_ends_there_whatever_its_task_does(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    found = ends_at(
+        make_bus(box(TASK_STATUS, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99
+    )
     assert found == [99] * 12

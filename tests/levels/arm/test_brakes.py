@@ -1,4 +1,5 @@
-"""The brakes of the simulated arm: they act without the motors, close by themselves, and keep the limits."""
+"""The brakes of the simulated arm: they act without the motors, close by themselves, and keep the
+limits."""
 
 from __future__ import annotations
 
@@ -96,9 +97,12 @@ def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "alarm"), [(np.nan, Alarm.COMMAND_INVALID), (np.inf, Alarm.COMMAND_INVALID), (1e3, Alarm.COMMAND_LIMIT)]
+    ("value", "alarm"),
+    [(np.nan, Alarm.COMMAND_INVALID), (np.inf, Alarm.COMMAND_INVALID), (1e3, Alarm.COMMAND_LIMIT)],
 )
-def test_a_torque_that_no_servo_level_gives_closes_the_brakes_and_is_named(value: float, alarm: Alarm) -> None:
+def test_a_torque_that_no_servo_level_gives_closes_the_brakes_and_is_named(
+    value: float, alarm: Alarm
+) -> None:
     arm, made, torque = moving()
     command = torque()
     command[3] = -value

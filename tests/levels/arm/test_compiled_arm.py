@@ -1,4 +1,5 @@
-"""The compiled functions of the arm: the same bits as their Python, and one version for all robots."""
+"""The compiled functions of the arm: the same bits as their Python, and one version for all
+robots."""
 
 from __future__ import annotations
 
@@ -70,7 +71,9 @@ def test_the_equation_of_motion_is_the_same_as_in_python(name: str) -> None:
     other._evaluate, other._carry = dynamics.evaluate, dynamics.carry
     for q, qd in RNG.uniform(-1.0, 1.0, (20, 2, len(made.qpos))):
         for payload in (None, Payload(1.5, OFFSET)):
-            for mine, theirs in zip(one.terms(q, qd, payload), other.terms(q, qd, payload), strict=True):
+            for mine, theirs in zip(
+                one.terms(q, qd, payload), other.terms(q, qd, payload), strict=True
+            ):
                 assert np.array_equal(mine, theirs)
 
 
@@ -101,13 +104,19 @@ def test_noise_is_normal_and_independent_of_joint_quantity_and_tick() -> None:
 def samples(tick: int) -> Array:
     """Return the noise of a tick in standard deviations, (2, joints)."""
     encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
-    return drives.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [[1e-3], [1e-2]]
+    return drives.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [
+        [1e-3],
+        [1e-2],
+    ]
 
 
 def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> None:
     arm_package.preload()
     four = four_bar(tmp_path)
-    for made, surroundings in ((cell("puma560"), config("puma560")[1]), (build_cell(*four, CLOCK_NS), four[1])):
+    for made, surroundings in (
+        (cell("puma560"), config("puma560")[1]),
+        (build_cell(*four, CLOCK_NS), four[1]),
+    ):
         arm = SimulatedArm(made, surroundings, CLOCK_NS)
         arm.dynamics.terms(made.home, np.zeros(6), Payload(1.0, OFFSET))
         driven(arm, made, 3)
@@ -125,7 +134,9 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("elsewhere", [0.0, 1e-3])
-def test_the_gate_predicts_with_the_controllers_evaluation_only_if_it_is_of_the_arms_state(elsewhere: float) -> None:
+def test_the_gate_predicts_with_the_controllers_evaluation_only_if_it_is_of_the_arms_state(
+    elsewhere: float,
+) -> None:
     made, looked = cell("puma560"), list[Array]()
     arm, alone = (SimulatedArm(made, config("puma560")[1], CLOCK_NS) for _ in range(2))
     admit = arm._gate.admit
@@ -150,13 +161,20 @@ def test_the_gate_predicts_with_the_controllers_evaluation_only_if_it_is_of_the_
 def test_what_is_clear_of_all_limits_would_also_pass_a_careful_look(name: str) -> None:
     made = cell(name)
     bounds, period_s = made.bounds, CLOCK_NS * 1e-9
-    quick, careful = (drives.LimitGate(bounds, made.limits.acceleration, period_s, Dynamics(made)) for _ in range(2))
+    quick, careful = (
+        drives.LimitGate(bounds, made.limits.acceleration, period_s, Dynamics(made))
+        for _ in range(2)
+    )
     careful._is_clear = lambda *_: False
     low, high = np.maximum(bounds.position[:, 0], -3.0), np.minimum(bounds.position[:, 1], 3.0)
     clear = 0
     for _ in range(2000):
         q = made.home + RNG.choice([0.05, 1.0]) * (RNG.uniform(low, high) - made.home)
-        qd, torque = RNG.choice([0.2, 1.0]) * RNG.uniform(-1.0, 1.0, (2, len(q))) * (bounds.velocity, bounds.torque)
+        qd, torque = (
+            RNG.choice([0.2, 1.0])
+            * RNG.uniform(-1.0, 1.0, (2, len(q)))
+            * (bounds.velocity, bounds.torque)
+        )
         mine, theirs = quick.admit(torque, q, qd), careful.admit(torque, q, qd)
         clear += mine[0] is torque
         assert mine[1] == theirs[1]

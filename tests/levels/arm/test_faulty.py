@@ -1,4 +1,5 @@
-"""Faults between servo level and arm: their effect, their joint, and their repetition with the same seed."""
+"""Faults between servo level and arm: their effect, their joint, and their repetition with the same
+seed."""
 
 from __future__ import annotations
 
@@ -57,7 +58,7 @@ def test_noise_is_the_same_again_with_the_same_seed_and_tick_and_has_its_size() 
     assert np.std(draws[0]) == pytest.approx(0.01, rel=0.1)
 
 
-def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_it_differs_by_enough() -> None:
+def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_enough() -> None:
     link, arm, acted = linked(fault("sensor-stuck", joint=0))
     first = link.sense().position.copy()
     assert acted == {}
@@ -96,7 +97,9 @@ def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -
     assert arm._data.ctrl[arm.cell.actuators][1] == HOLDING[1]
 
 
-def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_not_at_fault() -> None:
+def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_not_at_fault() -> (
+    None
+):
     link, arm, acted = linked(fault("actuator-saturated", part=0.1, joint=-1))
     link.drive(HOLDING, 0.0)
     limits = arm.cell.bounds.torque
@@ -108,9 +111,14 @@ def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_
 
 @pytest.mark.parametrize(
     ("kind", "parameters", "alarm"),
-    [("command-nan", {}, Alarm.COMMAND_INVALID), ("command-limit", {"factor": 1.1}, Alarm.COMMAND_LIMIT)],
+    [
+        ("command-nan", {}, Alarm.COMMAND_INVALID),
+        ("command-limit", {"factor": 1.1}, Alarm.COMMAND_LIMIT),
+    ],
 )
-def test_a_corrupted_command_never_reaches_the_motors(kind: str, parameters: dict[str, float], alarm: Alarm) -> None:
+def test_a_corrupted_command_never_reaches_the_motors(
+    kind: str, parameters: dict[str, float], alarm: Alarm
+) -> None:
     link, arm, acted = linked(fault(kind, joint=4, **parameters))
     found = link.drive(HOLDING, 0.0)
     assert found is not None
@@ -122,7 +130,9 @@ def test_a_corrupted_command_never_reaches_the_motors(kind: str, parameters: dic
 
 def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
     link, arm, acted = linked(
-        fault("sensor-bias", size=0.1, joint=0), fault("command-nan", joint=0), fault("sensor-bias", size=0.2, joint=0)
+        fault("sensor-bias", size=0.1, joint=0),
+        fault("command-nan", joint=0),
+        fault("sensor-bias", size=0.2, joint=0),
     )
     assert (link.sense().position - arm.sense().position)[0] == pytest.approx(0.3)
     link.drive(HOLDING, 0.0)
@@ -137,9 +147,10 @@ def test_a_joint_that_the_arm_lacks_is_never_struck() -> None:
 
 
 @pytest.mark.parametrize(
-    ("blocks", "more", "shows"), [(0, 0.0, True), (1, 0.0, False), (1, 20.0, True), (2, 20.0, False)]
+    ("blocks", "more", "shows"),
+    [(0, 0.0, True), (1, 0.0, False), (1, 20.0, True), (2, 20.0, False)],
 )
-def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_an_arm_at_rest_holds_a_part_or_leans_on_it(
+def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_a_resting_arm_bears_a_load(
     blocks: int, more: float, shows: bool
 ) -> None:
     made, acted = cell("puma560"), dict[int, bool]()
@@ -153,10 +164,15 @@ def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_an_arm_at_rest_h
 
 
 def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
-    """Put a block where one finger is, so that it is held, and another so that it touches the first alone."""
+    """Put a block where one finger is, so that it is held, and another so that it touches the first
+    alone."""
     data = arm._data
     mujoco.mj_forward(made.model, data)
-    finger = next(int(geom) for geom in made.gripper_geoms if made.model.geom(int(geom)).name.startswith("pad"))
+    finger = next(
+        int(geom)
+        for geom in made.gripper_geoms
+        if made.model.geom(int(geom)).name.startswith("pad")
+    )
     place = data.geom_xpos[finger].copy()
     for nth, body in enumerate(made.bodies[:blocks]):
         address = made.model.jnt_qposadr[made.model.body_jntadr[body]]

@@ -27,7 +27,9 @@ SUBSTEPS = 10
 class IdealArm(Arm):
     """Integrates the equation of motion; its brakes stop it at once."""
 
-    def __init__(self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0) -> None:
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         self._dynamics, self._step_s = Dynamics(cell), clock_ns * 1e-9 / SUBSTEPS
         self._q, self._qd = cell.home.copy(), np.zeros(len(cell.home))
@@ -120,7 +122,10 @@ def test_a_torque_that_is_nan_is_refused_by_every_arm(rig: ServoRig) -> None:
     ("reference", "why"),
     [
         ("nobody:Arm", "cannot import 'nobody': ModuleNotFoundError: No module named 'nobody'"),
-        ("tests.levels.arm.test_own_arm:Missing", "module 'tests.levels.arm.test_own_arm' has no class 'Missing'"),
+        (
+            "tests.levels.arm.test_own_arm:Missing",
+            "module 'tests.levels.arm.test_own_arm' has no class 'Missing'",
+        ),
         ("rack.levels.arm:Sensed", "'Sensed' is not a subclass of rack.levels.arm.arm.Arm"),
         ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, drive, step"),
     ],

@@ -29,7 +29,8 @@ def height(arm: SimulatedArm, row: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("time_s", "part"), [(0.99, 0.0), (1.0, 0.0), (1.1, 0.5), (1.2, 1.0), (1.3, 1.0), (1.45, 0.25), (1.5, 0.0)]
+    ("time_s", "part"),
+    [(0.99, 0.0), (1.0, 0.0), (1.1, 0.5), (1.2, 1.0), (1.3, 1.0), (1.45, 0.25), (1.5, 0.0)],
 )
 def test_a_push_rises_lasts_and_falls(time_s: float, part: float) -> None:
     assert push_force((UP,), time_s) == pytest.approx([0.0, 0.0, 4.0 * part])
@@ -53,12 +54,16 @@ def test_a_push_lifts_its_object_and_no_other() -> None:
 
 def test_an_arm_restored_during_a_push_continues_bit_for_bit() -> None:
     states = [Message(ARM_STATE.dtype(sizes(pushed_arm().cell))) for _ in range(3)]
-    arm = pushed_arm(PushConfig(body="block2", at=0.02, seconds=0.2, force=(1.5, 0.5, 0.3), rise=0.1))
+    arm = pushed_arm(
+        PushConfig(body="block2", at=0.02, seconds=0.2, force=(1.5, 0.5, 0.3), rise=0.1)
+    )
     arm.step(25)
     arm.save(states[0])
     arm.step(40)
     arm.save(states[1])
-    again = pushed_arm(PushConfig(body="block2", at=0.02, seconds=0.2, force=(1.5, 0.5, 0.3), rise=0.1))
+    again = pushed_arm(
+        PushConfig(body="block2", at=0.02, seconds=0.2, force=(1.5, 0.5, 0.3), rise=0.1)
+    )
     again.restore(states[0])
     again.step(40)
     again.save(states[2])

@@ -54,8 +54,12 @@ class Extremes:
     def look(self, data: mujoco.MjData) -> None:
         q, qd, bounds = data.qpos[self.made.qpos], data.qvel[self.made.dof], self.made.bounds
         self.speed = max(self.speed, float(np.max(np.abs(qd) / bounds.velocity)))
-        self.torque = max(self.torque, float(np.max(np.abs(data.qfrc_actuator[self.made.dof]) / bounds.torque)))
-        self.beyond = max(self.beyond, float(np.max([bounds.position[:, 0] - q, q - bounds.position[:, 1]])))
+        self.torque = max(
+            self.torque, float(np.max(np.abs(data.qfrc_actuator[self.made.dof]) / bounds.torque))
+        )
+        self.beyond = max(
+            self.beyond, float(np.max([bounds.position[:, 0] - q, q - bounds.position[:, 1]]))
+        )
         self.steps += 1
 
 
@@ -131,7 +135,9 @@ def test_an_arm_without_commands_stands_still(name: str) -> None:
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Watch) -> None:
     arm, made = arm_of(name)
-    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # a contact would stop the arm
+    made.model.opt.disableflags |= int(
+        mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )  # a contact would stop the arm
     extremes, rng = watched(arm), np.random.default_rng(7)
     for block in range(60):
         side = rng.choice([-1.0, 1.0], len(made.home)) if block < 40 else np.ones(len(made.home))
@@ -248,7 +254,9 @@ def test_a_move_cut_short_by_the_next_continues_from_where_it_was() -> None:
 def test_the_scene_shows_moving_obstacles_objects_and_the_tool_where_they_are() -> None:
     robot_and_scene = config("puma560_crossing")
     made, scene = cell("puma560_crossing"), robot_and_scene[1]
-    soon = SceneConfig(**{**scene.model_dump(), "motion": [{"body": "post", "at": 0.1, "to": (0.62, 0.0, 0.9)}]})
+    soon = SceneConfig(
+        **{**scene.model_dump(), "motion": [{"body": "post", "at": 0.1, "to": (0.62, 0.0, 0.9)}]}
+    )
     arm = SimulatedArm(made, soon, CLOCK_NS)
     arm.step(240)
     seen = Message(SCENE.dtype(sizes(made)))

@@ -38,13 +38,17 @@ def felt(arm: SimulatedArm) -> Array:
 
 
 def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
-    """Push the tool, at the tool's site, with a force, N, and a torque, N m, from the next step on."""
+    """Push the tool, at the tool's site, with a force, N, and a torque, N m, from the next step
+    on."""
     cell, data = arm.cell, arm._data
     applied = np.zeros(cell.model.nv)
     body = cell.model.site_bodyid[cell.tool]
     centre, site = data.xipos[body], data.site_xpos[cell.tool]
     mujoco.mj_applyFT(cell.model, data, force, torque, site, body, applied)
-    data.xfrc_applied[body, :3], data.xfrc_applied[body, 3:] = force, torque + np.cross(site - centre, force)
+    data.xfrc_applied[body, :3], data.xfrc_applied[body, 3:] = (
+        force,
+        torque + np.cross(site - centre, force),
+    )
 
 
 @pytest.mark.slow
@@ -66,9 +70,17 @@ def test_before_its_first_step_an_arm_rests(tmp_path: Path) -> None:
     assert np.abs(contact.wrench).max() < 1e-3
 
 
-@pytest.mark.parametrize("home", [(0.0, 1.4, -3.1, 0.0, -1.4416, 0.0), (0.6, 1.0, -2.6, 0.7, -0.9, 1.1)])
-def test_a_push_on_the_tool_is_the_wrench_of_the_contact(tmp_path: Path, home: tuple[float, ...]) -> None:
-    arm, force, torque = arm_of(tmp_path, home), np.array([5.0, -9.0, 12.0]), np.array([0.4, 0.3, -0.2])
+@pytest.mark.parametrize(
+    "home", [(0.0, 1.4, -3.1, 0.0, -1.4416, 0.0), (0.6, 1.0, -2.6, 0.7, -0.9, 1.1)]
+)
+def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
+    tmp_path: Path, home: tuple[float, ...]
+) -> None:
+    arm, force, torque = (
+        arm_of(tmp_path, home),
+        np.array([5.0, -9.0, 12.0]),
+        np.array([0.4, 0.3, -0.2]),
+    )
     for _ in range(200):
         push(arm, force, torque)
         arm.step(1)
@@ -89,7 +101,12 @@ def test_inertia_of_the_tool_is_no_contact(tmp_path: Path) -> None:
         velocity = 0.4 * np.sin(4.0 * np.pi * tick * 1e-3) * np.ones(6)
         acceleration = 4.0 * (velocity - arm._state[1]) / 0.02
         terms = arm.dynamics.terms(*arm._state)
-        arm.drive((terms.inertia * acceleration).sum(axis=1) + terms.bias + arm.dynamics.friction(velocity), 0.0)
+        arm.drive(
+            (terms.inertia * acceleration).sum(axis=1)
+            + terms.bias
+            + arm.dynamics.friction(velocity),
+            0.0,
+        )
         arm.step(1)
         state = np.array(arm._state)
         contact.take(felt(arm), state, np.zeros(6))

@@ -1,4 +1,5 @@
-"""The elemental move level with the real levels below it: paths planned ahead, detours, restarts."""
+"""The elemental move level with the real levels below it: paths planned ahead, detours,
+restarts."""
 
 from __future__ import annotations
 
@@ -16,8 +17,11 @@ GOAL = np.array(TRANSFER["to"])
 BLOCK1, POST = 0, 3
 
 
-def post_moves(*legs: tuple[float, tuple[float, float, float]], speed: float = 0.25) -> list[MotionConfig]:
-    """Bring the post to the height of the arm, out of its reach, then along `legs`: time and place."""
+def post_moves(
+    *legs: tuple[float, tuple[float, float, float]], speed: float = 0.25
+) -> list[MotionConfig]:
+    """Bring the post to the height of the arm, out of its reach, then along `legs`: time and
+    place."""
     first = MotionConfig(body="post", at=1.0, to=(legs[0][1][0], 0.85, legs[0][1][2]), speed=1.0)
     return [first, *(MotionConfig(body="post", at=at, to=to, speed=speed) for at, to in legs)]
 
@@ -46,7 +50,8 @@ def test_block_is_put_where_it_should_be_and_nothing_is_touched(transferred: tup
 
 
 def test_arm_hardly_waits_for_a_path_once_it_has_begun(transferred: tuple) -> None:
-    # Between two segments the primitive level may be without work for some of its cycles, not for one of this level's.
+    # Between two segments the primitive level may be without work for some of its cycles, not for
+    # one of this level's.
     _, seen = transferred
     begun = next(k for k, (_, busy) in enumerate(seen) if busy)
     last = max(done for done, _ in seen)
@@ -60,7 +65,9 @@ def test_arm_hardly_waits_for_a_path_once_it_has_begun(transferred: tuple) -> No
 
 @pytest.mark.slow
 def test_another_path_is_taken_around_an_obstacle_that_comes_into_the_way() -> None:
-    rack = WholeRack(arm="puma560_crossing", actions=[TRANSFER], motion=post_moves((5.5, (0.6, 0.0, 0.9))))
+    rack = WholeRack(
+        arm="puma560_crossing", actions=[TRANSFER], motion=post_moves((5.5, (0.6, 0.0, 0.9)))
+    )
     assert rack.run_to_end(40.0).state == State.DONE
     assert rack.move.replans >= 1
     assert rack.read("servo.status").touches == 0
@@ -85,7 +92,10 @@ def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() ->
 def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)))
     rack = WholeRack(
-        arm="puma560_crossing", actions=[TRANSFER], motion=motion, params={"elemental_move": {"patience": 0.5}}
+        arm="puma560_crossing",
+        actions=[TRANSFER],
+        motion=motion,
+        params={"elemental_move": {"patience": 0.5}},
     )
     status = rack.run_to_end(20.0)
     assert (status.state, status.error) == (State.ERROR, Error.NO_PATH)

@@ -1,4 +1,5 @@
-"""The executor of the elemental move level alone; the test plays task level, planner and primitive level."""
+"""The executor of the elemental move level alone; the test plays task level, planner and primitive
+level."""
 
 from __future__ import annotations
 
@@ -28,7 +29,11 @@ class Bench(Lockstep):
         places = {"above": "task", "below": "primitive"}
         board = BoardSpec("elemental_move", EVERY, ElementalMoveExecutor, **places, params=params)
         robot, scene = config("puma560")
-        outside = {"task.command": TASK_COMMAND, "primitive.status": PRIMITIVE_STATUS, "elemental_move.plan": MOVE_PLAN}
+        outside = {
+            "task.command": TASK_COMMAND,
+            "primitive.status": PRIMITIVE_STATUS,
+            "elemental_move.plan": MOVE_PLAN,
+        }
         super().__init__([board], robot, scene, outside=outside)
         self.home = np.array(robot.home)
         self.below = self.message("primitive.status")
@@ -37,7 +42,8 @@ class Bench(Lockstep):
         self.ends = {0: self.home}
 
     def cycle(self, cycles: int = 1, **below: object) -> None:
-        """Show the primitive level's status with the fields `below` changed, and run some cycles."""
+        """Show the primitive level's status with the fields `below` changed, and run some
+        cycles."""
         for name, value in below.items():
             setattr(self.below, name, value)
         self.write("primitive.status", self.below)
@@ -54,7 +60,11 @@ class Bench(Lockstep):
         self.write("task.command", command)
 
     def plan(
-        self, move: int, start: NDArray[np.float64] | None = None, replan: int = 0, error: Error = Error.NONE
+        self,
+        move: int,
+        start: NDArray[np.float64] | None = None,
+        replan: int = 0,
+        error: Error = Error.NONE,
     ) -> None:
         """Publish a path for a move, from where the one before it ends or `start`, or a refusal."""
         plan = self.message("elemental_move.plan")
@@ -193,8 +203,12 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
 
 
 def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
-    # As where the guard sees a collision that the planner does not: every path is free, and none can be followed.
-    bench, why = planned_bench(replans=3), "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm"
+    # As where the guard sees a collision that the planner does not: every path is free, and none
+    # can be followed.
+    bench, why = (
+        planned_bench(replans=3),
+        "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm",
+    )
     for _ in range(3):
         serial = bench.segments()[0][0]
         bench.cycle(2, current=serial, blocked=1, state=State.HOLDING, reason=why)
@@ -218,12 +232,24 @@ def test_next_move_may_take_as_many_other_paths_again() -> None:
 def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
     bench = planned_bench()
     bench.cycle(
-        2, current=1, progress=0.25, operated=1, state=State.HOLDING, reason="waiting for servo: brakes engaged"
+        2,
+        current=1,
+        progress=0.25,
+        operated=1,
+        state=State.HOLDING,
+        reason="waiting for servo: brakes engaged",
     )
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "waiting for servo: brakes engaged")
+    assert (bench.status.state, bench.status.reason) == (
+        State.HOLDING,
+        "waiting for servo: brakes engaged",
+    )
     assert (bench.status.progress, bench.status.operated) == (0.25, 1)
     bench.cycle(2, operated=0, state=State.EXECUTING, reason="")
-    assert (bench.status.state, bench.status.reason, bench.status.operated) == (State.EXECUTING, "", 0)
+    assert (bench.status.state, bench.status.reason, bench.status.operated) == (
+        State.EXECUTING,
+        "",
+        0,
+    )
 
 
 def test_answer_to_an_older_request_is_not_taken() -> None:
@@ -248,7 +274,8 @@ def test_time_is_handed_down_less_what_the_answer_takes() -> None:
     bench.order([Verb.MOVE_JOINTS], by=20.0)
     bench.plan(1)
     bench.cycle(2)
-    # The report of the primitive level waits a cycle to be read and this level's a cycle to be seen.
+    # The report of the primitive level waits a cycle to be read and this level's a cycle to be
+    # seen.
     assert 18.0 < bench.command.segments[0]["by"] <= 20.0 - 2 * 0.25
 
 
@@ -302,7 +329,9 @@ def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     assert bench.segments() == [(3, 3), (4, 4)]
 
 
-def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_blocked_one() -> None:
+def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_blocked_one() -> (
+    None
+):
     bench = planned_bench()
     bench.restart("elemental_move")
     bench.cycle(2, blocked=1, current=1)
@@ -338,7 +367,8 @@ def test_level_says_that_it_waits_for_the_board_below() -> None:
 
 
 def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:
-    # The path of move 1 was lost, that of move 2 was not; another path for move 1 may end elsewhere.
+    # The path of move 1 was lost, that of move 2 was not; another path for move 1 may end
+    # elsewhere.
     bench = Bench()
     bench.order()
     bench.plan(2, bench.home + 0.3)

@@ -30,7 +30,9 @@ def test_derivatives_agree_with_finite_differences() -> None:
     ahead, ahead_dq, _ = points(path, s + step)
     behind, behind_dq, _ = points(path, s - step)
     assert np.abs((ahead - behind) / (2 * step) - dq).max() < 1e-8
-    assert np.abs((ahead_dq - behind_dq) / (2 * step) - d2q).max() < 2e-4  # q'' has kinks where a blend ends
+    assert (
+        np.abs((ahead_dq - behind_dq) / (2 * step) - d2q).max() < 2e-4
+    )  # q'' has kinks where a blend ends
 
 
 def test_second_derivative_is_continuous_and_zero_where_a_blend_ends() -> None:
@@ -88,7 +90,9 @@ def test_single_waypoint_is_a_path_of_length_zero() -> None:
 
 
 def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
-    path = BlendedPath([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.3, 0.2, 0.4, 0.0])
+    path = BlendedPath(
+        [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.3, 0.2, 0.4, 0.0]
+    )
     assert path.waypoints == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
     assert path.blend == pytest.approx([0.0, 0.2, 0.0])
     nowhere = BlendedPath([[1.0, 2.0]] * 3, [0.0, 0.5, 0.0])

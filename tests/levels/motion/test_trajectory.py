@@ -1,4 +1,5 @@
-"""Time along a path: limits of every joint, exact ends, good use of the limits, stretching, stopping."""
+"""Time along a path: limits of every joint, exact ends, good use of the limits, stretching,
+stopping."""
 
 from __future__ import annotations
 
@@ -7,7 +8,13 @@ import pytest
 
 from rack.levels.messages import SECTIONS, WAYPOINTS
 from rack.levels.motion.path import BlendedPath, PathBounds
-from rack.levels.motion.speed import SpeedLimits, boundary_speeds, braking_limits, reachable_speed, speed_limits
+from rack.levels.motion.speed import (
+    SpeedLimits,
+    boundary_speeds,
+    braking_limits,
+    reachable_speed,
+    speed_limits,
+)
 from rack.levels.motion.trajectory import PathState, Trajectory, make_stop, make_trajectory
 from tests.levels.arms import cell
 
@@ -30,8 +37,11 @@ def random_path(seed: int, corners: int, scale: float = 0.6, stops: bool = False
     return BlendedPath(waypoints, blend)
 
 
-def used(path: BlendedPath, trajectory: Trajectory, samples: int = 3000) -> tuple[float, float, float]:
-    """Return the largest parts of velocity, acceleration and jerk limits that densely sampled motion uses.
+def used(
+    path: BlendedPath, trajectory: Trajectory, samples: int = 3000
+) -> tuple[float, float, float]:
+    """Return the largest parts of velocity, acceleration and jerk limits that densely sampled
+    motion uses.
 
     Jerk is the difference of the acceleration over a step that touches no change of section.
     """
@@ -91,12 +101,16 @@ def test_straight_line_uses_velocity_and_acceleration_limits_fully() -> None:
 
 def test_rounded_corner_is_quicker_than_a_stop_at_it() -> None:
     waypoints = [np.zeros(6), np.full(6, 0.5), np.array([1.0, 0.2, 0.9, 0.5, 0.0, 0.5])]
-    rounded, stopping = (make_trajectory(BlendedPath(waypoints, [0, blend, 0]), ARM).duration for blend in (0.6, 0.0))
+    rounded, stopping = (
+        make_trajectory(BlendedPath(waypoints, [0, blend, 0]), ARM).duration for blend in (0.6, 0.0)
+    )
     assert rounded < 0.95 * stopping
 
 
 def test_motion_rests_at_every_stop_of_the_path() -> None:
-    path = BlendedPath([np.zeros(6), np.full(6, 0.4), np.array([0.8, 0, 0, 0, 0, 0.4])], np.zeros(3))
+    path = BlendedPath(
+        [np.zeros(6), np.full(6, 0.4), np.array([0.8, 0, 0, 0, 0, 0.4])], np.zeros(3)
+    )
     trajectory = make_trajectory(path, ARM)
     s, ds, _ = trajectory.states(np.linspace(0.0, trajectory.duration, 20_001))
     assert path.stops
@@ -125,7 +139,9 @@ def test_stretched_trajectory_takes_exactly_the_time_asked_for_on_the_same_path(
     slow = quick.stretched(7.25 / quick.duration)
     assert slow.duration == pytest.approx(7.25, rel=1e-12)
     assert slow.end == pytest.approx(quick.end, rel=1e-12)
-    assert slow.at(0.3 * slow.duration).s == pytest.approx(quick.at(0.3 * quick.duration).s, rel=1e-9)
+    assert slow.at(0.3 * slow.duration).s == pytest.approx(
+        quick.at(0.3 * quick.duration).s, rel=1e-9
+    )
     velocity, acceleration, jerk = used(path, slow)
     factor = slow.duration / quick.duration
     assert velocity <= 1.0 / factor + EXACT
@@ -186,7 +202,9 @@ def test_stop_keeps_the_joint_limits_and_stays_on_the_path(corners: int) -> None
 
 
 def test_stop_never_overruns_a_corner_that_is_a_stop() -> None:
-    path = BlendedPath([np.zeros(6), np.full(6, 0.4), np.array([0.8, 0, 0, 0, 0, 0.4])], np.zeros(3))
+    path = BlendedPath(
+        [np.zeros(6), np.full(6, 0.4), np.array([0.8, 0, 0, 0, 0, 0.4])], np.zeros(3)
+    )
     trajectory = make_trajectory(path, ARM)
     corner = path.stops[0]
     for time_s in np.linspace(0.0, trajectory.duration, 60):

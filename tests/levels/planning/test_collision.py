@@ -113,7 +113,8 @@ def test_open_fingers_must_not_go_through_the_block_that_is_meant(
 def test_held_block_is_carried_and_keeps_clear_of_the_wall(
     puma: Cell, ik: InverseKinematics, checker: CollisionChecker
 ) -> None:
-    # The tool is as far from the wall as the palm needs, a block held 80 mm below it would stand in the wall's top.
+    # The tool is as far from the wall as the palm needs, a block held 80 mm below it would stand in
+    # the wall's top.
     q = at(ik, puma, 0.5, 0.0, 0.80)
     assert checker.free(q)
     checker.hold(BLOCK1, (0.0, 0.0, 0.05))
@@ -134,7 +135,9 @@ def test_held_block_may_touch_the_table_only_where_it_is_meant_and_not_sink_into
     assert not checker.free(at(ik, puma, 0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
 
 
-def test_objects_are_where_they_are_placed(puma: Cell, ik: InverseKinematics, checker: CollisionChecker) -> None:
+def test_objects_are_where_they_are_placed(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
     q = at(ik, puma, 0.7, 0.2, 0.55)
     positions, quaternions = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
     positions[:] = [[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]]
@@ -148,14 +151,20 @@ def test_objects_are_where_they_are_placed(puma: Cell, ik: InverseKinematics, ch
 def test_arm_may_be_near_the_fixed_body_that_carries_it(tmp_path: Path) -> None:
     model = tmp_path / "carried.xml"
     model.write_text(
-        '<mujoco><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body name="stand" pos="0 0 .5">'
-        '<geom name="stand" type="cylinder" size=".05 .1"/><body name="arm" pos="0 0 .16">'
-        '<joint name="j" axis="0 1 0"/><geom name="arm" type="capsule" fromto="0 0 0 0 0 .3" size=".05"/>'
-        '<site name="tip" pos="0 0 .3"/></body></body></worldbody><actuator><motor joint="j" ctrlrange="-9 9"/>'
-        "</actuator></mujoco>"
+        '<mujoco><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body name="stand"'
+        ' pos="0 0 .5"><geom name="stand" type="cylinder" size=".05 .1"/><body name="arm" pos="0 0'
+        ' .16"><joint name="j" axis="0 1 0"/><geom name="arm" type="capsule" fromto="0 0 0 0 0 .3"'
+        ' size=".05"/><site name="tip" pos="0 0 .3"/></body></body></worldbody><actuator><motor'
+        ' joint="j" ctrlrange="-9 9"/></actuator></mujoco>'
     )
     robot = RobotConfig(
-        model=model, joints=("j",), tool="tip", home=(0.0,), velocity=(1.0,), acceleration=(1.0,), jerk=(1.0,)
+        model=model,
+        joints=("j",),
+        tool="tip",
+        home=(0.0,),
+        velocity=(1.0,),
+        acceleration=(1.0,),
+        jerk=(1.0,),
     )
     scene = SceneConfig(clearance=0.05)
     checker = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene)
@@ -164,7 +173,9 @@ def test_arm_may_be_near_the_fixed_body_that_carries_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("held", [None, BLOCK1])
-def test_compiled_checks_decide_as_python_does_and_are_loaded_before(puma: Cell, held: int | None) -> None:
+def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
+    puma: Cell, held: int | None
+) -> None:
     collision.preload()
     loaded = list(is_free.load().signatures)  # type: ignore[attr-defined]
     checker, under_python = (CollisionChecker(puma, config("puma560")[1]) for _ in range(2))

@@ -65,7 +65,9 @@ def test_equal_questions_get_equal_answers_in_any_order() -> None:
     target, home = pose((0.5, -0.2, 0.7), DOWN), CELLS["puma560"].home
     fresh = InverseKinematics(CELLS["puma560"], SEED)
     fresh.reachable(pose((0.4, 0.3, 0.8), DOWN), home)
-    for one, other in zip(SOLVERS["puma560"].reachable(target, home), fresh.reachable(target, home), strict=True):
+    for one, other in zip(
+        SOLVERS["puma560"].reachable(target, home), fresh.reachable(target, home), strict=True
+    ):
         assert np.array_equal(one, other)
 
 
@@ -100,7 +102,10 @@ def test_tool_follows_a_straight_line(name: str, way: tuple[float, float, float]
 
 def test_line_that_leaves_the_reach_of_the_arm_is_refused() -> None:
     ik, home = SOLVERS["puma560"], CELLS["puma560"].home
-    assert straight_line(ik, home, pose(ik.tool_at(home).position + np.array([1.0, 0.0, 0.0]), DOWN)) is None
+    assert (
+        straight_line(ik, home, pose(ik.tool_at(home).position + np.array([1.0, 0.0, 0.0]), DOWN))
+        is None
+    )
 
 
 @pytest.mark.parametrize("name", CELLS)

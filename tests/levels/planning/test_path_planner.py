@@ -42,13 +42,17 @@ def sides(puma: Cell, checker: CollisionChecker) -> tuple[np.ndarray, np.ndarray
 
 
 @pytest.fixture(scope="module")
-def around(planner: PathPlanner, checker: CollisionChecker, sides: tuple[np.ndarray, np.ndarray]) -> Path:
+def around(
+    planner: PathPlanner, checker: CollisionChecker, sides: tuple[np.ndarray, np.ndarray]
+) -> Path:
     path = planner.plan(*sides, checker.free)
     assert path is not None
     return path
 
 
-def test_free_straight_line_is_the_path(planner: PathPlanner, checker: CollisionChecker, puma: Cell) -> None:
+def test_free_straight_line_is_the_path(
+    planner: PathPlanner, checker: CollisionChecker, puma: Cell
+) -> None:
     goal = puma.home + np.array([0.2, 0.0, 0.1, 0.0, 0.1, 0.5])
     path = planner.plan(puma.home, goal, checker.free)
     assert path is not None
@@ -64,7 +68,9 @@ def test_path_around_the_wall_is_free_between_its_checks_too(
     assert all(checker.free(q, least) for q in BlendedPath(*around).sample(0.13 * planner.step_rad))
 
 
-def test_path_begins_and_ends_exactly_where_it_should(around: Path, sides: tuple[np.ndarray, np.ndarray]) -> None:
+def test_path_begins_and_ends_exactly_where_it_should(
+    around: Path, sides: tuple[np.ndarray, np.ndarray]
+) -> None:
     assert np.array_equal(around.waypoints[0], sides[0])
     assert np.array_equal(around.end, sides[1])
     assert 3 <= len(around.waypoints) <= WAYPOINTS
@@ -89,7 +95,10 @@ def test_equal_questions_get_equal_paths_whatever_was_planned_before(
 
 @pytest.mark.slow
 def test_another_attempt_takes_other_random_numbers(
-    planner: PathPlanner, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
+    planner: PathPlanner,
+    checker: CollisionChecker,
+    around: Path,
+    sides: tuple[np.ndarray, np.ndarray],
 ) -> None:
     other = planner.plan(*sides, checker.free, attempt=1)
     assert other is not None
@@ -97,7 +106,10 @@ def test_another_attempt_takes_other_random_numbers(
 
 
 def test_one_search_is_never_quicker_than_all(
-    planner: PathPlanner, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
+    planner: PathPlanner,
+    checker: CollisionChecker,
+    around: Path,
+    sides: tuple[np.ndarray, np.ndarray],
 ) -> None:
     hasty = planner.plan(*sides, checker.free, searches=1)
     assert hasty is not None
@@ -105,14 +117,21 @@ def test_one_search_is_never_quicker_than_all(
 
 
 def test_no_path_where_goal_or_start_is_blocked(
-    planner: PathPlanner, checker: CollisionChecker, puma: Cell, sides: tuple[np.ndarray, np.ndarray]
+    planner: PathPlanner,
+    checker: CollisionChecker,
+    puma: Cell,
+    sides: tuple[np.ndarray, np.ndarray],
 ) -> None:
-    in_the_wall = InverseKinematics(puma, SEED).reachable(pose((0.5, 0.0, 0.65), pointing((0, 0, -1))), puma.home)[0]
+    in_the_wall = InverseKinematics(puma, SEED).reachable(
+        pose((0.5, 0.0, 0.65), pointing((0, 0, -1))), puma.home
+    )[0]
     assert planner.plan(puma.home, in_the_wall, checker.free) is None
     assert planner.plan(in_the_wall, puma.home, checker.free) is None
 
 
-def test_search_without_a_way_ends_after_a_bounded_number_of_checks(planner: PathPlanner, puma: Cell) -> None:
+def test_search_without_a_way_ends_after_a_bounded_number_of_checks(
+    planner: PathPlanner, puma: Cell
+) -> None:
     checks = 0
 
     def walled_in(q: np.ndarray) -> bool:
@@ -124,7 +143,9 @@ def test_search_without_a_way_ends_after_a_bounded_number_of_checks(planner: Pat
     assert checks < 30_000
 
 
-def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(planner: PathPlanner) -> None:
+def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
+    planner: PathPlanner,
+) -> None:
     corner = np.array([[0.0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0]])
 
     def on_the_polyline(q: np.ndarray) -> bool:

@@ -46,8 +46,12 @@ def grip_of(made: Cell, row: int) -> Pose:
 def test_grip_is_weighed_against_friction_with_both_forces(turn: float) -> None:
     # 40 N at one finger are 20 N at each pad, whose friction is 1.2: 48 N.
     made = weighing(6.0)
-    turned = grip_of(made, BLOCK1) @ pose(np.zeros(3), (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)))
-    with pytest.raises(Refused, match=r"payload 'block1' 6 kg needs 88\.3 N of grip; the gripper holds 48\.0 N") as got:
+    turned = grip_of(made, BLOCK1) @ pose(
+        np.zeros(3), (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
+    )
+    with pytest.raises(
+        Refused, match=r"payload 'block1' 6 kg needs 88\.3 N of grip; the gripper holds 48\.0 N"
+    ) as got:
         Payloads(made, SCENE.objects).check_grip(BLOCK1, turned)
     assert got.value.code == Error.OVERLOAD
     light = weighing(3.2)
@@ -63,7 +67,8 @@ def test_thin_object_is_gripped_by_the_spring_of_the_position_loop() -> None:
 
 
 def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
-    # The cranks, 50 mm, close on 50 mm near asin(0.5): 1 N m of each, 1 / (0.05 cos(pi/6)) N at its pad.
+    # The cranks, 50 mm, close on 50 mm near asin(0.5): 1 N m of each, 1 / (0.05 cos(pi/6)) N at its
+    # pad.
     made = build_cell(*four_bar(tmp_path), CLOCK_NS)
     made.model.body_subtreemass[made.bodies[BLOCK1]] = 6.0
     with pytest.raises(Refused) as refused:
@@ -74,15 +79,30 @@ def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
 
 def test_motors_are_weighed_with_the_payload_and_the_weakest_is_named() -> None:
     made = weighing(40.0)
-    with pytest.raises(Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'; its motor carries") as got:
-        Payloads(made, SCENE.objects).check_motors(BLOCK1, grip_of(made, BLOCK1), made.home[None, :] + 0.3)
+    with pytest.raises(
+        Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'; its motor carries"
+    ) as got:
+        Payloads(made, SCENE.objects).check_motors(
+            BLOCK1, grip_of(made, BLOCK1), made.home[None, :] + 0.3
+        )
     assert got.value.code == Error.OVERLOAD
-    Payloads(weighing(0.1), SCENE.objects).check_motors(BLOCK1, grip_of(made, BLOCK1), made.home[None, :] + 0.3)
+    Payloads(weighing(0.1), SCENE.objects).check_motors(
+        BLOCK1, grip_of(made, BLOCK1), made.home[None, :] + 0.3
+    )
 
 
 def test_any_move_with_what_is_held_is_weighed_an_operators_goto_too() -> None:
     made = weighing(40.0)
-    move = Move(1, 0, Verb.MOVE_JOINTS, None, pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0)), made.home + 0.3, False, 0.0)
+    move = Move(
+        1,
+        0,
+        Verb.MOVE_JOINTS,
+        None,
+        pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0)),
+        made.home + 0.3,
+        False,
+        0.0,
+    )
     motion, empty = MotionPlanner(made, SCENE, 1990), situation_of(made)
     motion.plan(move, made.home, empty)
     with pytest.raises(Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'") as got:
@@ -98,8 +118,12 @@ def test_object_that_the_fingers_do_not_meet_is_not_judged() -> None:
 
 def test_task_refuses_what_is_too_heavy_as_it_is_to_pick_it() -> None:
     made = weighing(6.0)
-    program = read_program({"action": [{"do": "transfer", "object": "block1", "to": [0.5, -0.2, 0.475]}]}, ROBOT, SCENE)
+    program = read_program(
+        {"action": [{"do": "transfer", "object": "block1", "to": [0.5, -0.2, 0.475]}]}, ROBOT, SCENE
+    )
     start = Rehearsal(MotionPlanner(made, SCENE, 1990), made.home, situation_of(made))
-    with pytest.raises(Refused, match=r"^action 0, pick block1: payload 'block1' 6 kg needs") as refused:
+    with pytest.raises(
+        Refused, match=r"^action 0, pick block1: payload 'block1' 6 kg needs"
+    ) as refused:
         rehearse(program, SCENE, start)
     assert refused.value.code == Error.OVERLOAD

@@ -40,7 +40,9 @@ def test_way_between_poses_is_straight_and_turns_at_a_constant_rate() -> None:
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.3, -2.0, 0.4)])
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
 def test_pointing_turns_the_z_axis_to_the_direction(direction: tuple, yaw: float) -> None:
-    assert rotated([0, 0, 1], pointing(direction, yaw)) == pytest.approx(direction / np.linalg.norm(direction))
+    assert rotated([0, 0, 1], pointing(direction, yaw)) == pytest.approx(
+        direction / np.linalg.norm(direction)
+    )
 
 
 def test_yaw_about_a_direction_turns_the_tool_about_its_own_z_axis() -> None:

@@ -1,4 +1,5 @@
-"""A rack of servo, world model and primitive level in one process; the test commands it in place of the level above."""
+"""A rack of servo, world model and primitive level in one process; the test commands it in place of
+the level above."""
 
 from __future__ import annotations
 
@@ -24,17 +25,29 @@ BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
 
 
 class PrimitiveRack(Lockstep):
-    """The primitive level above the real servo and the simulated cell; `seen` and `set_points` are its messages."""
+    """The primitive level above the real servo and the simulated cell; `seen` and `set_points` are
+    its messages."""
 
     def __init__(
-        self, name: str = "puma560", motion: Sequence[MotionConfig] = (), params: Mapping[str, Any] | None = None
+        self,
+        name: str = "puma560",
+        motion: Sequence[MotionConfig] = (),
+        params: Mapping[str, Any] | None = None,
     ) -> None:
         robot, scene = config(name)
         places = {"above": "em", "below": "servo"}
         boards = [
             BoardSpec("servo", 1, ServoExecutor, ServoPlanner, 8, above="primitive"),
             BoardSpec("world", 8, WorldModel),
-            BoardSpec("primitive", 8, PrimitiveExecutor, PrimitivePlanner, 2, **places, params=params or {}),
+            BoardSpec(
+                "primitive",
+                8,
+                PrimitiveExecutor,
+                PrimitivePlanner,
+                2,
+                **places,
+                params=params or {},
+            ),
         ]
         scene = scene.model_copy(update={"motion": tuple(motion)})
         super().__init__(boards, robot, scene, outside={"em.command": MOVE_COMMAND})
@@ -82,7 +95,9 @@ class PrimitiveRack(Lockstep):
         return self.status
 
 
-def path(serial: int, waypoints: ArrayLike, blend: ArrayLike | None = None, **fields: Any) -> Segment:
+def path(
+    serial: int, waypoints: ArrayLike, blend: ArrayLike | None = None, **fields: Any
+) -> Segment:
     """Return a PATH segment; without `blend` every corner is a stop."""
     points = np.array(waypoints)
     blends = np.zeros(len(points)) if blend is None else blend
@@ -98,7 +113,13 @@ def two_paths(rack: PrimitiveRack) -> tuple[Segment, Segment]:
 
 def gripper(serial: int, opening: float, held: int = -1, force: float = 30.0) -> Segment:
     """Return a GRIPPER segment."""
-    return {"id": serial, "kind": SegmentKind.GRIPPER, "object": held, "opening": opening, "force": force}
+    return {
+        "id": serial,
+        "kind": SegmentKind.GRIPPER,
+        "object": held,
+        "opening": opening,
+        "force": force,
+    }
 
 
 def _fields(record: np.ndarray) -> dict[str, Any]:

@@ -23,14 +23,17 @@ from tests.levels.primitive.rack import PrimitiveRack, path
 CROSSING = "puma560_crossing"
 POST = "post"
 NEAR = np.array([-0.9, 1.2, -3.1, 0.0, -1.24, 0.0])
-"""The arm reaches out next to the wall; turning about its base from here it sweeps over the table."""
+"""The arm reaches out next to the wall; turning about its base from here it sweeps over the
+table."""
 SWEEP = np.array([2.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def crossing(at: float, y: float = 0.0, leaves_at: float | None = None) -> list[MotionConfig]:
     """The post waits next to the sweep, steps into it at `at`, and may leave again."""
     beside, inside = (0.85, y, 0.8), (0.55, y, 0.8)
-    moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + ([(leaves_at, beside, 0.25)] if leaves_at else [])
+    moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + (
+        [(leaves_at, beside, 0.25)] if leaves_at else []
+    )
     return [MotionConfig(body=POST, at=start, to=to, speed=speed) for start, to, speed in moves]
 
 
@@ -88,7 +91,9 @@ def test_obstacle_that_enters_the_path_after_the_arm_has_passed_does_not_hold_it
 def test_hold_keeps_the_path_and_brakes_within_its_limits() -> None:
     made = [p for p in crossed(1.4, 0.0).set_points if p["due"]]
     accelerations = np.array([p["acceleration"] for p in made])
-    assert (np.abs(accelerations) <= 1.5 * arms.cell(CROSSING).limits.acceleration * (1 + 1e-6)).all()
+    assert (
+        np.abs(accelerations) <= 1.5 * arms.cell(CROSSING).limits.acceleration * (1 + 1e-6)
+    ).all()
     last = np.array([p["position"] for p in made[-50:]])
     assert np.ptp(last, axis=0).max() == 0.0
     assert last[0, 1:] == pytest.approx(NEAR[1:], abs=1e-9)
@@ -137,14 +142,19 @@ class Watched:
             self.world.quaternion[row] = start.xquat[body]
         self.path = BlendedPath(waypoints, np.zeros(len(waypoints)))
         self.trajectory = make_trajectory(self.path, self.cell.limits)
-        self.segment = MotionSegment(1, SegmentKind.PATH, held, touch, waypoints, np.zeros(2), 0.0, 0.0, 0.0)
+        self.segment = MotionSegment(
+            1, SegmentKind.PATH, held, touch, waypoints, np.zeros(2), 0.0, 0.0, 0.0
+        )
 
     def watch(self) -> None:
         self.guard.watch(self.segment, self.path, 0.04, self.world)
 
     def clear(self, time_s: float = 0.0, cycles: int = 60) -> bool:
         """Return whether the way stays clear over `cycles` in which nothing moves."""
-        answers = [self.guard.is_clear(self.path, self.trajectory, time_s, self.world) for _ in range(cycles)]
+        answers = [
+            self.guard.is_clear(self.path, self.trajectory, time_s, self.world)
+            for _ in range(cycles)
+        ]
         return all(answers)
 
     def tool_at(self, q: np.ndarray) -> np.ndarray:
@@ -201,7 +211,9 @@ def test_work_of_the_guard_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     watched.watch()
     checks = []
     free = watched.guard._checker.free
-    monkeypatch.setattr(watched.guard._checker, "free", lambda *args: checks.append(1) or free(*args))
+    monkeypatch.setattr(
+        watched.guard._checker, "free", lambda *args: checks.append(1) or free(*args)
+    )
     counts = [0]
     for _ in range(40):
         watched.guard.is_clear(watched.path, watched.trajectory, 0.0, watched.world)

@@ -17,7 +17,11 @@ def positions(rack: PrimitiveRack) -> np.ndarray:
 
 def first(rack: PrimitiveRack, **wanted: int) -> int:
     """Return the index of the first status whose fields are as wanted."""
-    return next(k for k, s in enumerate(rack.seen) if all(s[name] == value for name, value in wanted.items()))
+    return next(
+        k
+        for k, s in enumerate(rack.seen)
+        if all(s[name] == value for name, value in wanted.items())
+    )
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +39,14 @@ def test_arm_goes_along_both_paths_and_settles_at_their_end(finished: PrimitiveR
     assert finished.servo.clipped == finished.servo.touches == 0
 
 
-def test_set_points_keep_their_limits_and_agree_with_their_derivatives(finished: PrimitiveRack) -> None:
+def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
+    finished: PrimitiveRack,
+) -> None:
     limits = cell("puma560").limits
     made = [p for p in finished.set_points if p["due"]]
-    q, qd, qdd = (np.array([p[name] for p in made]) for name in ("position", "velocity", "acceleration"))
+    q, qd, qdd = (
+        np.array([p[name] for p in made]) for name in ("position", "velocity", "acceleration")
+    )
     assert (np.abs(qd) <= limits.velocity * (1 + 1e-6)).all()
     assert (np.abs(qdd) <= limits.acceleration * (1 + 1e-6)).all()
     assert np.abs(qdd).max(axis=0) == pytest.approx(limits.acceleration, rel=1.0)
@@ -47,14 +55,18 @@ def test_set_points_keep_their_limits_and_agree_with_their_derivatives(finished:
     assert np.abs((qd[2:] - qd[:-2]) / (2 * step) - qdd[1:-1]).max() < 1.0
 
 
-def test_set_point_is_due_two_cycles_after_the_release_that_made_it(finished: PrimitiveRack) -> None:
+def test_set_point_is_due_two_cycles_after_the_release_that_made_it(
+    finished: PrimitiveRack,
+) -> None:
     dues = [int(p["due"]) for p in finished.set_points]
     moving = [(8 * (k + 1), due) for k, due in enumerate(dues) if due]
     assert moving
     assert all(due - visible_at == 8 for visible_at, due in moving)
 
 
-def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait(finished: PrimitiveRack) -> None:
+def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait(
+    finished: PrimitiveRack,
+) -> None:
     begun = first(finished, current=2)
     assert not finished.seen[begun]["resting"]
     assert finished.seen[begun]["done"] == 1
@@ -91,7 +103,10 @@ def test_hold_ramps_to_rest_on_the_path_and_motion_continues_from_there() -> Non
     assert (rack.status.position == held.position).all()
     rack.command(*segments)
     assert rack.run_until_done(2)
-    way = np.array([p["position"] for p in rack.set_points[: first(rack, done=1)] if p["due"]]) - rack.home
+    way = (
+        np.array([p["position"] for p in rack.set_points[: first(rack, done=1)] if p["due"]])
+        - rack.home
+    )
     beside = way - np.outer(way @ TURN / (TURN @ TURN), TURN)
     assert np.abs(beside).max() < 1e-9
 
@@ -189,7 +204,9 @@ def test_path_that_begins_slightly_off_the_arm_is_joined_smoothly() -> None:
     assert rack.run_until_done(1)
     assert np.abs(rack.servo.position - rack.home - TURN).max() < 1e-3
     limits = cell("puma560").limits
-    assert (np.abs(np.diff(positions(rack), n=2, axis=0)) / 0.02**2 < 1.3 * limits.acceleration).all()
+    assert (
+        np.abs(np.diff(positions(rack), n=2, axis=0)) / 0.02**2 < 1.3 * limits.acceleration
+    ).all()
 
 
 def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() -> None:

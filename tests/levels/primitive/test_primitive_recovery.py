@@ -1,4 +1,5 @@
-"""The primitive level when a board dies, restarts, misses cycles or falls silent, or the arm does not follow."""
+"""The primitive level when a board dies, restarts, misses cycles or falls silent, or the arm does
+not follow."""
 
 from __future__ import annotations
 
@@ -28,8 +29,12 @@ def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("died_at_s", "away_s"), [(0.05, 0.25), (0.3, 0.0), (0.9, 0.04), (1.2, 0.25)])
-def test_executor_that_starts_anew_finishes_what_was_under_way(died_at_s: float, away_s: float) -> None:
+@pytest.mark.parametrize(
+    ("died_at_s", "away_s"), [(0.05, 0.25), (0.3, 0.0), (0.9, 0.04), (1.2, 0.25)]
+)
+def test_executor_that_starts_anew_finishes_what_was_under_way(
+    died_at_s: float, away_s: float
+) -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     rack.run(died_at_s)
@@ -107,12 +112,21 @@ def test_error_of_the_servo_level_goes_up_with_its_reason() -> None:
     def failed(visible_at: int, data: bytes) -> Shown:
         status = rack.message("servo.status")
         status.raw[:] = data
-        status.state, status.error, status.reason, status.stopped = State.ERROR, Error.SENSORS, "sensor of j2", 1
+        status.state, status.error, status.reason, status.stopped = (
+            State.ERROR,
+            Error.SENSORS,
+            "sensor of j2",
+            1,
+        )
         return ((visible_at, bytes(status.raw)),)
 
     rack.disturb("servo.status", failed, seconds(0.3))
     rack.run(0.25)
-    assert (rack.status.state, rack.status.error, rack.status.reason) == (State.ERROR, Error.SENSORS, "sensor of j2")
+    assert (rack.status.state, rack.status.error, rack.status.reason) == (
+        State.ERROR,
+        Error.SENSORS,
+        "sensor of j2",
+    )
 
 
 def test_servo_that_never_reports_that_it_holds_is_waited_for_with_a_reason() -> None:
@@ -128,7 +142,10 @@ def test_servo_that_never_reports_that_it_holds_is_waited_for_with_a_reason() ->
     rack.command(*two_paths(rack))
     rack.run(1.5)
     assert rack.status.state == State.HOLDING
-    assert rack.status.reason == "waiting for servo: it does not report `holding` with a target at rest"
+    assert (
+        rack.status.reason
+        == "waiting for servo: it does not report `holding` with a target at rest"
+    )
     rack.run(0.8)
     assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
 
@@ -139,7 +156,9 @@ def seconds(time_s: float) -> int:
 
 
 @pytest.mark.slow
-def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_continues_when_it_is_back() -> None:
+def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_continues_when_it_is_back() -> (
+    None
+):
     rack = PrimitiveRack(params={"settling": 0.5, "silent": 0.5})
     rack.command(*two_paths(rack))
     rack.run(0.4)
@@ -169,7 +188,8 @@ def test_gripper_does_not_begin_while_the_board_above_is_lost() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) -> None:
-    # The stop lasts longer than every time that may run out; brakes take the arm some way off its path.
+    # The stop lasts longer than every time that may run out; brakes take the arm some way off its
+    # path.
     rack = PrimitiveRack(params={"silent": 0.5, "settling": 0.5, "straying": 0.02, "astray": 0.05})
     rack.command(*two_paths(rack))
     rack.run(0.4)
@@ -252,11 +272,16 @@ def test_set_points_never_jump_however_often_boards_are_lost(seed: int) -> None:
     rack.command(*two_paths(rack))
     for _ in range(6):
         name = chance.choice(["primitive", "primitive", "primitive.planner", "servo", "world"])
-        rack.after(int(chance.integers(seconds(2.5))), lambda name=name: rack.lose(name, int(chance.integers(1, 100))))
+        rack.after(
+            int(chance.integers(seconds(2.5))),
+            lambda name=name: rack.lose(name, int(chance.integers(1, 100))),
+        )
     assert rack.run_until_done(2)
     last = None
     for new in rack.set_points:
-        assert all(np.isfinite(new[field]).all() for field in ("position", "velocity", "acceleration"))
+        assert all(
+            np.isfinite(new[field]).all() for field in ("position", "velocity", "acceleration")
+        )
         if last is not None and last["due"] and new["due"]:
             most = (new["due"] - last["due"]) * CLOCK_NS * 1e-9 * rack.fastest
             assert (np.abs(new["position"] - last["position"]) <= 1.01 * most).all()

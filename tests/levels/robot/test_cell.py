@@ -51,7 +51,15 @@ def test_the_gripper_starts_open_with_both_fingers() -> None:
 
 def test_two_builds_give_equal_models() -> None:
     first, second = cell("puma560").model, cell("puma560").model
-    for name in ("qpos0", "key_qpos", "body_mass", "body_inertia", "geom_size", "actuator_forcerange", "dof_armature"):
+    for name in (
+        "qpos0",
+        "key_qpos",
+        "body_mass",
+        "body_inertia",
+        "geom_size",
+        "actuator_forcerange",
+        "dof_armature",
+    ):
         assert np.array_equal(getattr(first, name), getattr(second, name)), name
 
 
@@ -79,7 +87,9 @@ def test_planned_motion_leaves_room_within_the_bounds() -> None:
 
 
 def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> None:
-    made = build(pendulum(tmp_path, first=BLOCK), SceneConfig(objects=("block",), supports=("floor",)))
+    made = build(
+        pendulum(tmp_path, first=BLOCK), SceneConfig(objects=("block",), supports=("floor",))
+    )
     assert made.qpos.tolist() == [7, 8]
     assert made.dof.tolist() == [6, 7]
     assert made.object_qpos.tolist() == [0]
@@ -92,7 +102,13 @@ def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> No
         ('<motor joint="shoulder" ctrlrange="-2 2" gear="15"/>', 30.0),
         ('<motor joint="shoulder" ctrlrange="-50 50" forcerange="-12 12" gear="2"/>', 24.0),
         ('<position joint="shoulder" kp="90" forcerange="-31 31"/>', 31.0),
-        ('<position joint="shoulder" kp="90" forcerange="-31 31"/><velocity joint="shoulder" kv="5"/>', 31.0),
+        (
+            (
+                '<position joint="shoulder" kp="90" forcerange="-31 31"/><velocity joint="shoulder"'
+                ' kv="5"/>'
+            ),
+            31.0,
+        ),
         ('<intvelocity joint="shoulder" kp="90" actrange="-1 1" forcerange="-7 7"/>', 7.0),
         ('<general jointinparent="shoulder" gainprm="10" ctrlrange="-3 3"/>', 30.0),
     ],
@@ -120,7 +136,10 @@ def test_a_tendon_drive_is_replaced_when_the_config_gives_torque_limits(tmp_path
 def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, MOTORS.replace("<motor", '<motor name="m"', 1))
     text = robot.model.read_text()
-    extra = '<keyframe><key ctrl="1 2"/></keyframe><sensor><actuatorfrc actuator="m"/></sensor></mujoco>'
+    extra = (
+        '<keyframe><key ctrl="1 2"/></keyframe><sensor><actuatorfrc'
+        ' actuator="m"/></sensor></mujoco>'
+    )
     robot.model.write_text(text.replace("</mujoco>", extra))
     assert build(robot).model.nsensor == 0
 
@@ -150,20 +169,28 @@ def gripper(**changed: str) -> GripperConfig:
 
 
 WRONG_CONFIGS = {
-    "joint": ({"joints": ("shoulder", "wrist")}, "no joint 'wrist' in the model; it has: shoulder, elbow"),
+    "joint": (
+        {"joints": ("shoulder", "wrist")},
+        "no joint 'wrist' in the model; it has: shoulder, elbow",
+    ),
     "twice": ({"joints": ("elbow", "elbow")}, "'elbow' is named 2 times"),
     "tool": ({"tool": "tcp"}, "robot.tool: no site 'tcp' in the model; it has: tip"),
     "length": ({"velocity": (1.0,)}, "robot.velocity: 1 values; one per joint: 2"),
     "home outside": ({"home": (0.0, 2.5)}, "joint 'elbow' at 2.5 rad; -1.995 to 1.995 is valid"),
     "home touches": ({"home": (1.5, 0.5)}, "'floor' touches 'lower'"),
     "too weak": ({"torque": (1.0, 20.0)}, "joint 'shoulder' carries"),
-    "no range": ({"position": ((2.5, 3.0), (-1.0, 1.0))}, "joint 'shoulder' has no room from 2.5 to 2 rad"),
+    "no range": (
+        {"position": ((2.5, 3.0), (-1.0, 1.0))},
+        "joint 'shoulder' has no room from 2.5 to 2 rad",
+    ),
     "gripper": ({"gripper": gripper()}, "'grip' is not in the model"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG_CONFIGS)
-def test_a_config_that_does_not_fit_the_model_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+def test_a_config_that_does_not_fit_the_model_is_refused_in_one_line(
+    tmp_path: Path, case: str
+) -> None:
     changed, message = WRONG_CONFIGS[case]
     with pytest.raises(RobotError) as refused:
         build(pendulum(tmp_path, **changed))
@@ -172,7 +199,10 @@ def test_a_config_that_does_not_fit_the_model_is_refused_in_one_line(tmp_path: P
 
 
 WRONG_SCENES = {
-    "object": (SceneConfig(objects=("cup",)), "no body 'cup' in the model; it has: world, block, upper, lower"),
+    "object": (
+        SceneConfig(objects=("cup",)),
+        "no body 'cup' in the model; it has: world, block, upper, lower",
+    ),
     "not free": (SceneConfig(objects=("lower",)), "body 'lower' has no free joint"),
     "obstacle": (SceneConfig(obstacles=("block",)), "body 'block' cannot move by itself"),
     "support": (SceneConfig(supports=("shelf",)), "no geom 'shelf' in the model"),
@@ -181,7 +211,9 @@ WRONG_SCENES = {
 
 
 @pytest.mark.parametrize("case", WRONG_SCENES)
-def test_a_scene_that_does_not_fit_the_model_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+def test_a_scene_that_does_not_fit_the_model_is_refused_in_one_line(
+    tmp_path: Path, case: str
+) -> None:
     scene, message = WRONG_SCENES[case]
     with pytest.raises(RobotError) as refused:
         build(pendulum(tmp_path, first=BLOCK), scene)
@@ -193,16 +225,38 @@ WRONG_MODELS = {
     "nan step": ({"timestep": "nan"}, "timestep = 'nan' is not a number"),
     "no step": ({"timestep": "0"}, "timestep 0 s is not valid"),
     "long step": ({"timestep": "2.5"}, "timestep 2.5 s is not valid; above 0, at most 0.1"),
-    "no limit": ({"actuators": '<motor joint="shoulder"/>'}, "joint 'shoulder': the model gives no torque limit"),
-    "ball": ({"first": '<body name="b" pos="2 0 1"><joint name="shoulder2" type="ball"/><geom size=".1"/></body>'}, ""),
+    "no limit": (
+        {"actuators": '<motor joint="shoulder"/>'},
+        "joint 'shoulder': the model gives no torque limit",
+    ),
+    "ball": (
+        {
+            "first": (
+                '<body name="b" pos="2 0 1"><joint name="shoulder2" type="ball"/><geom'
+                ' size=".1"/></body>'
+            )
+        },
+        "",
+    ),
     "malformed": ({"first": "<body>"}, "malformed XML"),
     "unknown": ({"first": "<chair/>"}, "unrecognized"),
     "huge": (
-        {"first": '</worldbody><asset><hfield name="h" nrow="20000" ncol="20000" size="1 1 1 1"/></asset><worldbody>'},
+        {
+            "first": (
+                '</worldbody><asset><hfield name="h" nrow="20000" ncol="20000" size="1 1 1'
+                ' 1"/></asset><worldbody>'
+            )
+        },
         "nrow x ncol = 4e+08; at most 4000000",
     ),
-    "outside": ({"first": '<include file="/etc/hostname"/>'}, "include '/etc/hostname' leaves the model's folder"),
-    "parent": ({"first": '<include file="../other.xml"/>'}, "include '../other.xml' leaves the model's folder"),
+    "outside": (
+        {"first": '<include file="/etc/hostname"/>'},
+        "include '/etc/hostname' leaves the model's folder",
+    ),
+    "parent": (
+        {"first": '<include file="../other.xml"/>'},
+        "include '../other.xml' leaves the model's folder",
+    ),
     "lost": ({"first": '<include file="other.xml"/>'}, "no such file"),
 }
 

@@ -27,7 +27,10 @@ def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
     tree = ElementTree.parse(ROBOTS / "puma560.xml")
     root = tree.getroot()
     for name, parent in [(n, p) for p in root.iter() for n in list(p)]:
-        of_hand = name.get("name") in ("hand", "grip") or "hand" in (name.get("body1"), name.get("body2"))
+        of_hand = name.get("name") in ("hand", "grip") or "hand" in (
+            name.get("body1"),
+            name.get("body2"),
+        )
         fingers = "finger" in name.get("body1", "") + name.get("joint1", "")
         if of_hand or fingers:
             parent.remove(name)
@@ -35,7 +38,9 @@ def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
         joint.attrib.pop("damping", None)
     model = tmp_path_factory.mktemp("puma") / "bare.xml"
     tree.write(model)
-    robot = config("puma560")[0].model_copy(update={"model": model, "tool": "wrist", "gripper": None})
+    robot = config("puma560")[0].model_copy(
+        update={"model": model, "tool": "wrist", "gripper": None}
+    )
     return build_cell(robot, SceneConfig(), CLOCK_NS)
 
 
@@ -48,7 +53,9 @@ def test_puma_kinematics_match_the_robotics_toolbox(puma: Cell, pose: str) -> No
 
 
 @pytest.mark.parametrize("pose", PUMA)
-def test_puma_gravity_inertia_and_coriolis_torques_match_the_robotics_toolbox(puma: Cell, pose: str) -> None:
+def test_puma_gravity_inertia_and_coriolis_torques_match_the_robotics_toolbox(
+    puma: Cell, pose: str
+) -> None:
     dynamics, published = Dynamics(puma), PUMA[pose]
     q, qd, qdd = (np.array(published[name]) for name in ("q", "qd", "qdd"))
     inertia, bias = (x.copy() for x in dynamics.terms(q, np.zeros(6)))
@@ -68,7 +75,9 @@ def test_k1607_gravity_matches_the_published_vectors(row: int) -> None:
 
 def test_k1607_masses_are_the_published_ones() -> None:
     model = cell("k1607").model
-    assert [model.body(f"k{n}").mass[0] for n in range(1, 7)] == pytest.approx([x["m"] for x in K1607["links"][:6]])
+    assert [model.body(f"k{n}").mass[0] for n in range(1, 7)] == pytest.approx(
+        [x["m"] for x in K1607["links"][:6]]
+    )
 
 
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
@@ -80,7 +89,9 @@ def test_torques_from_the_equation_give_the_acceleration_that_was_wanted(name: s
     inertia, bias = dynamics.terms(made.home, qd)
     data = made.start()
     data.qvel[made.dof] = qd
-    data.ctrl[made.actuators] = inertia @ wanted + bias + made.model.dof_frictionloss[made.dof] * np.sign(qd)
+    data.ctrl[made.actuators] = (
+        inertia @ wanted + bias + made.model.dof_frictionloss[made.dof] * np.sign(qd)
+    )
     if made.gripper_dof is not None:  # fingers that do not fly apart
         data.qvel[made.gripper_dof] = 0.0
     mujoco.mj_forward(made.model, data)
@@ -131,8 +142,14 @@ def test_a_payload_acts_like_a_small_mass_fixed_to_the_tool(tmp_path: Path) -> N
     ball = f'<body pos="{x} {y} {z}">{inertia}</body>'
     loaded = tmp_path / "loaded.xml"
     loaded.write_text(text.replace('<site name="tcp"', ball + '<site name="tcp"'))
-    heavy = Dynamics(build_cell(robot.model_copy(update={"model": loaded}), SceneConfig(), CLOCK_NS))
-    bare = Dynamics(build_cell(robot.model_copy(update={"model": ROBOTS / "puma560.xml"}), SceneConfig(), CLOCK_NS))
+    heavy = Dynamics(
+        build_cell(robot.model_copy(update={"model": loaded}), SceneConfig(), CLOCK_NS)
+    )
+    bare = Dynamics(
+        build_cell(
+            robot.model_copy(update={"model": ROBOTS / "puma560.xml"}), SceneConfig(), CLOCK_NS
+        )
+    )
     q, qd = np.random.default_rng(5).uniform(-1, 1, (2, 6))
     carried, welded = bare.terms(q, qd, Payload(mass, offset)), heavy.terms(q, qd)
     assert carried.inertia == pytest.approx(welded.inertia, abs=1e-7)

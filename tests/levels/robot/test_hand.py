@@ -68,7 +68,10 @@ def test_a_tension_turns_its_joint_and_no_other() -> None:
 
 def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
     made = build(config("utah_mit")[0])
-    geom = {name: made.model.geom(name).id for name in ("palm", "can", "stand", "index_pad", "thumb_pad")}
+    geom = {
+        name: made.model.geom(name).id
+        for name in ("palm", "can", "stand", "index_pad", "thumb_pad")
+    }
     assert not made.touch[geom["palm"], geom["can"]]
     assert not made.touch[geom["index_pad"], geom["thumb_pad"]]
     assert not made.touch[geom["can"], geom["stand"]]
@@ -97,7 +100,9 @@ def test_a_valve_remembers_its_controls_for_as_long_as_it_delays_them() -> None:
         (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "turns joint 'index1'"),
     ],
 )  # fmt: skip
-def test_a_tendon_that_is_no_half_of_a_pair_is_refused(tmp_path: Path, old: str, new: str, why: str) -> None:
+def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
+    tmp_path: Path, old: str, new: str, why: str
+) -> None:
     with pytest.raises(RobotError, match=r"robot\.hand") as refused:
         build(changed(tmp_path, old, new))
     assert why in str(refused.value)
@@ -136,11 +141,16 @@ def test_what_the_model_lacks_is_named() -> None:
     robot = config("utah_mit")[0]
     assert robot.hand is not None
     index, *rest = robot.hand.finger
-    for tip, why in (("nail", "robot.hand.finger.tip: no site 'nail'"), ("palm", "does not move the tip 'palm'")):
+    for tip, why in (
+        ("nail", "robot.hand.finger.tip: no site 'nail'"),
+        ("palm", "does not move the tip 'palm'"),
+    ):
         with pytest.raises(RobotError, match=why):
             build(retold(finger=(index.model_copy(update={"tip": tip}), *rest)))
     names = ("muscle", *robot.hand.extensors[1:])
-    with pytest.raises(RobotError, match=r"robot\.hand\.extensors: no actuator 'muscle' in the model; it has"):
+    with pytest.raises(
+        RobotError, match=r"robot\.hand\.extensors: no actuator 'muscle' in the model; it has"
+    ):
         build(retold(extensors=names))
     with pytest.raises(RobotError, match="actuator 'index0_flexor' is named 2 times"):
         build(retold(extensors=("index0_flexor", *robot.hand.extensors[1:])))
@@ -148,5 +158,7 @@ def test_what_the_model_lacks_is_named() -> None:
 
 def test_a_hand_has_neither_gripper_nor_torque_limits_of_its_own() -> None:
     robot = config("utah_mit")[0]
-    with pytest.raises(RobotError, match=r"robot\.torque: torques of a hand follow from its tendons"):
+    with pytest.raises(
+        RobotError, match=r"robot\.torque: torques of a hand follow from its tendons"
+    ):
         build(robot.model_copy(update={"torque": (1.0,) * 16}))

@@ -1,4 +1,5 @@
-"""Grippers whose joints follow one that is driven: geared, in closed loops, on springs and stops."""
+"""Grippers whose joints follow one that is driven: geared, in closed loops, on springs and
+stops."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def built(folder: Path, old: str = "", new: str = "") -> Cell:
 
 
 def settled(made: Cell, force: float) -> mujoco.MjData:
-    """Return the simulated cell after a second with `force` on the gripper, its arm held at home."""
+    """Return the simulated cell after a second with `force` on the gripper, its arm held at
+    home."""
     data = made.start()
     data.ctrl[made.gripper_actuator] = force
     for _ in range(2000):
@@ -36,7 +38,8 @@ def settled(made: Cell, force: float) -> mujoco.MjData:
 
 
 def away(made: Cell, data: mujoco.MjData) -> float:
-    """Return how far the farthest joint of the gripper is from where the linkage puts it, in rad."""
+    """Return how far the farthest joint of the gripper is from where the linkage puts it, in
+    rad."""
     assert made.linkage is not None
     posed = np.array(data.qpos)
     made.linkage.set(posed, float(data.qpos[made.gripper_qpos]))
@@ -67,7 +70,8 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
 
 
 def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
-    # Without its loop the left tip has a spring that presses it outwards against a stop, as underactuated fingers have.
+    # Without its loop the left tip has a spring that presses it outwards against a stop, as
+    # underactuated fingers have.
     robot, scene = four_bar(tmp_path)
     arm = tmp_path / "puma560.xml"
     text = arm.read_text().replace('name="loop_left"', 'name="loop_left" active="false"')
@@ -84,7 +88,11 @@ def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('<connect name="loop_left"', '<weld name="loop_left"', r"robot\.gripper: equality 'loop_left' is \d"),
+        (
+            '<connect name="loop_left"',
+            '<weld name="loop_left"',
+            r"robot\.gripper: equality 'loop_left' is \d",
+        ),
         ('<connect name="loop_left"', "<weld", "equality <weld> of 'rod_left' and 'tip_left' is"),
     ],
 )
@@ -95,8 +103,12 @@ def test_linkage_that_cannot_move_as_wanted_is_refused_by_the_name_of_its_equali
         built(tmp_path, old, new)
 
 
-@pytest.mark.parametrize(("equality", "joint"), [("gear", "crank_right"), ("loop_right", "tip_right")])
-def test_joint_that_nothing_determines_is_refused_by_name(tmp_path: Path, equality: str, joint: str) -> None:
+@pytest.mark.parametrize(
+    ("equality", "joint"), [("gear", "crank_right"), ("loop_right", "tip_right")]
+)
+def test_joint_that_nothing_determines_is_refused_by_name(
+    tmp_path: Path, equality: str, joint: str
+) -> None:
     with pytest.raises(RobotError, match=rf"robot\.gripper: joint '{joint}' follows nothing"):
         built(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')
 

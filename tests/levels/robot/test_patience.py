@@ -1,4 +1,5 @@
-"""Motors keep their last torque for a time in which the arm does little, by its model; or for the time that is set."""
+"""Motors keep their last torque for a time in which the arm does little, by its model; or for the
+time that is set."""
 
 from __future__ import annotations
 
@@ -6,7 +7,13 @@ import pytest
 
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.robot.limits import LEAST_CYCLES, MAX_PATIENCE_S, PATIENCE_PART, MotorPatience, patience_of
+from rack.levels.robot.limits import (
+    LEAST_CYCLES,
+    MAX_PATIENCE_S,
+    PATIENCE_PART,
+    MotorPatience,
+    patience_of,
+)
 from rack.levels.tables import RobotConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 
@@ -14,28 +21,44 @@ ROBOT, SCENE = config("puma560")
 
 
 @pytest.mark.parametrize("arm", ["puma560", "k1607"])
-def test_motors_put_in_no_more_than_a_part_of_the_energy_that_the_brakes_take_anyway(arm: str) -> None:
+def test_motors_put_in_no_more_than_a_part_of_the_energy_that_the_brakes_take_anyway(
+    arm: str,
+) -> None:
     made = cell(arm)
     speed, patience = made.bounds.velocity, made.patience
     kinetic = 0.5 * speed @ Dynamics(made).terms(made.home, 0.0 * speed).inertia @ speed
     # The fingers of `Dynamics` are open, those of the model at its reference.
-    assert patience.seconds * (speed @ made.bounds.torque) == pytest.approx(PATIENCE_PART * kinetic, rel=0.01)
-    assert (patience.seconds * speed <= PATIENCE_PART * 0.5 * speed**2 / config(arm)[0].acceleration).all()
+    assert patience.seconds * (speed @ made.bounds.torque) == pytest.approx(
+        PATIENCE_PART * kinetic, rel=0.01
+    )
+    assert (
+        patience.seconds * speed <= PATIENCE_PART * 0.5 * speed**2 / config(arm)[0].acceleration
+    ).all()
 
 
 def test_the_puma_keeps_its_torque_for_5_ms_at_400_hz_and_at_1_khz() -> None:
     patience = cell("puma560").patience
-    assert (patience.ticks(1, 0.0025), patience.ticks(1, 0.001), patience.ticks(5, 0.001)) == (2, 5, 10)
+    assert (patience.ticks(1, 0.0025), patience.ticks(1, 0.001), patience.ticks(5, 0.001)) == (
+        2,
+        5,
+        10,
+    )
 
 
 def test_an_arm_with_weak_motors_is_bounded_by_the_angle_and_by_the_longest_time() -> None:
     bounds = cell("puma560").bounds
     hard = ROBOT.model_copy(update={"acceleration": (200.0,) * 6})
-    assert patience_of(hard, bounds, 1e6).seconds == pytest.approx(PATIENCE_PART * 0.5 * 1.51 / 200.0)
+    assert patience_of(hard, bounds, 1e6).seconds == pytest.approx(
+        PATIENCE_PART * 0.5 * 1.51 / 200.0
+    )
     assert patience_of(ROBOT, bounds, 1e6) == MotorPatience(MAX_PATIENCE_S, LEAST_CYCLES)
 
 
-@pytest.mark.parametrize(("asked_ms", "ticks"), [(0.9, 1), (2.5, 1), (4.9, 1), (5.0, 2), (7.5, 3), (100.0, 40)])
-def test_a_patience_that_is_set_is_in_whole_cycles_and_at_least_one(asked_ms: float, ticks: int) -> None:
+@pytest.mark.parametrize(
+    ("asked_ms", "ticks"), [(0.9, 1), (2.5, 1), (4.9, 1), (5.0, 2), (7.5, 3), (100.0, 40)]
+)
+def test_a_patience_that_is_set_is_in_whole_cycles_and_at_least_one(
+    asked_ms: float, ticks: int
+) -> None:
     given = RobotConfig(**(dict(ROBOT) | {"patience_ms": asked_ms}))
     assert build_cell(given, SCENE, CLOCK_NS).patience.ticks(1, 0.0025) == ticks

@@ -24,7 +24,9 @@ def test_range_limits_and_noise_are_those_of_model_and_config(tmp_path: Path) ->
 
 def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: Path) -> None:
     model = (cell := build_cell(*pad(tmp_path), CLOCK_NS)).model
-    tip, flange, table, floor = (model.geom(name).id for name in ("pad", "flange", "table", "pedestal"))
+    tip, flange, table, floor = (
+        model.geom(name).id for name in ("pad", "flange", "table", "pedestal")
+    )
     assert not cell.touch[tip, table]
     assert cell.touch[tip, floor]
     assert cell.touch[flange, table]
@@ -35,21 +37,33 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
     [
         (
             {"force": "wrist"},
-            "robot.wrist.force: no sensor 'wrist' in the model; it has these force sensors: wrist_force",
+            (
+                "robot.wrist.force: no sensor 'wrist' in the model; it has these force sensors:"
+                " wrist_force"
+            ),
         ),
         (
             {"torque": "wrist_force"},
-            "robot.wrist.torque: sensor 'wrist_force' is no torque sensor; it has these torque sensors: wrist_torque",
+            (
+                "robot.wrist.torque: sensor 'wrist_force' is no torque sensor; it has these torque"
+                " sensors: wrist_torque"
+            ),
         ),
         (
             {"sites": ("sensor", "tcp")},
-            "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp'; one is valid",
+            (
+                "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp'; one is"
+                " valid"
+            ),
         ),
         (
             {"sites": ("base", "base")},
             "robot.wrist: site 'base' is on a body that the arm does not move",
         ),
-        ({"reach": 0.0}, "robot.wrist.force: sensor 'wrist_force' has no range; give it a cutoff, N"),
+        (
+            {"reach": 0.0},
+            "robot.wrist.force: sensor 'wrist_force' has no range; give it a cutoff, N",
+        ),
         (
             {"most_force": 151.0},
             "robot.wrist.most_force: 151 N is beyond the sensor's range; at most 150 is valid",

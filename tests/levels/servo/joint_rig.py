@@ -35,15 +35,21 @@ class JointRig:
         servo: type[JointServo] = JointServo,
         **arm: float | str,
     ) -> None:
-        """Start boards `servos`, by name with their parameters, every `every` ticks; `arm` are the arm's parameters."""
+        """Start boards `servos`, by name with their parameters, every `every` ticks; `arm` are the
+        arm's parameters."""
         robot, scene = config("puma560")
         names = tuple(servos)
         boards = [
             BoardSpec("arm", 1, ArmExecutor, above=names, params=arm),
-            *(BoardSpec(n, every, servo, above="swing", below="arm", params=p) for n, p in servos.items()),
+            *(
+                BoardSpec(n, every, servo, above="swing", below="arm", params=p)
+                for n, p in servos.items()
+            ),
             BoardSpec("swing", SWING_TICKS, Swing, below=names),
         ]
-        self.rack = Lockstep(boards, robot.model_copy(update={"substeps": 2}), scene, clock_ns=CLOCK_NS)
+        self.rack = Lockstep(
+            boards, robot.model_copy(update={"substeps": 2}), scene, clock_ns=CLOCK_NS
+        )
         self.names = names
         self.positions: list[Array] = []
         self.targets: list[Array] = []

@@ -23,7 +23,8 @@ PERIOD = 8
 
 
 class Course(NamedTuple):
-    """A smooth move from one place to another, (joints,) rad, from second 0 on: the minimum-jerk one."""
+    """A smooth move from one place to another, (joints,) rad, from second 0 on: the minimum-jerk
+    one."""
 
     start: Array
     goal: Array
@@ -33,7 +34,9 @@ class Course(NamedTuple):
         """Return position and velocity."""
         u = min(max(time_s / self.duration_s, 0.0), 1.0)
         way = self.goal - self.start
-        return self.start + way * u**3 * (10 - 15 * u + 6 * u * u), way * 30 * u * u * (1 - u) ** 2 / self.duration_s
+        return self.start + way * u**3 * (10 - 15 * u + 6 * u * u), way * 30 * u * u * (
+            1 - u
+        ) ** 2 / self.duration_s
 
 
 class Found(NamedTuple):
@@ -44,14 +47,19 @@ class Found(NamedTuple):
 
 
 class ServoRig:
-    """Runs executor and planner of the servo level tick by tick; the set points come from a function of time."""
+    """Runs executor and planner of the servo level tick by tick; the set points come from a
+    function of time."""
 
     executor: type[ServoExecutor] = ServoExecutor
     outside: Mapping[str, MessageType] = {"primitive.command": JOINT_SET_POINT}
     """Mailboxes that the test writes."""
 
-    def __init__(self, robot: RobotConfig, scene: SceneConfig, name: str = "", **params: Any) -> None:
-        board = BoardSpec("servo", 1, self.executor, ServoPlanner, PERIOD, above="primitive", params=params)
+    def __init__(
+        self, robot: RobotConfig, scene: SceneConfig, name: str = "", **params: Any
+    ) -> None:
+        board = BoardSpec(
+            "servo", 1, self.executor, ServoPlanner, PERIOD, above="primitive", params=params
+        )
         self.rack = Lockstep([board], robot, scene, outside=self.outside, name=name)
         self.command: Message = self.rack.message("primitive.command")
         self.command.opening, self.command.force, self.command.held = 0.04, 20.0, -1
@@ -83,7 +91,8 @@ class ServoRig:
         self.rack.write("primitive.command", self.command)
 
     def run(self, ticks: int, motion: Callable[[float], tuple[Array, Array]] | None = None) -> None:
-        """Run `ticks` ticks; while `motion` is given, set points for it come every `PERIOD` ticks, one period ahead."""
+        """Run `ticks` ticks; while `motion` is given, set points for it come every `PERIOD` ticks,
+        one period ahead."""
         for _ in range(ticks):
             if motion is not None and self.rack.tick % PERIOD == 0:
                 due = self.rack.tick + PERIOD

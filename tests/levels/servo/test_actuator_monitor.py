@@ -1,4 +1,5 @@
-"""The servo level when motors or torques fail: found in bounded cycles, limits kept; and the monitor by itself."""
+"""The servo level when motors or torques fail: found in bounded cycles, limits kept; and the
+monitor by itself."""
 
 from __future__ import annotations
 
@@ -79,7 +80,8 @@ def found(rig: ServoRig) -> list[int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize(
-    ("name", "joint"), [("puma560", joint) for joint in range(6)] + [("k1607", joint) for joint in (1, 3, 5)]
+    ("name", "joint"),
+    [("puma560", joint) for joint in range(6)] + [("k1607", joint) for joint in (1, 3, 5)],
 )
 def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
     name: str, joint: int, side: float
@@ -94,9 +96,12 @@ def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
 
 
 @pytest.mark.parametrize(
-    ("kind", "parameters"), [("actuator-off", {"joint": 1}), ("actuator-saturated", {"joint": 1, "part": 0.05})]
+    ("kind", "parameters"),
+    [("actuator-off", {"joint": 1}), ("actuator-saturated", {"joint": 1, "part": 0.05})],
 )
-def test_a_shoulder_that_loses_its_torque_at_rest_hardly_falls(kind: str, parameters: dict[str, float]) -> None:
+def test_a_shoulder_that_loses_its_torque_at_rest_hardly_falls(
+    kind: str, parameters: dict[str, float]
+) -> None:
     rig = ServoRig(*config("puma560"))
     rig.run(200)
     home = rig.status.position.copy()
@@ -125,7 +130,9 @@ def test_a_failed_motor_is_retried_and_set_points_are_followed_once_it_works() -
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
-def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(reaction: str, braked: int) -> None:
+def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(
+    reaction: str, braked: int
+) -> None:
     rig, dash = dashing("puma560", 0, 1.0, on_actuator_fault=reaction)
     rig.inject("actuator-saturated", joint=0, part=0.1)
     rig.run(195, dash.at)
@@ -163,7 +170,9 @@ def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torqu
     begun = rig.inject(kind, joint=0, **parameters)
     rig.run(cycles, dash.at)
     alarm = Alarm.COMMAND_INVALID if kind == "command-nan" else Alarm.COMMAND_LIMIT
-    assert [(f.tick, f.finding.alarm) for f in rig.found if f.finding.alarm is alarm] == [(begun, alarm)]
+    assert [(f.tick, f.finding.alarm) for f in rig.found if f.finding.alarm is alarm] == [
+        (begun, alarm)
+    ]
     assert (rig.status.stopped, rig.status.braked) == (1, 1)
     assert not rig.status.torque.any()
     rig.heal()
@@ -208,7 +217,8 @@ class Bench:
         self.monitor.look(RESTING, RESTING, self.terms, False)
 
     def leave(self, cycles: int, holds: bool = False, **left: float) -> list[Finding]:
-        """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is found."""
+        """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is
+        found."""
         over = REST.copy()
         for joint, torque in left.items():
             over[int(joint[1:]) - 1] = torque
@@ -224,7 +234,8 @@ class Bench:
 def test_a_part_that_is_pressed_on_its_support_is_no_motor_at_fault() -> None:
     bench = Bench()
     assert bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1) == []
-    # The arm has turned to it: only the wrist still presses, commanded a little more in every cycle.
+    # The arm has turned to it: only the wrist still presses, commanded a little more in every
+    # cycle.
     for cycle in range(40):
         assert bench.leave(1, j5=1.6 + 0.01 * cycle) == []
 

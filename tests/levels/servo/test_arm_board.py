@@ -20,7 +20,8 @@ LAST = f"servo_{JOINTS[-1]}"
 WARM_UP = 200
 """Ticks after which the arm swings."""
 NEAR_RAD = 1e-3
-"""Bound of the tracking error: the load is that of the set point, and the joints do not know of each other's motion."""
+"""Bound of the tracking error: the load is that of the set point, and the joints do not know of
+each other's motion."""
 
 
 def swinging(servos: Mapping[str, Mapping[str, Any]] = APART, **arm: float | str) -> JointRig:
@@ -133,7 +134,9 @@ def test_fault_between_level_and_arm_brakes_it_within_limits(
 
 def test_arm_is_not_released_towards_where_its_sensors_did_not_see_it() -> None:
     rig = JointRig(TOGETHER, following=0.01)
-    rig.run(WARM_UP + 60)  # at its fastest: blind, it is thought to stop earlier or later than it does
+    rig.run(
+        WARM_UP + 60
+    )  # at its fastest: blind, it is thought to stop earlier or later than it does
     rig.inject("sensor-dropout")
     rig.run(200)
     rig.heal()
@@ -170,7 +173,9 @@ def test_stop_brings_the_arm_to_rest_by_torques_before_it_is_braked() -> None:
     rig.run(400)
     ramp = np.flatnonzero(rig.braked[WARM_UP:])[0]
     assert 10 < ramp < 300
-    assert np.abs(np.diff(rig.positions[WARM_UP + ramp - 2 :], axis=0)).max() < 5e-5  # rad a tick: it creeps
+    assert (
+        np.abs(np.diff(rig.positions[WARM_UP + ramp - 2 :], axis=0)).max() < 5e-5
+    )  # rad a tick: it creeps
     assert all(rig.braked[WARM_UP + ramp :])
     rig.run(20)
     assert_goes_on(rig)

@@ -1,4 +1,5 @@
-"""The servo level's compiled functions: equal to their numpy selves, bit for bit, and loaded before the first cycle."""
+"""The servo level's compiled functions: equal to their numpy selves, bit for bit, and loaded before
+the first cycle."""
 
 from __future__ import annotations
 
@@ -9,15 +10,34 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, driver, reference, sensor_monitor
+from rack.levels.servo import (
+    ServoExecutor,
+    actuator_monitor,
+    control,
+    curves,
+    driver,
+    reference,
+    sensor_monitor,
+)
 from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control, joint_torques
 from tests.levels.arms import config
 from tests.levels.servo.joint_rig import APART, JointRig
 from tests.levels.servo.rig import Course, ServoRig
 
 JOINTS = 7
-MODULES = (curves, reference, sensor_monitor, actuator_monitor, control, driver, joint_control, joint_torques)
-FUNCTIONS = {name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)}
+MODULES = (
+    curves,
+    reference,
+    sensor_monitor,
+    actuator_monitor,
+    control,
+    driver,
+    joint_control,
+    joint_torques,
+)
+FUNCTIONS = {
+    name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)
+}
 
 
 def noise(seed: int, *shape: int) -> Array:
@@ -25,7 +45,8 @@ def noise(seed: int, *shape: int) -> Array:
 
 
 def sample_of(seed: int, error: float) -> tuple[Any, ...]:
-    """Return the arguments of `check` for a sample off by up to `error`, rad; one joint shows no change."""
+    """Return the arguments of `check` for a sample off by up to `error`, rad; one joint shows no
+    change."""
     estimate, passed_s = np.abs(noise(seed, 3, JOINTS)), 0.0025
     sample = estimate[:2] + 1e-3 * noise(seed + 1, 2, JOINTS)
     sample[1, seed % JOINTS] = estimate[1, seed % JOINTS]
@@ -34,9 +55,20 @@ def sample_of(seed: int, error: float) -> tuple[Any, ...]:
     last, rules = estimate[:2].copy(), np.full((3, JOINTS), 1e-4)
     last[0, seed % JOINTS] = sample[0, seed % JOINTS]
     motionless = np.abs(noise(seed + 3, 3, JOINTS)) * np.array([[9.0], [1e-3], [1e-5]])
-    table = np.concatenate((noise(seed, 2, JOINTS), last, estimate, rules, motionless, np.ones((6, JOINTS))))
+    table = np.concatenate(
+        (noise(seed, 2, JOINTS), last, estimate, rules, motionless, np.ones((6, JOINTS)))
+    )
     unusual = (0.01, 5.0) if seed % 11 == 0 else (0.0, 0.0)
-    return table, seed % 2 == 0, *sample, noise(seed + 4, 2, JOINTS), passed_s, *unusual, seed % 5 > 0, seed % 7 == 0
+    return (
+        table,
+        seed % 2 == 0,
+        *sample,
+        noise(seed + 4, 2, JOINTS),
+        passed_s,
+        *unusual,
+        seed % 5 > 0,
+        seed % 7 == 0,
+    )
 
 
 def table(seed: int) -> Array:
@@ -46,7 +78,9 @@ def table(seed: int) -> Array:
 def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     """Return the arguments of `left_over`."""
     before, inertia = noise(seed, 3, JOINTS), noise(seed + 1, 2, JOINTS, JOINTS)
-    table = np.concatenate((before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((5, JOINTS)), inertia[0]))
+    table = np.concatenate(
+        (before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((5, JOINTS)), inertia[0])
+    )
     return (
         table,
         200.0,
@@ -66,35 +100,67 @@ def wanted_of(seed: int, limit: float) -> tuple[Any, ...]:
 
 
 def joints_of(seed: int) -> tuple[Any, ...]:
-    """Return the arguments of `servo_joints`: its torques are cut, NaN, or neither; some joints are of other boards."""
+    """Return the arguments of `servo_joints`: its torques are cut, NaN, or neither; some joints are
+    of other boards."""
     limit, driven = (1.0, 1e5)[seed % 2], np.arange(JOINTS) % 2 == 0
     constants = np.outer((3600.0, 120.0, abs(noise(seed)[0]), limit, 0.0), np.ones(JOINTS))
     constants[4] = driven
     loads = np.abs(noise(seed + 1, 4, JOINTS)) * (np.nan if seed == 3 else 1.0)
     motion = noise(seed + 2, 2 * JOINTS), noise(seed + 3, 3, JOINTS)
-    return constants, loads, 0.4, 0.001, 0.002, *motion, noise(seed + 4, 3 * JOINTS), noise(seed + 5, 4 * JOINTS)
+    return (
+        constants,
+        loads,
+        0.4,
+        0.001,
+        0.002,
+        *motion,
+        noise(seed + 4, 3 * JOINTS),
+        noise(seed + 5, 4 * JOINTS),
+    )
 
 
 CASES: dict[str, list[tuple[Any, ...]]] = {
-    "set_motion": [(table(1), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS)) for ends_s in (0.01, 0.0135, np.inf)],
+    "set_motion": [
+        (table(1), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS))
+        for ends_s in (0.01, 0.0135, np.inf)
+    ],
     "set_bridge": [(table(3), 0.02, 0.02, 0.013, noise(4), noise(5), 0.02, table(6))],
     "is_within": [(table(7), 0.02, size * np.ones(JOINTS)) for size in (1e3, 1e5)],
-    "admit": [
-        (noise(k), noise(k + 1), -size, size, size) for k, size in ((1, np.ones(JOINTS)), (3, np.full(JOINTS, 9.0)))
-    ]
-    + [(np.full(JOINTS, np.nan), noise(1), noise(2), noise(3), noise(4))],
+    "admit": (
+        [
+            (noise(k), noise(k + 1), -size, size, size)
+            for k, size in ((1, np.ones(JOINTS)), (3, np.full(JOINTS, 9.0)))
+        ]
+        + [(np.full(JOINTS, np.nan), noise(1), noise(2), noise(3), noise(4))]
+    ),
     "check": [sample_of(seed, error) for seed in range(35) for error in (1e-6, 1e-2, np.nan)],
     "left_over": [
-        motion_of(k, following, size) for k in range(20) for following, size in ((0.02, 1), (9, 1), (9, 1e6))
+        motion_of(k, following, size)
+        for k in range(20)
+        for following, size in ((0.02, 1), (9, 1), (9, 1e6))
     ],
     "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
     "servo_joints": [joints_of(k) for k in range(4)],
     "add_up": [
-        (noise(k, 3 * JOINTS + 5), noise(k + 1, 3, JOINTS), size * noise(k + 2, 90), np.array([0, 30, 60]))
+        (
+            noise(k, 3 * JOINTS + 5),
+            noise(k + 1, 3, JOINTS),
+            size * noise(k + 2, 90),
+            np.array([0, 30, 60]),
+        )
         for k, size in ((1, 1.0), (2, 0.0))
     ],
     "show": [
-        (noise(1, 5 * JOINTS + 3), noise(2, 3 * JOINTS), noise(5), *noise(3, 2, 3, JOINTS), noise(4), 0.1, 0.2, 0.3)
+        (
+            noise(1, 5 * JOINTS + 3),
+            noise(2, 3 * JOINTS),
+            noise(5),
+            *noise(3, 2, 3, JOINTS),
+            noise(4),
+            0.1,
+            0.2,
+            0.3,
+        )
     ],
 }
 VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2, "add_up": 2}
@@ -109,12 +175,18 @@ def test_every_compiled_function_has_its_cases() -> None:
 def test_compiled_code_gives_the_bits_of_numpy(name: str) -> None:
     verdicts = set()
     for case in CASES[name]:
-        under_numpy, compiled_ = ([np.array(a, copy=True) if np.ndim(a) else a for a in case] for _ in range(2))
+        under_numpy, compiled_ = (
+            [np.array(a, copy=True) if np.ndim(a) else a for a in case] for _ in range(2)
+        )
         verdict = FUNCTIONS[name](*under_numpy)
         verdicts.add(verdict)
         assert FUNCTIONS[name].load()(*compiled_) == verdict
         for expected, found in zip(under_numpy, compiled_, strict=True):
-            assert np.array_equal(np.asarray(expected), np.asarray(found), equal_nan=np.asarray(expected).dtype != bool)
+            assert np.array_equal(
+                np.asarray(expected),
+                np.asarray(found),
+                equal_nan=np.asarray(expected).dtype != bool,
+            )
     assert len(verdicts) == VERDICTS.get(name, 1)
 
 

@@ -1,4 +1,5 @@
-"""Encoders with a resolution and noise: the samples of the arm, and the tolerance of the monitors."""
+"""Encoders with a resolution and noise: the samples of the arm, and the tolerance of the
+monitors."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ def move() -> Course:
 def test_samples_are_steps_of_the_resolution_a_joint_and_brakes_and_gate_see_the_truth() -> None:
     robot, scene = config("puma560")
     steps = (1e-3, 0.0, 1e-4, 1e-3, 1e-3, 1e-3)
-    robot = robot.model_copy(update={"sensors": SensorConfig(resolution=steps), "home": (0.1234567, *robot.home[1:])})
+    robot = robot.model_copy(
+        update={"sensors": SensorConfig(resolution=steps), "home": (0.1234567, *robot.home[1:])}
+    )
     arm = SimulatedArm(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS)
     position = arm.sense().position
     assert position[0] == pytest.approx(0.123, abs=1e-12)
@@ -59,7 +62,9 @@ def test_noise_is_that_of_its_tick_and_seed_and_has_its_size() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
 @pytest.mark.parametrize("resolution", [1e-5, 1e-4, 3e-4, 1e-3])
-def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resolution: float, noise: float) -> None:
+def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(
+    resolution: float, noise: float
+) -> None:
     robot, scene = config("puma560")
     rig = ServoRig(coarse(robot, resolution, noise), scene)
     rig.run(1000, move().at)
@@ -68,12 +73,16 @@ def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(resoluti
 
 
 @pytest.mark.timeout(200)
-def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     from tests.levels import whole_rack
 
     load = whole_rack.load
     monkeypatch.setattr(
-        whole_rack, "load", lambda name: (lambda c: c.model_copy(update={"robot": coarse(c.robot, 1e-3)}))(load(name))
+        whole_rack,
+        "load",
+        lambda name: (lambda c: c.model_copy(update={"robot": coarse(c.robot, 1e-3)}))(load(name)),
     )
     rack = WholeRack("nasrem")
     servo = rack.tasks["servo"].level
@@ -111,5 +120,7 @@ def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
 
 def test_a_list_of_another_length_is_refused_with_both_numbers(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1)))
-    with pytest.raises(RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one per joint: 2"):
+    with pytest.raises(
+        RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one per joint: 2"
+    ):
         build_cell(robot, config("puma560")[1], CLOCK_NS)

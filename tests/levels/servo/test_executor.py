@@ -16,7 +16,10 @@ from rack.levels.tables import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
 from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
 
-GOALS = {"puma560": [0.6, 1.0, -2.6, 0.4, -1.2, 0.5], "k1607": [0.6, -0.5, 0.3, -1.2, 0.4, -0.5, 0.5]}
+GOALS = {
+    "puma560": [0.6, 1.0, -2.6, 0.4, -1.2, 0.5],
+    "k1607": [0.6, -0.5, 0.3, -1.2, 0.4, -0.5, 0.5],
+}
 
 
 def rig_of(name: str, **params: float) -> ServoRig:
@@ -69,7 +72,9 @@ def test_before_any_set_point_the_arm_holds_home_with_the_gripper_open(name: str
     assert rig.status.position == pytest.approx(robot.home, abs=1e-3)
     assert rig.status.holding == 1
     assert rig.status.state == State.IDLE
-    assert rig.status.opening == pytest.approx(robot.gripper.open if robot.gripper else 0.0, abs=1e-3)
+    assert rig.status.opening == pytest.approx(
+        robot.gripper.open if robot.gripper else 0.0, abs=1e-3
+    )
 
 
 def test_motion_between_set_points_has_no_jump_in_velocity() -> None:
@@ -206,7 +211,12 @@ def test_equal_runs_give_equal_messages() -> None:
     for _ in range(2):
         rig = rig_of("puma560")
         rig.run(300, course("puma560").at)
-        raws.append([bytes(rig.rack.read(f"servo.{port}").raw) for port in ("status", "state", "scene", "plan")])
+        raws.append(
+            [
+                bytes(rig.rack.read(f"servo.{port}").raw)
+                for port in ("status", "state", "scene", "plan")
+            ]
+        )
     assert raws[0] == raws[1]
 
 
@@ -232,16 +242,26 @@ def test_an_unknown_parameter_is_refused_with_the_valid_ones() -> None:
 @pytest.mark.parametrize(
     "drives",
     [
-        '<motor joint="shoulder" gear="20" ctrlrange="-2 2"/><motor joint="elbow" ctrlrange="-20 20"/>',
-        '<position joint="shoulder" kp="900" kv="9" forcerange="-40 40"/>'
-        '<position joint="elbow" kp="90" forcerange="-20 20"/>',
-        '<general joint="shoulder" dyntype="filter" dynprm=".1" gainprm="9" forcerange="-40 40"/>'
-        '<velocity joint="elbow" kv="4" forcerange="-20 20"/>',
+        (
+            '<motor joint="shoulder" gear="20" ctrlrange="-2 2"/><motor joint="elbow"'
+            ' ctrlrange="-20 20"/>'
+        ),
+        (
+            '<position joint="shoulder" kp="900" kv="9" forcerange="-40 40"/>'
+            '<position joint="elbow" kp="90" forcerange="-20 20"/>'
+        ),
+        (
+            '<general joint="shoulder" dyntype="filter" dynprm=".1" gainprm="9" forcerange="-40'
+            ' 40"/><velocity joint="elbow" kv="4" forcerange="-20 20"/>'
+        ),
     ],
 )
 def test_a_foreign_arm_follows_by_its_config_alone(tmp_path: Path, drives: str) -> None:
     robot = pendulum(tmp_path, drives)
-    rig, move = ServoRig(robot, SceneConfig()), Course(np.array(robot.home), np.array([-0.5, 1.2]), 1.5)
+    rig, move = (
+        ServoRig(robot, SceneConfig()),
+        Course(np.array(robot.home), np.array([-0.5, 1.2]), 1.5),
+    )
     rig.run(200)
     assert rig.status.position == pytest.approx(robot.home, abs=1e-4)
     rig = ServoRig(robot, SceneConfig())
@@ -262,7 +282,9 @@ def grasping(tmp_path: Path) -> ServoRig:
     """A servo level whose gripper closes on a weight that starts to fall between the fingers."""
     robot, _ = config("puma560")
     model = tmp_path / "weight.xml"
-    model.write_text((ROBOTS / "puma560.xml").read_text().replace("<worldbody>", f"<worldbody>{WEIGHT}", 1))
+    model.write_text(
+        (ROBOTS / "puma560.xml").read_text().replace("<worldbody>", f"<worldbody>{WEIGHT}", 1)
+    )
     rig = ServoRig(robot.model_copy(update={"model": model}), SceneConfig(objects=("weight",)))
     rig.command.opening, rig.command.force, rig.command.held = 0.0, 40.0, 0
     return rig

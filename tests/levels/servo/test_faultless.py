@@ -1,4 +1,5 @@
-"""Without a fault nothing is found: whole tasks with contacts and payloads, missed cycles, restarted boards."""
+"""Without a fault nothing is found: whole tasks with contacts and payloads, missed cycles,
+restarted boards."""
 
 from __future__ import annotations
 
@@ -13,11 +14,14 @@ from tests.levels.whole_rack import WholeRack
 
 BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
 
-pytestmark = pytest.mark.timeout(300)  # half a minute of an arm's time each, on a machine that others use as well
+pytestmark = pytest.mark.timeout(
+    300
+)  # half a minute of an arm's time each, on a machine that others use as well
 
 
 def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[int, Finding]]:
-    """Run to the end of the task; with a seed, cycles are missed and boards start anew at random."""
+    """Run to the end of the task; with a seed, cycles are missed and boards start anew at
+    random."""
     found: list[tuple[int, Finding]] = []
     rng = np.random.default_rng(seed)
     while rack.seconds < most_s and rack.task.state not in (State.DONE, State.ERROR):
@@ -28,7 +32,11 @@ def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[i
                 rack.restart(str(rng.choice(["servo", "servo.planner", "world", "task.planner"])))
             rack.step()
             servo = rack.tasks["servo"].level
-            found += [(rack.tick - 1, finding) for finding in servo.findings if finding.alarm not in BRAKES]
+            found += [
+                (rack.tick - 1, finding)
+                for finding in servo.findings
+                if finding.alarm not in BRAKES
+            ]
             servo.findings.clear()
     return found
 

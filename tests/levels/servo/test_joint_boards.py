@@ -1,4 +1,5 @@
-"""Parts of boards that servo joints, and of the arm's: loads on the way between references, torques added up."""
+"""Parts of boards that servo joints, and of the arm's: loads on the way between references, torques
+added up."""
 
 from __future__ import annotations
 
@@ -32,7 +33,11 @@ def reference(due: int, inertia: float, load: float) -> Message:
 def torque(sampled: int, joint: int, newton_metres: float) -> Message:
     message = Message(JOINT_TORQUE.dtype(SIZES))
     message.sampled = sampled
-    message.torque[joint], message.target[joint], message.target_velocity[joint] = newton_metres, 0.1 * joint, 0.2
+    message.torque[joint], message.target[joint], message.target_velocity[joint] = (
+        newton_metres,
+        0.1 * joint,
+        0.2,
+    )
     return message
 
 
@@ -41,7 +46,8 @@ def joint_torques() -> JointTorques:
     robot, scene = config("puma560")
     pace = {"fast": Pace(1, 1), "slow": Pace(2, 1)}
     return JointTorques(
-        LevelContext("arm", 1, 1, CLOCK_NS, 0, robot, scene, {}, SIZES, pace), build_cell(robot, scene, CLOCK_NS)
+        LevelContext("arm", 1, 1, CLOCK_NS, 0, robot, scene, {}, SIZES, pace),
+        build_cell(robot, scene, CLOCK_NS),
     )
 
 
@@ -58,7 +64,9 @@ def test_loads_go_evenly_from_one_reference_to_the_next() -> None:
     assert (begin[:, 0].tolist(), end[:, 0].tolist()) == ([2.0, 5.0], [4.0, 9.0])
 
 
-def test_loads_of_an_arm_that_holds_are_computed_where_it_is_and_again_only_far_from_there() -> None:
+def test_loads_of_an_arm_that_holds_are_computed_where_it_is_and_again_only_far_from_there() -> (
+    None
+):
     puma = cell("puma560")
     loads, still = JointLoads(puma), np.zeros(6)
     loads.hold(puma.home)
@@ -83,7 +91,9 @@ def test_an_arm_that_holds_a_part_carries_it() -> None:
     assert np.abs(loaded.table[1] - empty.table[1]).max() > 1.0
 
 
-@pytest.mark.parametrize(("inertia", "load"), [(0.0, 1.0), (math.nan, 1.0), (math.inf, 1.0), (1.0, math.nan)])
+@pytest.mark.parametrize(
+    ("inertia", "load"), [(0.0, 1.0), (math.nan, 1.0), (math.inf, 1.0), (1.0, math.nan)]
+)
 def test_a_reference_on_which_no_torque_can_rest_is_not_taken(inertia: float, load: float) -> None:
     assert JointLoads.are_good(reference(20, 1.0, 1.0))
     assert not JointLoads.are_good(reference(20, inertia, load))
@@ -91,7 +101,12 @@ def test_a_reference_on_which_no_torque_can_rest_is_not_taken(inertia: float, lo
 
 def test_torques_of_all_boards_are_added_up() -> None:
     torques, fast, slow = joint_torques(), torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0)
-    slow.grip_force, slow.payload_mass, slow.payload_offset, slow.operator = 12.0, 0.3, (0.0, 0.1, 0.2), 4
+    slow.grip_force, slow.payload_mass, slow.payload_offset, slow.operator = (
+        12.0,
+        0.3,
+        (0.0, 0.1, 0.2),
+        4,
+    )
     assert torques.missing(readings(fast, slow), TICK, since=0) == ""
     torques.add_up()
     assert torques.torque.tolist() == [7.0, 0.0, 0.0, 0.0, 0.0, -3.0]
@@ -121,7 +136,11 @@ MISSING: dict[str, tuple[Callable[[dict[str, Reading]], object], int, str]] = {
         0,
         "stale torque from board 'slow': based on a status more than 7 ticks old",
     ),
-    "from before the brakes engaged": (lambda read: None, TICK - 2, "braked until the boards above have seen it"),
+    "from before the brakes engaged": (
+        lambda read: None,
+        TICK - 2,
+        "braked until the boards above have seen it",
+    ),
 }
 
 

@@ -17,7 +17,13 @@ from rack.levels.level import Finding, LevelContext
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.servo.common_modifications import DeadZone, JointPd, Notch
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.modification import Hook, LawContext, LawSample, ModifiableParams, Modification
+from rack.levels.servo.modification import (
+    Hook,
+    LawContext,
+    LawSample,
+    ModifiableParams,
+    Modification,
+)
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from tests.levels.arms import cell, config
 
@@ -111,17 +117,25 @@ class Bench:
     """A law of one number: torque = 3 N m + 10 N m/rad times the position wanted, modified."""
 
     def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
-        tables = {n: {"class": HERE + m} if isinstance(m, str) else m for n, m in modifications.items()}
+        tables = {
+            n: {"class": HERE + m} if isinstance(m, str) else m for n, m in modifications.items()
+        }
         robot, scene = config("puma560")
         context = LevelContext("servo", 1, 1, TICK_NS, 0, robot, scene, {}, {})
         self.findings: list[Finding] = []
-        params = ModifiableParams.model_validate({"modifications": tables, "transfer": TRANSFER_TICKS * TICK_NS * 1e-9})
+        params = ModifiableParams.model_validate(
+            {"modifications": tables, "transfer": TRANSFER_TICKS * TICK_NS * 1e-9}
+        )
         self.law = ModifiedLaw(context, params, LIMITS, self.findings)
         self.tick = 0
 
     def switch(self, name: str, is_on: bool) -> str:
         message = Message(OPERATOR_COMMAND.dtype({}))
-        message.what, message.name, message.goal = Operation.MODIFY, name, Goal.ON if is_on else Goal.OFF
+        message.what, message.name, message.goal = (
+            Operation.MODIFY,
+            name,
+            Goal.ON if is_on else Goal.OFF,
+        )
         return self.law.obey(message)
 
     def run(self, samples: int, wanted: Callable[[int], float] = lambda tick: 0.0) -> Array:
@@ -130,7 +144,9 @@ class Bench:
         for _ in range(samples):
             motion = Motion(np.zeros((3, JOINTS)))
             motion.position[:] = wanted(self.tick)
-            found.append(self.law.torque(self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick))[2])
+            found.append(
+                self.law.torque(self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick))[2]
+            )
             self.tick += 1
         return np.array(found)
 
@@ -148,7 +164,9 @@ def test_without_a_modification_put_in_the_torque_is_the_laws() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "after"), [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)], ids=["after", "before", "instead"]
+    ("name", "after"),
+    [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)],
+    ids=["after", "before", "instead"],
 )
 def test_a_switch_begins_at_the_last_torque_and_goes_over_to_the_modified_law_in_the_transfer_time(
     name: str, after: float
@@ -171,7 +189,14 @@ def test_a_switch_begins_at_the_last_torque_and_goes_over_to_the_modified_law_in
 def test_no_step_at_any_switch_under_motion(name: str) -> None:
     bench, torque = Bench(it=name), [Bench(it=name).run(1, swing)]
     # Also while the transfer before it lasts.
-    for samples, is_on in ((40, True), (120, False), (20, True), (10, False), (80, True), (200, False)):
+    for samples, is_on in (
+        (40, True),
+        (120, False),
+        (20, True),
+        (10, False),
+        (80, True),
+        (200, False),
+    ):
         torque.append(bench.run(samples, swing))
         bench.switch("it", is_on)
     steps = np.abs(np.diff(np.concatenate(torque)))
@@ -229,7 +254,10 @@ def test_one_that_raises_is_undone_and_taken_out_in_the_same_sample() -> None:
     # The failure itself is a switch: no step.
     assert np.abs(np.diff(torque)).max() < 0.1
     assert bench.findings == [Finding(Alarm.MODIFICATION, 0)]
-    assert bench.law.reason == "modification 'raises' taken out: ZeroDivisionError: left nothing; modified by half"
+    assert (
+        bench.law.reason
+        == "modification 'raises' taken out: ZeroDivisionError: left nothing; modified by half"
+    )
     bench.switch("raises", False)
     assert bench.law.reason == "modified by half"
 
@@ -248,7 +276,10 @@ def test_one_whose_result_is_not_finite_is_taken_out_and_the_law_goes_on(name: s
 
 
 def test_an_unknown_name_is_refused() -> None:
-    assert Bench(half="Half", nine="Nine").switch("third", True) == "no modification 'third'; permitted: half, nine"
+    assert (
+        Bench(half="Half", nine="Nine").switch("third", True)
+        == "no modification 'third'; permitted: half, nine"
+    )
 
 
 def law_of(**params: Any) -> LawContext:
@@ -262,7 +293,9 @@ def sample_of(**vectors: float) -> LawSample:
     return sample
 
 
-@pytest.mark.parametrize(("error", "seen"), [(0.0005, 0.0), (-0.0005, 0.0), (0.003, 0.002), (-0.003, -0.002)])
+@pytest.mark.parametrize(
+    ("error", "seen"), [(0.0005, 0.0), (-0.0005, 0.0), (0.003, 0.002), (-0.003, -0.002)]
+)
 def test_a_dead_zone_hides_small_errors_and_reduces_larger_ones(error: float, seen: float) -> None:
     sample = sample_of(position=1.0, wanted_position=1.0 + error)
     DeadZone(law_of(width=0.001)).modify(sample)
@@ -270,15 +303,21 @@ def test_a_dead_zone_hides_small_errors_and_reduces_larger_ones(error: float, se
 
 
 def test_pd_control_is_each_joints_own_with_its_load_or_without() -> None:
-    sample = sample_of(wanted_position=0.1, wanted_velocity=0.2, inertia=2.0, load=7.0, torque=np.nan)
+    sample = sample_of(
+        wanted_position=0.1, wanted_velocity=0.2, inertia=2.0, load=7.0, torque=np.nan
+    )
     JointPd(law_of(bandwidth=10.0, damping=0.5)).modify(sample)
     assert sample.torque == pytest.approx(2.0 * (100.0 * 0.1 + 10.0 * 0.2) + 7.0)
     JointPd(law_of(bandwidth=10.0, damping=0.5, load=False)).modify(sample)
     assert sample.torque == pytest.approx(24.0)
 
 
-@pytest.mark.parametrize(("frequency", "least", "most"), [(60.0, 0.0, 0.02), (3.0, 0.99, 1.01), (200.0, 0.9, 1.01)])
-def test_a_notch_removes_its_frequency_and_passes_others(frequency: float, least: float, most: float) -> None:
+@pytest.mark.parametrize(
+    ("frequency", "least", "most"), [(60.0, 0.0, 0.02), (3.0, 0.99, 1.01), (200.0, 0.9, 1.01)]
+)
+def test_a_notch_removes_its_frequency_and_passes_others(
+    frequency: float, least: float, most: float
+) -> None:
     notch, sample, passed = Notch(law_of(frequency=60.0)), sample_of(torque=5.0), []
     notch.begin(sample)
     for tick in range(1000):
@@ -293,7 +332,9 @@ def test_a_notch_begins_without_a_transient_and_lies_below_half_the_rate() -> No
     notch.begin(sample)
     notch.modify(sample)
     assert sample.torque == pytest.approx(5.0)
-    with pytest.raises(LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"):
+    with pytest.raises(
+        LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"
+    ):
         Notch(law_of(frequency=500.0))
 
 
@@ -309,15 +350,27 @@ def test_a_modification_that_assigns_a_vector_fills_it() -> None:
 
 MISTAKES = {
     "no class": ({"class": COMMON + "Notsch"}, "has no class 'Notsch'"),
-    "another class": ({"class": "rack.levels.servo:ServoExecutor"}, "'ServoExecutor' is not a subclass of"),
+    "another class": (
+        {"class": "rack.levels.servo:ServoExecutor"},
+        "'ServoExecutor' is not a subclass of",
+    ),
     "half a class": ({"class": HERE + "Unfinished"}, "class 'Unfinished' lacks: modify"),
-    "no hook": ({"class": HERE + "Hookless"}, "class 'Hookless' has the hook None; permitted: before, instead, after"),
+    "no hook": (
+        {"class": HERE + "Hookless"},
+        "class 'Hookless' has the hook None; permitted: before, instead, after",
+    ),
     "unknown hook": (
         {"class": HERE + "Later"},
         "class 'Later' has the hook 'later'; permitted: before, instead, after",
     ),
-    "params of one without": ({"class": HERE + "Half", "params": {"gain": 2.0}}, "'Half' takes no params; remove them"),
-    "params": ({"class": COMMON + "DeadZone", "params": {"width": -1.0}}, "params.width = -1.0: input should be"),
+    "params of one without": (
+        {"class": HERE + "Half", "params": {"gain": 2.0}},
+        "'Half' takes no params; remove them",
+    ),
+    "params": (
+        {"class": COMMON + "DeadZone", "params": {"width": -1.0}},
+        "params.width = -1.0: input should be",
+    ),
     "unknown key": ({"class": HERE + "Half", "onn": True}, "Extra inputs"),
 }
 
@@ -336,7 +389,9 @@ class Later(Hookless):
 
 
 @pytest.mark.parametrize(("table", "expected"), MISTAKES.values(), ids=MISTAKES)
-def test_a_table_of_a_modification_is_checked_with_its_class(table: Mapping[str, Any], expected: str) -> None:
+def test_a_table_of_a_modification_is_checked_with_its_class(
+    table: Mapping[str, Any], expected: str
+) -> None:
     with pytest.raises(ValueError, match=re.escape(expected)):
         ModifiableParams.model_validate({"modifications": {"it": table}})
 

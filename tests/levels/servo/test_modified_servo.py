@@ -50,7 +50,11 @@ def test_a_law_is_replaced_under_motion_without_a_step_and_the_arm_follows_its_c
     before = torques(rig, 300)
     serial = operator.modify("servo", "pd", True)
     replaced = torques(rig, 200)
-    assert (rig.status.order, rig.status.answer, rig.status.operator) == (serial, Answer.DONE, serial)
+    assert (rig.status.order, rig.status.answer, rig.status.operator) == (
+        serial,
+        Answer.DONE,
+        serial,
+    )
     assert (rig.status.state, rig.status.reason) == (State.EXECUTING, "modified by pd")
     assert replaced[0] == pytest.approx(before[-1], abs=1e-12)
     assert not np.allclose(replaced[-1], before[-1], atol=0.1)

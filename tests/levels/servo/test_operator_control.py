@@ -1,4 +1,5 @@
-"""The servo level under an operator: it holds, goes to set points within its limits, and comes back the way it went."""
+"""The servo level under an operator: it holds, goes to set points within its limits, and comes back
+the way it went."""
 
 from __future__ import annotations
 
@@ -30,7 +31,11 @@ def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None
     assert np.abs(rig.status.target_velocity).max() > 0.1
     serial = Operator(rig.rack).say("servo", Operation.HOLD)
     rig.run(1, COURSE.at)
-    assert (rig.status.order, rig.status.operator, rig.status.answer) == (serial, serial, Answer.TAKEN)
+    assert (rig.status.order, rig.status.operator, rig.status.answer) == (
+        serial,
+        serial,
+        Answer.TAKEN,
+    )
     rig.run(2 * SECOND, COURSE.at)
     held = rig.status.position.copy()
     rig.run(SECOND, COURSE.at)
@@ -55,7 +60,11 @@ def test_after_a_hold_set_points_are_followed_again(rig: ServoRig) -> None:
     rig.run(SECOND // 2, COURSE.at)
     serial = operator.say("servo", Operation.RESUME)
     rig.run(3 * SECOND, COURSE.at)
-    assert (rig.status.order, rig.status.answer, rig.status.standing) == (serial, Answer.DONE, Operation.NONE)
+    assert (rig.status.order, rig.status.answer, rig.status.standing) == (
+        serial,
+        Answer.DONE,
+        Operation.NONE,
+    )
     assert (rig.status.holding, rig.status.stopped) == (0, 0)
     assert np.abs(rig.status.position - COURSE.goal).max() < 1e-3
 
@@ -92,7 +101,11 @@ def test_from_its_set_points_the_arm_returns_the_same_way(rig: ServoRig) -> None
         rig.run(2 * SECOND)
     operator.say("servo", Operation.RESUME)
     rig.run(1)
-    assert (rig.status.answer, rig.status.standing, rig.status.stopped) == (Answer.TAKEN, Operation.NONE, 1)
+    assert (rig.status.answer, rig.status.standing, rig.status.stopped) == (
+        Answer.TAKEN,
+        Operation.NONE,
+        1,
+    )
     began = len(rig.targets)
     rig.run(3 * SECOND)
     assert (rig.status.answer, rig.status.stopped) == (Answer.DONE, 0)
@@ -112,7 +125,9 @@ def test_a_hold_on_the_way_to_a_set_point_stops_there(rig: ServoRig) -> None:
     assert_within_limits(np.array(rig.targets))
 
 
-def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force(rig: ServoRig) -> None:
+def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force(
+    rig: ServoRig,
+) -> None:
     operator = Operator(rig.rack)
     operator.say("servo", Operation.HOLD)
     rig.run(SECOND // 2, COURSE.at)
@@ -150,7 +165,8 @@ def test_a_restarted_board_continues_with_the_command_in_force(rig: ServoRig) ->
 
 
 def assert_within_limits(targets: Array) -> None:
-    """Hold the reference, (ticks, joints), rad, against the limits of planned motion, by differences."""
+    """Hold the reference, (ticks, joints), rad, against the limits of planned motion, by
+    differences."""
     velocity = np.diff(targets, axis=0) / TICK_S
     acceleration = np.diff(velocity, axis=0) / TICK_S
     assert (np.abs(velocity) <= LIMITS.velocity * 1.001).all()

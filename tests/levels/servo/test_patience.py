@@ -1,4 +1,5 @@
-"""Every fault of the arm ends within its bound: recovered from when it is over in time, else latched with its cause."""
+"""Every fault of the arm ends within its bound: recovered from when it is over in time, else
+latched with its cause."""
 
 from __future__ import annotations
 
@@ -98,7 +99,9 @@ def test_a_fault_of_any_joint_that_outlasts_the_patience_is_latched_with_its_cau
     assert rig.status.reason.endswith("; not over within 0.3 s")
     if kind != "sensor-dropout":
         assert f"'j{joint + 1}'" in rig.status.reason
-        assert next(f.finding.subject for f in rig.found if f.finding.alarm is Alarm.LATCHED) == joint
+        assert (
+            next(f.finding.subject for f in rig.found if f.finding.alarm is Alarm.LATCHED) == joint
+        )
     rig.heal()
     rig.run(100, swing)
     assert (rig.status.state, rig.status.braked) == (State.ERROR, 1)
@@ -112,7 +115,9 @@ def test_a_wait_names_its_cause_and_the_tick_at_which_it_ends() -> None:
     assert rig.status.reason.startswith("sensor of 'j3' reads -")
     assert rig.status.reason.endswith(f"off by 0.31; latched at tick {begun + PATIENCE_TICKS - 1}")
     rig.run(PATIENCE_TICKS, swing)
-    assert [f.tick for f in rig.found if f.finding.alarm is Alarm.LATCHED] == [begun + PATIENCE_TICKS - 1]
+    assert [f.tick for f in rig.found if f.finding.alarm is Alarm.LATCHED] == [
+        begun + PATIENCE_TICKS - 1
+    ]
 
 
 def test_a_latched_fault_outlasts_a_restart_of_the_board() -> None:
@@ -123,7 +128,11 @@ def test_a_latched_fault_outlasts_a_restart_of_the_board() -> None:
     rig.heal()
     rig.restart()
     rig.run(60, swing)
-    assert (rig.status.state, rig.status.error, rig.status.reason) == (State.ERROR, Error.SENSORS, reason)
+    assert (rig.status.state, rig.status.error, rig.status.reason) == (
+        State.ERROR,
+        Error.SENSORS,
+        reason,
+    )
 
 
 def test_a_recurring_fault_is_latched_as_well() -> None:
@@ -141,7 +150,10 @@ def test_a_demand_on_the_arm_uses_up_no_patience_and_is_the_reason() -> None:
     rig.inject("sensor-nan", joint=1)
     rig.rack.demand = Demand.BRAKE
     rig.run(2 * PATIENCE_TICKS, swing)
-    assert (rig.status.state, rig.status.reason.split(" on ")[0]) == (State.HOLDING, "demand 'brake'")
+    assert (rig.status.state, rig.status.reason.split(" on ")[0]) == (
+        State.HOLDING,
+        "demand 'brake'",
+    )
     rig.heal()
     rig.rack.demand = Demand.NONE
     rig.run(30, swing)
@@ -155,7 +167,11 @@ def test_sensors_trusted_again_report_the_offset_found() -> None:
     thought = rig.status.position.copy()
     rig.heal()
     rig.run(30, swing)
-    offsets = {f.finding.subject: f.finding.value for f in rig.found if f.finding.alarm is Alarm.RE_REFERENCED}
+    offsets = {
+        f.finding.subject: f.finding.value
+        for f in rig.found
+        if f.finding.alarm is Alarm.RE_REFERENCED
+    }
     assert offsets
     assert all(abs(offset) < 0.03 for offset in offsets.values())
     for joint, offset in offsets.items():
@@ -181,7 +197,7 @@ def test_nasrem_continues_after_all_sensors_were_stuck_for_half_a_second() -> No
     assert rack.move.done > done
 
 
-def test_a_stuck_sensor_taken_for_a_failing_motor_is_trusted_again_where_the_joint_has_crept_to() -> None:
+def test_a_stuck_sensor_taken_for_a_failing_motor_is_trusted_again_where_the_joint_is() -> None:
     speed = np.full(6, 0.02)  # at once: a joint that does not start looks like a motor at fault
     rig = ServoRig(ROBOT, SCENE, patience=5.0, retry=0.05)
     rig.run(60, lambda time_s: (HOME, 0.0 * speed))

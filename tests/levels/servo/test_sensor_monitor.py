@@ -1,4 +1,5 @@
-"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the arm is."""
+"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the
+arm is."""
 
 from __future__ import annotations
 
@@ -129,7 +130,9 @@ def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
 
 
 @pytest.mark.parametrize("speed", [2e-4, 2e-3, 2e-2])
-def test_a_stuck_sensor_is_found_before_its_joint_runs_away_however_slow_the_set_points_are(speed: float) -> None:
+def test_a_stuck_sensor_is_found_before_its_joint_runs_away_however_slow_the_set_points_are(
+    speed: float,
+) -> None:
     rig, home = ServoRig(*config("puma560")), move().start
     rig.run(60, lambda _: (home, np.zeros(6)))
     begun, slow = rig.inject("sensor-stuck", joint=-1), np.full(6, speed)
@@ -175,7 +178,11 @@ def test_a_bias_at_rest_is_not_accepted_because_another_sensor_was_faulty_before
     rig, home = ServoRig(*config("puma560")), move().start
     rig.run(200, lambda _: (home, np.zeros(6)))
     for joint in (0, 4):
-        rig.inject("sensor-nan" if joint == 0 else "sensor-bias", joint=joint, **({"size": 0.03} if joint else {}))
+        rig.inject(
+            "sensor-nan" if joint == 0 else "sensor-bias",
+            joint=joint,
+            **({"size": 0.03} if joint else {}),
+        )
         rig.run(60, lambda _: (home, np.zeros(6)))
         assert rig.status.stopped == 1
         rig.heal()
@@ -189,10 +196,16 @@ def test_an_offset_too_small_to_matter_is_accepted_at_rest() -> None:
     rig.run(400, slow.at)
     rig.inject("sensor-bias", size=3e-4, joint=0)
     rig.run(100, slow.at)
-    assert (rig.alarms(*BRAKES), rig.status.stopped) == ([Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED], 0)
+    assert (rig.alarms(*BRAKES), rig.status.stopped) == (
+        [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED],
+        0,
+    )
     rig.heal()
     rig.run(100, slow.at)
-    assert (rig.alarms(*BRAKES), rig.status.stopped) == ([Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED] * 2, 0)
+    assert (rig.alarms(*BRAKES), rig.status.stopped) == (
+        [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED] * 2,
+        0,
+    )
 
 
 def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:
@@ -223,7 +236,8 @@ def test_with_known_velocities_the_arm_may_ramp_to_rest_instead(reaction: str, b
 
 
 def delay(kind: str, size: float, cycles: int = 200) -> int | None:
-    """Return the cycles from a fault of this size until it is found; None: it is not in `cycles`."""
+    """Return the cycles from a fault of this size until it is found; None: it is not in
+    `cycles`."""
     rig = rig_under_way()
     begun = rig.inject(kind, size=size, joint=1)
     rig.run(cycles, move().at)

@@ -1,4 +1,5 @@
-"""The servo level stops on a demand and when something hits the arm: a collision, named by geoms, is nobody's fault."""
+"""The servo level stops on a demand and when something hits the arm: a collision, named by geoms,
+is nobody's fault."""
 
 from __future__ import annotations
 
@@ -60,17 +61,26 @@ def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_br
     assert rig.status.pushed > 0
     rig.run(400, motion)
     assert (rig.status.stopped, rig.status.braked, rig.status.state) == (0, 0, State.EXECUTING)
-    assert [f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES] == [Alarm.COLLISION]
+    assert [f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES] == [
+        Alarm.COLLISION
+    ]
 
 
 @pytest.mark.slow
 def test_a_lasting_contact_is_latched_with_the_names_of_both_geoms() -> None:
     rig = under_fire(HAND, 0.2, 4.0)
     rig.run(1200, turn)
-    assert (rig.status.state, rig.status.error, rig.status.braked) == (State.ERROR, Error.TOUCHED, 1)
+    assert (rig.status.state, rig.status.error, rig.status.braked) == (
+        State.ERROR,
+        Error.TOUCHED,
+        1,
+    )
     assert rig.status.reason.startswith("unintended contact: '")
     assert "'post'" in rig.status.reason
-    assert {f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES} == {Alarm.COLLISION, Alarm.LATCHED}
+    assert {f.finding.alarm for f in rig.found if f.finding.alarm not in BRAKES} == {
+        Alarm.COLLISION,
+        Alarm.LATCHED,
+    }
 
 
 def test_a_limit_that_the_arm_itself_breaks_is_a_violation_with_or_without_a_blow() -> None:
@@ -99,7 +109,9 @@ def test_a_brake_demand_engages_the_brakes_in_its_own_cycle() -> None:
     rig.run(1, move.at)
     status = rig.status
     assert (status.stopped, status.braked, status.holding, status.demand) == (1, 1, 1, Demand.BRAKE)
-    assert status.reason == "demand 'brake' on the arm, until boards and emergency stop are in order"
+    assert (
+        status.reason == "demand 'brake' on the arm, until boards and emergency stop are in order"
+    )
     assert not status.torque.any()
     rig.run(200, move.at)
     assert np.abs(rig.status.velocity).max() < 1e-3
@@ -130,7 +142,9 @@ def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 @pytest.mark.parametrize("ticks", [1, 30, 300])
-def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(demand: Demand, ticks: int) -> None:
+def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(
+    demand: Demand, ticks: int
+) -> None:
     rig, move = rig_under_way()
     limits = np.array(config("puma560")[0].acceleration)
     rig.rack.demand = demand
@@ -159,7 +173,9 @@ def test_an_arm_braked_from_the_start_stays_where_it_is_without_an_alarm() -> No
 
 
 @pytest.mark.parametrize(("missed", "seen"), [(1, None), (2, 2), (40, 40)])
-def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(missed: int, seen: int | None) -> None:
+def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(
+    missed: int, seen: int | None
+) -> None:
     rig, move = rig_under_way()
     rig.miss(missed)
     rig.run(100, move.at)
@@ -169,18 +185,24 @@ def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(
 
 
 @pytest.mark.parametrize("missed", [2, 3, 40])
-def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_their_time(missed: int) -> None:
+def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_their_time(
+    missed: int,
+) -> None:
     rig, move = rig_under_way()
     begun = rig.rack.tick
     rig.miss(missed)
     rig.run(missed + 5, move.at)
     # The last torque was given a tick before, and the motors kept it for two.
-    closed, opened = (Alarm.BRAKES_CLOSED, NO_TORQUE, missed), (Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1)
+    closed, opened = (
+        (Alarm.BRAKES_CLOSED, NO_TORQUE, missed),
+        (Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1),
+    )
     assert rig.found == [(begun + missed, closed), (begun + missed, opened)]
 
 
 @pytest.mark.parametrize(
-    ("kind", "why"), [("sensor-nan", Error.SENSORS), ("actuator-off", Error.MOTORS), ("command-nan", Error.LIMIT)]
+    ("kind", "why"),
+    [("sensor-nan", Error.SENSORS), ("actuator-off", Error.MOTORS), ("command-nan", Error.LIMIT)],
 )
 def test_brakes_say_which_fault_engaged_them(kind: str, why: Error) -> None:
     rig, move = rig_under_way()

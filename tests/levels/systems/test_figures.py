@@ -22,7 +22,12 @@ def context(**params: Any) -> LevelContext:
 
 
 def ports(**inputs: Message | None) -> Ports:
-    return Ports(**{name: Reading(m, Verdict.NEW if m is not None else Verdict.NONE) for name, m in inputs.items()})
+    return Ports(
+        **{
+            name: Reading(m, Verdict.NEW if m is not None else Verdict.NONE)
+            for name, m in inputs.items()
+        }
+    )
 
 
 def plan_of(tick: int) -> Message:
@@ -49,11 +54,19 @@ def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
 def test_several_times_are_taken_in_turn_cycle_by_cycle() -> None:
     executor = FigureExecutor(context(process_ms=[6.0, 1.0]))
     # A cycle that is skipped takes its turn with it.
-    assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [True, False, False, True]
+    assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [
+        True,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_an_executor_reports_which_plan_is_in_force() -> None:
-    executor, write = FigureExecutor(context(process_ms=0.0)), Ports(status=Message(FIGURE_STATUS.dtype({})))
+    executor, write = (
+        FigureExecutor(context(process_ms=0.0)),
+        Ports(status=Message(FIGURE_STATUS.dtype({}))),
+    )
     executor.process(ports(plan=None), write, 8)
     assert (write.status.cycle, write.status.plan, write.status.state) == (8, -1, State.EXECUTING)
     executor.process(ports(plan=plan_of(4)), write, 12)
@@ -61,7 +74,11 @@ def test_an_executor_reports_which_plan_is_in_force() -> None:
 
 
 def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
-    planner, write, status = FigurePlanner(context(plan_ms=4.0)), plan_of(-1), Message(FIGURE_STATUS.dtype({}))
+    planner, write, status = (
+        FigurePlanner(context(plan_ms=4.0)),
+        plan_of(-1),
+        Message(FIGURE_STATUS.dtype({})),
+    )
     status.cycle = 8
     assert planner.wanted(ports(status=None), 0)
     start = process_time_ns()

@@ -90,9 +90,17 @@ def test_object_is_turned_as_wanted(start: Rehearsal) -> None:
 @pytest.mark.parametrize(
     ("action", "code", "words"),
     [
-        ({**TRANSFER, "to": [1.2, 0.0, 0.475]}, Error.UNREACHABLE, "would be over 'floor'; supports: 'table'"),
+        (
+            {**TRANSFER, "to": [1.2, 0.0, 0.475]},
+            Error.UNREACHABLE,
+            "would be over 'floor'; supports: 'table'",
+        ),
         ({**TRANSFER, "to": [0.5, -0.2, 0.9]}, Error.UNREACHABLE, "425 mm above 'table'"),
-        ({**TRANSFER, "to": [0.5, -0.2, 0.44]}, Error.UNREACHABLE, "35 mm deep in 'table'; valid z: 0.475"),
+        (
+            {**TRANSFER, "to": [0.5, -0.2, 0.44]},
+            Error.UNREACHABLE,
+            "35 mm deep in 'table'; valid z: 0.475",
+        ),
         ({**TRANSFER, "to": [0.9, 0.5, 0.475]}, Error.UNREACHABLE, "out of reach: ["),
         ({**TRANSFER, "to": [0.65, 0.3, 0.475]}, Error.NO_PATH, "'block1' and 'block2'"),
         ({"do": "goto", "position": [0.5, 0.0, 0.6]}, Error.NO_PATH, "'wall'"),
@@ -116,7 +124,10 @@ def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Reh
     on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
     buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
     assert "action 0, pick block1: '" in str(refusal(buried, TRANSFER))
-    taken = replace(start, situation=start.situation.with_body(BLOCK2, Pose(np.array(TRANSFER["to"]), on_block1[1])))
+    taken = replace(
+        start,
+        situation=start.situation.with_body(BLOCK2, Pose(np.array(TRANSFER["to"]), on_block1[1])),
+    )
     assert "action 0, place block1 at [0.5, -0.2, 0.475]: '" in str(refusal(taken, TRANSFER))
 
 
@@ -157,7 +168,9 @@ def refused_run() -> WholeRack:
 
 
 @pytest.mark.slow
-def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(refused_run: WholeRack) -> None:
+def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(
+    refused_run: WholeRack,
+) -> None:
     status = refused_run.task
     earliest = refused_run.read("task.plan").earliest
     assert (status.state, status.error) == (State.ERROR, Error.TOO_LATE)
@@ -187,7 +200,11 @@ def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() ->
     rack = WholeRack(actions=[{**HOME, "by": 20.0}])
     planner = rack.tasks["task.planner"].level
     assert isinstance(planner, TaskPlanner)
-    home = Move(1, 0, Verb.MOVE_JOINTS, None, Pose(np.zeros(3), np.zeros(4)), np.zeros(6), False, 0.0)
+    home = Move(
+        1, 0, Verb.MOVE_JOINTS, None, Pose(np.zeros(3), np.zeros(4)), np.zeros(6), False, 0.0
+    )
     for offset in np.random.default_rng(1).uniform(-20.0, 0.0, 200):
         planner._ahead_s = float(offset)  # the move is slowed down to end just in time
-        planner._promise(planner._with_times([Rehearsed(home, 1.0)]), 0.0, Message(TASK_PLAN.dtype(rack.sizes)))
+        planner._promise(
+            planner._with_times([Rehearsed(home, 1.0)]), 0.0, Message(TASK_PLAN.dtype(rack.sizes))
+        )

@@ -1,4 +1,5 @@
-"""The task level alone: the test plays its planner and the level below, or the arm and the world."""
+"""The task level alone: the test plays its planner and the level below, or the arm and the
+world."""
 
 from __future__ import annotations
 
@@ -10,7 +11,15 @@ import pytest
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, Ports
-from rack.levels.messages import MOVE_STATUS, SERVO_STATUS, TASK_COMMAND, TASK_PLAN, WINDOW, WORLD_MODEL, Error
+from rack.levels.messages import (
+    MOVE_STATUS,
+    SERVO_STATUS,
+    TASK_COMMAND,
+    TASK_PLAN,
+    WINDOW,
+    WORLD_MODEL,
+    Error,
+)
 from rack.levels.task import TaskExecutor, TaskPlanner
 from tests.levels.arms import cell, config
 from tests.levels.box import lose_some
@@ -83,7 +92,10 @@ def test_error_below_names_the_action_that_it_ended() -> None:
     bench = Bench(HOME, HOME)
     bench.plan([0, 1])
     bench.cycle(done=1, state=State.ERROR, error=Error.FOLLOWING, reason="joint 2 strays")
-    assert (bench.status.error, bench.status.reason) == (Error.FOLLOWING, "action 1: joint 2 strays")
+    assert (bench.status.error, bench.status.reason) == (
+        Error.FOLLOWING,
+        "action 1: joint 2 strays",
+    )
 
 
 def test_action_that_is_late_is_an_error() -> None:
@@ -99,7 +111,10 @@ def test_action_that_is_late_is_an_error() -> None:
 
 
 def test_task_that_stands_still_ends_with_who_is_in_the_way() -> None:
-    bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
+    bench, below = (
+        Bench(HOME, stalled_s=5.0),
+        {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"},
+    )
     bench.plan([0])
     bench.cycle(current=1, progress=0.1)
     assert bench.status.state == State.EXECUTING
@@ -129,7 +144,9 @@ def test_task_without_a_plan_ends_and_says_so() -> None:
     assert "no plan" in bench.status.reason
 
 
-@pytest.mark.parametrize(("current", "why"), [(1, "move 1 is under way"), (0, "no path yet for move 1")])
+@pytest.mark.parametrize(
+    ("current", "why"), [(1, "move 1 is under way"), (0, "no path yet for move 1")]
+)
 def test_task_that_nobody_holds_says_what_it_waits_for(current: int, why: str) -> None:
     bench = Bench(HOME, stalled_s=5.0)
     bench.plan([0])
@@ -139,7 +156,10 @@ def test_task_that_nobody_holds_says_what_it_waits_for(current: int, why: str) -
 
 
 def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> None:
-    bench, below = Bench(HOME, stalled_s=5.0), {"state": State.HOLDING, "reason": "primitive held by the operator"}
+    bench, below = (
+        Bench(HOME, stalled_s=5.0),
+        {"state": State.HOLDING, "reason": "primitive held by the operator"},
+    )
     bench.plan([0])
     for _ in range(10):
         bench.cycle(current=1, operated=1, **below)
@@ -176,7 +196,8 @@ class Obedient(Executor):
 
 
 class PlannedBench(Lockstep):
-    """Executor and planner of the task level; the arm is at home, and resting objects are seen from tick `seen` on."""
+    """Executor and planner of the task level; the arm is at home, and resting objects are seen from
+    tick `seen` on."""
 
     def __init__(self, *actions: Mapping[str, Any], seen: int = 4) -> None:
         outside = {"servo.status": SERVO_STATUS, "world.model": WORLD_MODEL}
@@ -198,7 +219,8 @@ class PlannedBench(Lockstep):
         self.write("world.model", world)
 
     def run_to_end(self) -> tuple[Message, int]:
-        """Run until the task is done or 20 s have passed; return its status, and how often a plan was published."""
+        """Run until the task is done or 20 s have passed; return its status, and how often a plan
+        was published."""
         self.run(20.0, until=lambda rack: rack.read("task.status").state == State.DONE)
         return self.read("task.status"), self.boxes["task.plan"].at(self.tick)[0]
 
@@ -208,7 +230,9 @@ class PlannedBench(Lockstep):
     [(True, 40, 1), (True, 900, 1), (False, 40, 1)],
     ids=["plan on its way", "plan followed", "plan never made"],
 )
-def test_planner_that_is_lost_plans_again_only_what_was_lost(finished: bool, away_ticks: int, published: int) -> None:
+def test_planner_that_is_lost_plans_again_only_what_was_lost(
+    finished: bool, away_ticks: int, published: int
+) -> None:
     bench = PlannedBench(HOME)
     bench.after(500, lambda: bench.lose("task.planner", away_ticks, finished))
     status, plans = bench.run_to_end()

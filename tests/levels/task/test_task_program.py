@@ -47,7 +47,11 @@ def test_actions_of_every_kind_are_read() -> None:
 
 @pytest.mark.parametrize(
     ("task", "robot"),
-    [("around-the-wall", "puma560"), ("around-the-wall", "puma560_crossing"), ("k1607-tour", "k1607")],
+    [
+        ("around-the-wall", "puma560"),
+        ("around-the-wall", "puma560_crossing"),
+        ("k1607-tour", "k1607"),
+    ],
 )
 def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> None:
     table = tomllib.loads((TASKS / f"{task}.toml").read_text())["task"]
@@ -63,14 +67,23 @@ def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> Non
             {"do": "transfer", "object": "cup", "to": [0.5, 0.3, 0.5]},
             'task.action[0].object = "cup": not in the scene; objects: block1, block2, peg',
         ),
-        ({"do": "transfer", "object": "peg"}, "task.action[0].to: missing; where the object's origin goes, m"),
+        (
+            {"do": "transfer", "object": "peg"},
+            "task.action[0].to: missing; where the object's origin goes, m",
+        ),
         (
             {"do": "home", "by": 0},
-            "task.action[0].by = 0: should be greater than 0; simulated time by which the action must be done, s",
+            (
+                "task.action[0].by = 0: should be greater than 0; simulated time by which the"
+                " action must be done, s"
+            ),
         ),
         ({"do": "home", "speed": 2}, "task.action[0].speed = 2: unknown key; known: by, do"),
         ({"do": "goto"}, "task.action[0]: a goto has either position or joints"),
-        ({"do": "goto", "joints": [0, 0]}, "task.action[0].joints = [0.0, 0.0]: 2 values; permitted: 6, one per joint"),
+        (
+            {"do": "goto", "joints": [0, 0]},
+            "task.action[0].joints = [0.0, 0.0]: 2 values; permitted: 6, one per joint",
+        ),
         (
             {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},
             "task.action[0]: direction is all zero; its length must not be zero",
@@ -81,7 +94,9 @@ def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> Non
         ),
     ],
 )
-def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(action: dict[str, Any], line: str) -> None:
+def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(
+    action: dict[str, Any], line: str
+) -> None:
     assert mistake(action) == line
 
 
@@ -92,7 +107,9 @@ def test_all_mistakes_are_told_at_once() -> None:
 def test_transfer_needs_a_gripper() -> None:
     robot, scene = config("k1607")
     with pytest.raises(ProgramError, match="the robot has no gripper; permitted: goto, home"):
-        read_program({"action": [{"do": "transfer", "object": "peg", "to": [0, 0, 0]}]}, robot, scene)
+        read_program(
+            {"action": [{"do": "transfer", "object": "peg", "to": [0, 0, 0]}]}, robot, scene
+        )
 
 
 def test_table_without_actions_is_an_empty_program() -> None:

@@ -31,7 +31,9 @@ def residual(cycle_ns: int, executions_ns: tuple[int, ...]) -> float:
         (2, "=", 3, False),
     ],
 )
-def test_a_relation_is_as_true_as_its_sides_make_it(left: int, sign: str, right: int, holds: bool) -> None:
+def test_a_relation_is_as_true_as_its_sides_make_it(
+    left: int, sign: str, right: int, holds: bool
+) -> None:
     relation = Relation(left, sign, right)
     assert (relation.holds, bool(relation), relation.margin) == (holds, holds, right - left)
 
@@ -58,7 +60,11 @@ def test_figure_3_one_processor_with_6_ms_cycles_has_no_plan_within_three_cycles
 
 
 def test_figure_4_two_processors_with_6_ms_cycles_plan_in_time() -> None:
-    assert timing.fits_cycle(max(EXECUTE), PLANNER_EXCHANGE + READ + WRITE, 6 * MS) == (6 * MS, "<=", 6 * MS)
+    assert timing.fits_cycle(max(EXECUTE), PLANNER_EXCHANGE + READ + WRITE, 6 * MS) == (
+        6 * MS,
+        "<=",
+        6 * MS,
+    )
     assert timing.plan_fits_loose(PLAN + UPDATE, 2, 6 * MS) == (7 * MS, "<=", 12 * MS)
     assert not timing.plan_fits_loose(PLAN + UPDATE, 1, 6 * MS)
 

@@ -1,4 +1,5 @@
-"""Static cyclic schedules: the places of boards in their frames, and boards that do not fit in them."""
+"""Static cyclic schedules: the places of boards in their frames, and boards that do not fit in
+them."""
 
 from __future__ import annotations
 
@@ -42,7 +43,11 @@ def test_a_board_that_is_at_work_when_the_next_begins_has_negative_slack_and_fai
     rack = timing("board.fast.budget.process_ms=1.1")
     even, odd = core_frames(rack)
     assert places(even)[0] == (*places(odd)[0][:3], "even") == ("fast", 0, -0.14, "even")
-    failing = [(v.subject, v.left, v.right, v.meaning) for v in verdicts(rack) if v.equation == FRAMES and not v.holds]
+    failing = [
+        (v.subject, v.left, v.right, v.meaning)
+        for v in verdicts(rack)
+        if v.equation == FRAMES and not v.holds
+    ]
     assert failing == [
         ("fast", 1.14 * MS, 1.0 * MS, "done before 'even' begins, in frame 0"),
         ("fast", 1.14 * MS, 1.0 * MS, "done before 'odd' begins, in frame 1"),
@@ -63,6 +68,9 @@ def test_the_clock_takes_its_part_of_every_place_on_its_core() -> None:
 
 
 def test_planners_have_no_place_in_frames() -> None:
-    planner = ("board.even.planner=rack.levels.systems.figures:FigurePlanner", "board.even.coupling=tight")
+    planner = (
+        "board.even.planner=rack.levels.systems.figures:FigurePlanner",
+        "board.even.coupling=tight",
+    )
     even, _ = core_frames(timing(*planner, "board.even.budget.plan_ms=5.0"))
     assert [name for name, *_ in places(even)] == ["fast", "even"]

@@ -1,4 +1,5 @@
-"""A rack as plain data: its chains, its longest cycles, and the verdicts on the paper's figure 3."""
+"""A rack as plain data: its chains, its longest cycles, and the verdicts on the paper's figure
+3."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ FIGURE_3 = BoardTiming(
 
 
 def rack(*boards: BoardTiming, goal_ns: float | None = None) -> RackTiming:
-    return RackTiming(False, 1.0, 2 * MS, CLOCK, {board.name: board for board in boards}, 0, 0.2, goal_ns)
+    return RackTiming(
+        False, 1.0, 2 * MS, CLOCK, {board.name: board for board in boards}, 0, 0.2, goal_ns
+    )
 
 
 def board(name: str, every: int, above: str = "", below: str = "") -> BoardTiming:
@@ -40,7 +43,11 @@ def board(name: str, every: int, above: str = "", below: str = "") -> BoardTimin
 
 
 def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
-    failing = {(verdict.equation, verdict.subject) for verdict in verdicts(rack(FIGURE_3)) if not verdict.holds}
+    failing = {
+        (verdict.equation, verdict.subject)
+        for verdict in verdicts(rack(FIGURE_3))
+        if not verdict.holds
+    }
     assert failing == {("3.8", "level"), ("response time", "level.planner"), ("load", "core 1")}
     # The paper's own way out: cycles of 8 ms, figure 2.
     longer = rack(FIGURE_3).changed("level", every=4, within_cycles=2)
@@ -48,12 +55,16 @@ def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
 
 
 def test_a_planner_has_the_ceiling_of_its_executor_only_in_a_critical_section() -> None:
-    planners = [rack(replace(FIGURE_3, is_critical=critical)).tasks[1] for critical in (True, False)]
+    planners = [
+        rack(replace(FIGURE_3, is_critical=critical)).tasks[1] for critical in (True, False)
+    ]
     assert [(planner.ceiling, planner.locked_ns) for planner in planners] == [(80, MS), (0, 0)]
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
-    timing = rack(board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7))
+    timing = rack(
+        board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7)
+    )
     assert timing.chains == (("top", "a"), ("top", "b"))
     assert timing.hierarchy.chains == (("top", "b"),)
     assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
@@ -63,10 +74,20 @@ JOINTS = tuple(f"joint{k}" for k in range(1, 7))
 
 
 def arm_of(*joints: str, every: int = 4, goal_ns: float | None = None) -> RackTiming:
-    """A board a joint between a trajectory level, which has a planner's board above it, and the board of the arm."""
+    """A board a joint between a trajectory level, which has a planner's board above it, and the
+    board of the arm."""
     names = " ".join(joints)
-    boards = [board("plan", 200, below="path"), board("path", 20, "plan", names), board("arm", 2, names)]
-    return rack(*boards, *(board(name, every, "path", "arm") for name in joints), board("alone", 500), goal_ns=goal_ns)
+    boards = [
+        board("plan", 200, below="path"),
+        board("path", 20, "plan", names),
+        board("arm", 2, names),
+    ]
+    return rack(
+        *boards,
+        *(board(name, every, "path", "arm") for name in joints),
+        board("alone", 500),
+        goal_ns=goal_ns,
+    )
 
 
 def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
@@ -129,12 +150,16 @@ def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() 
         ((), ""),
     ],
 )
-def test_numbered_names_are_shortened_only_if_none_is_left_out(names: tuple[str, ...], text: str) -> None:
+def test_numbered_names_are_shortened_only_if_none_is_left_out(
+    names: tuple[str, ...], text: str
+) -> None:
     assert spanned(names) == text
 
 
 def test_a_goal_for_the_response_is_divided_among_the_levels() -> None:
-    timing = rack(board("top", 40, below="a"), board("a", 4, "top"), board("alone", 7), goal_ns=30 * 2.0 * MS)
+    timing = rack(
+        board("top", 40, below="a"), board("a", 4, "top"), board("alone", 7), goal_ns=30 * 2.0 * MS
+    )
     assert timing.longest_cycles == {"top": 15, "a": 15, "alone": 7}
 
 
@@ -146,13 +171,17 @@ def test_boards_without_a_budget_are_named_and_not_judged() -> None:
 
 def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
     assert FIGURE_3.budget is not None
-    silent = replace(FIGURE_3, name="silent", budget=replace(FIGURE_3.budget, plan_ns=0), core=2, planner_core=2)
+    silent = replace(
+        FIGURE_3, name="silent", budget=replace(FIGURE_3.budget, plan_ns=0), core=2, planner_core=2
+    )
     plain = replace(silent, name="plain", has_planner=False, core=3)
     notes = Forecast.of(rack(FIGURE_3, silent, plain, board("unknown", 4))).notes
     assert [note for note in notes if note.startswith("planner not judged")] == [
         "planner not judged, no plan_ms in the budget: silent"
     ]
-    assert not any("planner not judged" in note for note in Forecast.of(rack(FIGURE_3, plain)).notes)
+    assert not any(
+        "planner not judged" in note for note in Forecast.of(rack(FIGURE_3, plain)).notes
+    )
 
 
 def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
@@ -161,11 +190,17 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     ordinary = replace(FIGURE_3, planner_priority=70)
     assert Forecast.of(replace(counted, boards={"level": ordinary})).notes == ()
     notes = Forecast.of(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
-    expected = ("in lockstep", "times are of the wall clock: speed 2", "cores are those of the config")
+    expected = (
+        "in lockstep",
+        "times are of the wall clock: speed 2",
+        "cores are those of the config",
+    )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
     # Without a budget there is nothing to say about times.
-    bare = Forecast.of(replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False).notes
+    bare = Forecast.of(
+        replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False
+    ).notes
     assert [note.partition(" ")[0] for note in bare] == ["no", "the"]
     # Two ordinary tasks that compute share a core; one has it to itself.
     both = replace(FIGURE_3, priority=0, planner_priority=0)

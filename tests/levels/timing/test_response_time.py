@@ -1,4 +1,5 @@
-"""Worst-case response times against published examples, and against schedules drawn out unit by unit."""
+"""Worst-case response times against published examples, and against schedules drawn out unit by
+unit."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ PERIODS = (4, 5, 6, 8, 10, 12, 15, 20, 24)
 
 
 class Plain(NamedTuple):
-    """A task in whole units of time; those of a set stand in the order of their priorities, highest first."""
+    """A task in whole units of time; those of a set stand in the order of their priorities, highest
+    first."""
 
     cost: int
     period: int
@@ -26,10 +28,12 @@ class Plain(NamedTuple):
 
 
 def seen(tasks: list[Plain], blocked: int = 0) -> list[int]:
-    """Draw the schedule of queueing jobs, unit by unit, until nothing is left to do; return the longest responses.
+    """Draw the schedule of queueing jobs, unit by unit, until nothing is left to do; return the
+    longest responses.
 
-    It is the worst case: all tasks become known at 0, as late after their release as their jitter allows, and never
-    again that late; a part that cannot be preempted has taken the core just before, until `blocked`.
+    It is the worst case: all tasks become known at 0, as late after their release as their jitter
+    allows, and never again that late; a part that cannot be preempted has taken the core just
+    before, until `blocked`.
     """
     queues: list[list[list[int]]] = [[] for _ in tasks]  # the jobs of each task: release, time left
     worst, made, now = [0] * len(tasks), [0] * len(tasks), 0
@@ -55,11 +59,16 @@ def analysed(tasks: list[Plain], blocked: int = 0, queueing: bool = True) -> lis
 
 
 def drawn(draw: random.Random, full: bool = False, jitter: bool = False) -> list[Plain]:
-    """Return a random set of tasks that one processor has time for, fully loaded only if that is wanted."""
+    """Return a random set of tasks that one processor has time for, fully loaded only if that is
+    wanted."""
     while True:
         tasks = [Plain(draw.randint(1, 6), draw.choice(PERIODS)) for _ in range(draw.randint(2, 5))]
         if sum(120 // t.period * t.cost for t in tasks) < 120 + full:
-            return [t._replace(jitter=draw.randint(0, 2 * t.period)) for t in tasks] if jitter else tasks
+            return (
+                [t._replace(jitter=draw.randint(0, 2 * t.period)) for t in tasks]
+                if jitter
+                else tasks
+            )
 
 
 def timed(name: str, core: int, priority: int, every: int, *parts: Part, **more: int) -> TimedTask:
@@ -73,10 +82,12 @@ def computing(time: int) -> Part:
 @pytest.mark.parametrize(
     ("tasks", "expected"),
     [
-        # A. Burns and A. Wellings, Real-Time Systems and Programming Languages: process sets B and C, rate monotonic.
+        # A. Burns and A. Wellings, Real-Time Systems and Programming Languages: process sets B and
+        # C, rate monotonic.
         ([Plain(3, 7), Plain(3, 12), Plain(5, 20)], [3, 6, 20]),
         ([Plain(5, 20), Plain(10, 40), Plain(40, 80)], [5, 15, 80]),
-        # J. Lehoczky, Fixed Priority Scheduling of Periodic Task Sets with Arbitrary Deadlines (1990), table 1.
+        # J. Lehoczky, Fixed Priority Scheduling of Periodic Task Sets with Arbitrary Deadlines
+        # (1990), table 1.
         ([Plain(26, 70), Plain(62, 100)], [26, 118]),
     ],
 )
@@ -186,7 +197,10 @@ def test_ordinary_tasks_wait_for_those_with_a_priority() -> None:
 def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
     update = Part(Unit.UPDATE, 3, preemptible=False)
     planner = timed("level.planner", 0, 5, 40, Part(Unit.PLAN, 6), update, ceiling=20)
-    tasks = [timed(name, 0, priority, 40, computing(1)) for name, priority in (("above", 21), ("own", 20), ("low", 4))]
+    tasks = [
+        timed(name, 0, priority, 40, computing(1))
+        for name, priority in (("above", 21), ("own", 20), ("low", 4))
+    ]
     tasks.append(planner)
     assert {task.name: blocking_ns(task, tasks) for task in tasks} == {
         "above": 0,
@@ -198,7 +212,10 @@ def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
 
 
 def test_jitter_of_a_timed_task_counts() -> None:
-    tasks = [timed("high", 0, 20, 10, computing(4), jitter_ns=3), timed("low", 0, 10, 40, computing(4))]
+    tasks = [
+        timed("high", 0, 20, 10, computing(4), jitter_ns=3),
+        timed("low", 0, 10, 40, computing(4)),
+    ]
     # The second job of the high one may come 7 after the first.
     assert response_times(tasks) == {"high": 7, "low": 12}
 
@@ -212,7 +229,10 @@ def test_no_schedule_of_executors_and_planners_goes_beyond_the_bound() -> None:
     draw, attained = random.Random(14), 0
     for _ in range(SETS):
         switch, tasks = draw.randint(0, 1), levels_drawn(draw)
-        bounds, periods = response_times(tasks, switch), {task.name: task.period_ns for task in tasks}
+        bounds, periods = (
+            response_times(tasks, switch),
+            {task.name: task.period_ns for task in tasks},
+        )
         for job in simulate(tasks, 480, switch).jobs:
             bound = bounds[job.task]
             # A task that was late once may take up its next release late.
@@ -224,19 +244,26 @@ def test_no_schedule_of_executors_and_planners_goes_beyond_the_bound() -> None:
 
 
 def levels_drawn(draw: random.Random) -> list[TimedTask]:
-    """Return levels on two cores, of different priorities, with planners whose update keeps their executor out."""
+    """Return levels on two cores, of different priorities, with planners whose update keeps their
+    executor out."""
     tasks, priorities = [], iter(draw.sample(range(50, 99), 3))
     for name, priority in zip(("task", "primitive", "servo"), priorities, strict=True):
         core, every, within = draw.randint(0, 1), draw.choice(PERIODS), draw.randint(1, 4)
         tasks.append(timed(name, core, priority, every, computing(draw.randint(1, 3))))
-        parts = Part(Unit.PLAN, draw.randint(1, 6)), Part(Unit.UPDATE, 1, preemptible=draw.random() < 0.5)
+        parts = (
+            Part(Unit.PLAN, draw.randint(1, 6)),
+            Part(Unit.UPDATE, 1, preemptible=draw.random() < 0.5),
+        )
         own, ceiling = priority - 49, 0 if parts[1].preemptible else priority
-        tasks.append(TimedTask(f"{name}.planner", name, "planner", core, own, every, parts, within, ceiling))
+        tasks.append(
+            TimedTask(f"{name}.planner", name, "planner", core, own, every, parts, within, ceiling)
+        )
     return tasks
 
 
 def stepped(tasks: list[TimedTask], until: int) -> dict[str, int] | None:
-    """Return the longest response of each task, by giving the processor away unit by unit; None if one is late."""
+    """Return the longest response of each task, by giving the processor away unit by unit; None if
+    one is late."""
     left: dict[str, tuple[int, int]] = {}
     worst = dict.fromkeys((task.name for task in tasks), 0)
     for now in range(until):
@@ -258,11 +285,15 @@ def stepped(tasks: list[TimedTask], until: int) -> dict[str, int] | None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_with_phases_responses_are_those_of_the_schedule_and_never_longer_than_without(seed: int) -> None:
+def test_with_phases_responses_are_those_of_the_schedule_and_never_longer_than_without(
+    seed: int,
+) -> None:
     draw, exact = random.Random(seed), 0
     for _ in range(SETS):
         plain = drawn(draw)
-        together = [timed(f"t{at}", 0, 9 - at, t.period, computing(t.cost)) for at, t in enumerate(plain)]
+        together = [
+            timed(f"t{at}", 0, 9 - at, t.period, computing(t.cost)) for at, t in enumerate(plain)
+        ]
         tasks = [replace(task, phase_ns=draw.randrange(task.every_ns)) for task in together]
         found, bound = response_times(tasks), response_times(together)
         expected = stepped(tasks, 360)

@@ -15,16 +15,23 @@ C, R, X, W, P, U = Unit
 
 
 def parts(text: str, locked: str = "") -> tuple[Part, ...]:
-    """Return parts of so many units of time each, as in "R1 X2 W1"; those of `locked` are not preemptible."""
+    """Return parts of so many units of time each, as in "R1 X2 W1"; those of `locked` are not
+    preemptible."""
     return tuple(Part(Unit(p[0]), int(p[1:]), p[0] not in locked) for p in text.split())
 
 
-def executor(text: str, every: int, priority: int = 80, core: int = 1, name: str = "level") -> TimedTask:
+def executor(
+    text: str, every: int, priority: int = 80, core: int = 1, name: str = "level"
+) -> TimedTask:
     return TimedTask(name, name, "executor", core, priority, every, parts(text))
 
 
-def planner(text: str, every: int, cycles: int, core: int = 1, ceiling: int = 80, name: str = "level") -> TimedTask:
-    return TimedTask(f"{name}.planner", name, "planner", core, 0, every, parts(text, "U"), cycles, ceiling)
+def planner(
+    text: str, every: int, cycles: int, core: int = 1, ceiling: int = 80, name: str = "level"
+) -> TimedTask:
+    return TimedTask(
+        f"{name}.planner", name, "planner", core, 0, every, parts(text, "U"), cycles, ceiling
+    )
 
 
 def row(chart: Chart, core: int = 1) -> str:
@@ -79,8 +86,16 @@ def test_figure_4_with_a_longer_executor_misses_every_cycle() -> None:
 
 def test_a_late_task_takes_the_newest_release_and_skips_the_others() -> None:
     chart = simulate([executor("X25", 10)], 60)
-    # Done at 25 and at 45: the releases of 10 and of 30 have passed, those of 20 and 40 are the newest.
-    assert ends(chart, "level") == [(0, 25), (10, None), (20, 50), (30, None), (40, None), (50, None)]
+    # Done at 25 and at 45: the releases of 10 and of 30 have passed, those of 20 and 40 are the
+    # newest.
+    assert ends(chart, "level") == [
+        (0, 25),
+        (10, None),
+        (20, 50),
+        (30, None),
+        (40, None),
+        (50, None),
+    ]
     assert [job.release_ns for job in chart.late("level")] == [0, 10, 20, 30, 40, 50]
 
 
@@ -93,7 +108,7 @@ def test_a_planner_that_is_done_early_waits_for_the_end_of_its_slice() -> None:
     assert row(simulate([planner("P1", 2, 3)], 13)) == "P-----P-----P"
 
 
-def test_a_planner_that_lost_more_than_its_slice_skips_to_the_oldest_release_that_has_not_passed() -> None:
+def test_a_planner_that_lost_more_than_its_slice_skips_to_the_oldest_release_still_ahead() -> None:
     # One unit of five is left to it: a plan of seven lasts 35, far beyond its slice of 10.
     chart = simulate((executor("X4", 5), planner("P7", 5, 2)), 110)
     assert ends(chart, "level.planner") == [(0, 35), (30, 70), (65, 105), (100, None)]
@@ -122,7 +137,8 @@ def test_equal_priorities_take_their_turns_by_release_then_by_name() -> None:
 
 def test_every_job_costs_two_context_switches() -> None:
     chart = simulate(FIG_2, 16, context_switch_ns=1)
-    # in, R X W, out; in, P; in, R X W, out; P: the rest of two cycles is six units, one of them a switch.
+    # in, R X W, out; in, P; in, R X W, out; P: the rest of two cycles is six units, one of them a
+    # switch.
     assert row(chart) == "-RXXW--P-RXXW-PP"
     assert ends(chart, "level") == [(0, 5), (8, 13)]
     assert [job.end_ns for job in chart.late("level.planner")] == [None]
@@ -147,7 +163,10 @@ def random_tasks(seed: int) -> list[TimedTask]:
     tasks = []
     for at in range(chance.randint(1, 3)):
         every, priority = chance.randint(4, 20), chance.choice((10, 20, 30, 40))
-        text = f"R{chance.randint(0, 1)} X{chance.randint(1, max(1, every // 3))} W{chance.randint(0, 2)}"
+        text = (
+            f"R{chance.randint(0, 1)} X{chance.randint(1, max(1, every // 3))}"
+            f" W{chance.randint(0, 2)}"
+        )
         name = f"level{at}"
         tasks.append(executor(text, every, priority, name=name))
         if chance.random() < 0.7:
@@ -157,10 +176,14 @@ def random_tasks(seed: int) -> list[TimedTask]:
     return tasks
 
 
-def step_by_step(tasks: Sequence[TimedTask], until: int) -> tuple[list[str], dict[tuple[str, int], int]]:
-    """Return the task and part computing in each unit of time, "X of a", and the end of every job by task and release.
+def step_by_step(
+    tasks: Sequence[TimedTask], until: int
+) -> tuple[list[str], dict[tuple[str, int], int]]:
+    """Return the task and part computing in each unit of time, "X of a", and the end of every job
+    by task and release.
 
-    It is written from the rules alone, unit by unit: slow, and too simple to be wrong in the same way.
+    It is written from the rules alone, unit by unit: slow, and too simple to be wrong in the same
+    way.
     """
     todo: dict[str, list[tuple[str, bool, bool]]] = {task.name: [] for task in tasks}
     release = {task.name: -1 for task in tasks}
@@ -179,7 +202,9 @@ def step_by_step(tasks: Sequence[TimedTask], until: int) -> tuple[list[str], dic
             release[name] = max(free_from[name], newest - late_by[name])
             late_by[name] = (task.within_cycles - 1) * task.every_ns
             for part in task.parts:
-                units = [(part.unit.value, not part.preemptible, at > 0) for at in range(part.time_ns)]
+                units = [
+                    (part.unit.value, not part.preemptible, at > 0) for at in range(part.time_ns)
+                ]
                 todo[name] += units
         letter, _, _ = todo[name].pop(0)
         row.append(f"{letter} of {name}")
@@ -189,7 +214,9 @@ def step_by_step(tasks: Sequence[TimedTask], until: int) -> tuple[list[str], dic
     return row, ends
 
 
-def place(task: TimedTask, todo: list[tuple[str, bool, bool]], since: int) -> tuple[int, int, int, str]:
+def place(
+    task: TimedTask, todo: list[tuple[str, bool, bool]], since: int
+) -> tuple[int, int, int, str]:
     """Return the order in which tasks get the core; the lowest does."""
     is_locked = bool(todo) and todo[0][1] and todo[0][2]
     priority = max(task.priority, task.ceiling) if is_locked else task.priority
@@ -206,9 +233,13 @@ def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
         found = ["-"] * until
         for span in chart.spans:
             assert set(found[span.start_ns : span.end_ns]) == {"-"}
-            found[span.start_ns : span.end_ns] = [f"{span.unit.value} of {span.task}"] * (span.end_ns - span.start_ns)
+            found[span.start_ns : span.end_ns] = [f"{span.unit.value} of {span.task}"] * (
+                span.end_ns - span.start_ns
+            )
         assert found == expected
-        assert {(job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None} == ended
+        assert {
+            (job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None
+        } == ended
 
 
 SPANS = (
@@ -228,7 +259,10 @@ def test_a_job_is_late_if_it_ended_after_its_deadline_or_did_not_end_by_then() -
 
 def test_a_window_cuts_spans_and_leaves_out_what_lies_outside() -> None:
     window = CHART.window(4, 12)
-    assert [(span.unit, span.start_ns, span.end_ns) for span in window.spans] == [("X", 4, 10), ("W", 10, 12)]
+    assert [(span.unit, span.start_ns, span.end_ns) for span in window.spans] == [
+        ("X", 4, 10),
+        ("W", 10, 12),
+    ]
     assert (window.start_ns, window.end_ns) == (4, 12)
 
 

@@ -13,18 +13,25 @@ from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.system_response import CommandPath, command_paths
 
 
-def path_of(levels: Sequence[str], grids: Sequence[TickGrid], reads: Sequence[TickGrid] | None = None) -> CommandPath:
-    """Return a path whose first command takes a tick; each level reads in every cycle, or at `reads`."""
+def path_of(
+    levels: Sequence[str], grids: Sequence[TickGrid], reads: Sequence[TickGrid] | None = None
+) -> CommandPath:
+    """Return a path whose first command takes a tick; each level reads in every cycle, or at
+    `reads`."""
     return CommandPath(tuple(levels), tuple(grids), tuple(reads or grids), 1, True)
 
 
-NASREM = path_of(("task", "elemental_move", "primitive", "servo"), [TickGrid(every) for every in (400, 100, 8, 1)])
+NASREM = path_of(
+    ("task", "elemental_move", "primitive", "servo"),
+    [TickGrid(every) for every in (400, 100, 8, 1)],
+)
 
 
 @pytest.mark.parametrize(
     ("given", "sampled", "acts"),
     [
-        # Visible a tick later; each level's next release on the grid: 400, 800, 904 (900 is not a multiple of 8), 912.
+        # Visible a tick later; each level's next release on the grid: 400, 800, 904 (900 is not a
+        # multiple of 8), 912.
         (0, 400, 912),
         (399, 400, 912),
         (400, 800, 1312),
@@ -40,7 +47,8 @@ def test_a_command_is_followed_from_release_to_release(given: int, sampled: int,
 def test_bounds_are_those_of_the_paper_and_of_the_grid() -> None:
     assert NASREM.bound_eq_3_2 == 4 * 400
     assert NASREM.sum_eq_3_3 == 400 + 100 + 8 + 1
-    # A cycle of the first level until it is read, the sum, and up to 4 ticks: 100 is not a multiple of 8.
+    # A cycle of the first level until it is read, the sum, and up to 4 ticks: 100 is not a multiple
+    # of 8.
     assert NASREM.longest == 400 + 509 + 4
 
 
@@ -55,12 +63,20 @@ def test_the_longest_on_the_grid_is_met_and_never_passed(cycles: tuple[int, ...]
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_with_phases_and_rare_reads_the_longest_is_met_by_two_levels_and_never_passed(seed: int) -> None:
+def test_with_phases_and_rare_reads_the_longest_is_met_by_two_levels_and_never_passed(
+    seed: int,
+) -> None:
     rng = Random(seed)
-    grids = [TickGrid(every, rng.randrange(every)) for every in rng.choices(range(1, 13), k=rng.choice((2, 2, 3)))]
+    grids = [
+        TickGrid(every, rng.randrange(every))
+        for every in rng.choices(range(1, 13), k=rng.choice((2, 2, 3)))
+    ]
     # Each level reads in every n-th of its cycles.
     ratios = [rng.randint(1, 3) for _ in grids]
-    reads = [TickGrid(n * g.every, g.phase + rng.randrange(n) * g.every) for n, g in zip(ratios, grids, strict=True)]
+    reads = [
+        TickGrid(n * g.every, g.phase + rng.randrange(n) * g.every)
+        for n, g in zip(ratios, grids, strict=True)
+    ]
     path = path_of([str(grid) for grid in grids], grids, reads)
     period = int(np.lcm.reduce([grid.every for grid in reads]))
     found = [path.response(given, path.acts_at(given + 1)) for given in range(2 * period)]

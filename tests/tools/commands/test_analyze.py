@@ -20,7 +20,11 @@ from tests.tools.recordings import MS, Cycle, recorded
 
 SETTLED = 40
 PLAIN = (0.0, 0.1, 1.0, 0.1)
-BUDGET = ["board.lower.budget.process_ms=1.0", "board.lower.budget.read_ms=0.2", "board.lower.budget.write_ms=0.2"]
+BUDGET = [
+    "board.lower.budget.process_ms=1.0",
+    "board.lower.budget.read_ms=0.2",
+    "board.lower.budget.write_ms=0.2",
+]
 USUAL = ["--percentile", "50"]
 """What a machine whose host stalls it cannot change."""
 
@@ -34,7 +38,9 @@ def run_of(figure: str, name: str, folder: Path) -> Path:
 def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
     """Return which equations hold on which subjects, on one side of the document."""
     return {
-        (row["equation"], row["subject"]): row[side]["holds"] for row in found["equations"] if row[side] is not None
+        (row["equation"], row["subject"]): row[side]["holds"]
+        for row in found["equations"]
+        if row[side] is not None
     }
 
 
@@ -46,11 +52,18 @@ def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_pa
     assert (done.returncode, found["holds"]) == (0, True), done.stderr
     predicted, measured = verdicts(found, "predicted"), verdicts(found, "measured")
     assert all(predicted.values())
-    assert {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")} <= set(measured)
+    assert {
+        ("3.1", "level"),
+        ("3.6", "level"),
+        ("response time", "level"),
+        ("load", "core 1"),
+    } <= set(measured)
     assert all(measured.values())
     assert not any(row["disagrees"] for row in found["equations"])
     level = found["levels"]["level"]
-    assert level["measured"]["execution_ns"] == pytest.approx(level["predicted"]["execution_ns"], rel=0.1)
+    assert level["measured"]["execution_ns"] == pytest.approx(
+        level["predicted"]["execution_ns"], rel=0.1
+    )
     assert level["measured"]["plan_ns"] == pytest.approx(level["predicted"]["plan_ns"], rel=0.1)
     assert "fits into 2 of its 2 cycles" in level["summary"]
     written = {path.name for path in (tmp_path / "run").iterdir()}
@@ -70,7 +83,12 @@ def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_pa
     found = json.loads((tmp_path / "analysis" / "analysis.json").read_text())
     for side in ("predicted", "measured"):
         failed = {key for key, holds in verdicts(found, side).items() if not holds}
-        assert {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")} <= failed
+        assert {
+            ("3.1", "level"),
+            ("3.6", "level"),
+            ("response time", "level"),
+            ("load", "core 1"),
+        } <= failed
     broken = [breach for breach in found["breaches"] if breach["task"] == "level"]
     # Every cycle takes 7 of 6 ms.
     assert len(broken) >= found["tasks"]["level"]["cycles"]
@@ -86,7 +104,10 @@ def test_a_folder_without_a_run_is_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Path) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])
-    trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1), flags=int(k == 7)) for k in range(40)]
+    trace = [
+        Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1), flags=int(k == 7))
+        for k in range(40)
+    ]
     analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": trace}))
     differing = {pair.equation for pair in analysis.pairs if pair.disagrees}
     assert differing >= {"3.1", "3.6", "response time"}
@@ -99,7 +120,9 @@ def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Pa
     assert "upper: never ran" in found
 
 
-def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(small: Path, tmp_path: Path) -> None:
+def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(
+    small: Path, tmp_path: Path
+) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])
     trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1)) for k in range(400)]
     recording = recorded(tmp_path / "run", config, {"lower": trace})
@@ -125,7 +148,9 @@ def test_alpha_and_deviation_are_those_of_equation_3_6(small: Path, tmp_path: Pa
 def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Path) -> None:
     trace = [Cycle(SETTLED + k, PLAIN, late=0.3 if k == 5 else 0.1) for k in (*range(8), 11)]
     traces = {"lower": trace}
-    found = document(Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces)))
+    found = document(
+        Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
+    )
     task = found["tasks"]["lower"]
     assert (task["lateness_ms"]["max"], task["lateness_ms"]["p50"]) == (0.3, 0.1)
     assert task["largest_gap_ms"] == 4 * 2.5
@@ -138,21 +163,35 @@ def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_the_tables_of_an_analysis_fit_the_terminal(small: Path, tmp_path: Path, width: int) -> None:
+def test_the_tables_of_an_analysis_fit_the_terminal(
+    small: Path, tmp_path: Path, width: int
+) -> None:
     traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(8)] for name in ("lower", "upper")}
     analysis = Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
     lines = text(analysis, width).splitlines()
-    rows = [line for line in lines if line.startswith(("lower ", "upper ", "3.", "task ", "eq. ", "level "))]
+    rows = [
+        line
+        for line in lines
+        if line.startswith(("lower ", "upper ", "3.", "task ", "eq. ", "level "))
+    ]
     assert len(rows) >= 20
     assert max(map(len, rows)) <= width
     assert max(map(len, text(analysis).splitlines())) > 120
 
 
 @pytest.mark.slow
-def test_a_run_in_lockstep_is_analyzed_with_its_system_response(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_run_in_lockstep_is_analyzed_with_its_system_response(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     found = json.loads(rack("analyze", slow_run(tmp_path_factory), "--json").stdout)
-    measured = [(row["equation"], row["measured"]) for row in found["equations"] if row["measured"] is not None]
+    measured = [
+        (row["equation"], row["measured"])
+        for row in found["equations"]
+        if row["measured"] is not None
+    ]
     # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
-    responses = [(found["left"], found["right"]) for equation, found in measured if equation == "3.3"]
+    responses = [
+        (found["left"], found["right"]) for equation, found in measured if equation == "3.3"
+    ]
     assert responses == [(45 * 2.5 * MS, 45 * 2.5 * MS), (80 * 2.5 * MS, 80 * 2.5 * MS)]
     assert "response time" not in dict(measured)

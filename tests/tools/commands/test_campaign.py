@@ -42,18 +42,39 @@ def campaign(config: Path, *arguments: str | Path) -> subprocess.CompletedProces
 
 
 def trials_in(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(path.read_text())["finding"] for path in sorted((folder / "trials").glob("0*.json"))]
+    return [
+        json.loads(path.read_text())["finding"]
+        for path in sorted((folder / "trials").glob("0*.json"))
+    ]
 
 
 @pytest.mark.slow
-def test_every_death_and_hang_of_a_lockstep_campaign_is_found_and_survived(small: Path, tmp_path: Path) -> None:
+def test_every_death_and_hang_of_a_lockstep_campaign_is_found_and_survived(
+    small: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "campaign"
-    options = ["--lockstep", "--injections", "2", "--seed", "4", "--seconds", "9", "--kinds", "kill,hang,self-test"]
+    options = [
+        "--lockstep",
+        "--injections",
+        "2",
+        "--seed",
+        "4",
+        "--seconds",
+        "9",
+        "--kinds",
+        "kill,hang,self-test",
+    ]
     done = campaign(small, *options, "--out", out, "--json")
     report = json.loads(done.stdout)
     assert (done.returncode, done.stderr, report["shortfalls"]) == (0, "", [])
     summary = report["summary"]
-    assert summary["injected"] == summary["detected"] == summary["within_bound"] == summary["recovered"] == 6
+    assert (
+        summary["injected"]
+        == summary["detected"]
+        == summary["within_bound"]
+        == summary["recovered"]
+        == 6
+    )
     bounds = {kind: found["wilson"]["detected"] for kind, found in report["by_kind"].items()}
     assert bounds == {kind: [0.34238, 1.0] for kind in ("kill", "hang", "self-test")}
     assert (summary["limits_violated"], summary["left_behind"], summary["unexplained"]) == (0, 0, 0)
@@ -61,7 +82,9 @@ def test_every_death_and_hang_of_a_lockstep_campaign_is_found_and_survived(small
     assert json.loads((out / "campaign.json").read_text()) == report
     assert (out / "campaign.md").read_text().startswith(f"# Campaign on {small}, seed 4: passed")
     assert (out / "campaign.png").read_bytes().startswith(b"\x89PNG")
-    assert [trial["plan"]["number"] for trial in trials_in(out)] == list(range(1, summary["trials"] + 1))
+    assert [trial["plan"]["number"] for trial in trials_in(out)] == list(
+        range(1, summary["trials"] + 1)
+    )
     assert not list(out.glob("*.toml"))
 
 
@@ -77,17 +100,29 @@ def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(small: Path, tmp_path: Path) -> None:
-    out, options = tmp_path / "campaign", ["--lockstep", "--injections", "2", "--seconds", "9", "--kinds", "kill"]
-    # In a rack without restarts its first loss is the end: what comes after it does not strike, and is drawn again.
+def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(
+    small: Path, tmp_path: Path
+) -> None:
+    out, options = (
+        tmp_path / "campaign",
+        ["--lockstep", "--injections", "2", "--seconds", "9", "--kinds", "kill"],
+    )
+    # In a rack without restarts its first loss is the end: what comes after it does not strike, and
+    # is drawn again.
     done = campaign(small, *options, "--set", "supervision.restarts=0", "--out", out, "--json")
     report = json.loads(done.stdout)
     first, second = trials_in(out)
-    assert (done.returncode, first["ended"], second["ended"]) == (1, "safely stopped", "safely stopped")
+    assert (done.returncode, first["ended"], second["ended"]) == (
+        1,
+        "safely stopped",
+        "safely stopped",
+    )
     assert sorted(fault["seen"] for fault in first["faults"]) == ["detected", "not struck"]
     assert [fault["seen"] for fault in second["faults"]] == ["detected"]
     assert (report["summary"]["injected"], report["summary"]["not_struck"]) == (2, 1)
-    assert all("no restart follows" in line or "never undone" in line for line in report["shortfalls"])
+    assert all(
+        "no restart follows" in line or "never undone" in line for line in report["shortfalls"]
+    )
     for trial in (first, second):
         path = out / f"trial-{trial['plan']['number']:04}.toml"
         assert tomllib.loads(path.read_text())["fault"] == trial["plan"]["faults"]
@@ -96,8 +131,21 @@ def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(small: Path,
 @pytest.mark.slow
 def test_a_campaign_that_was_killed_goes_on_where_it_was(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
-    options = ["--lockstep", "--injections", "3", "--seconds", "9", "--kinds", "kill,hang", "--out", str(out), "--json"]
-    process = subprocess.Popen([*COMMAND, str(small), *options], cwd=ROOT, stdout=subprocess.DEVNULL)
+    options = [
+        "--lockstep",
+        "--injections",
+        "3",
+        "--seconds",
+        "9",
+        "--kinds",
+        "kill,hang",
+        "--out",
+        str(out),
+        "--json",
+    ]
+    process = subprocess.Popen(
+        [*COMMAND, str(small), *options], cwd=ROOT, stdout=subprocess.DEVNULL
+    )
     trials = out / "trials"
     try:
         wait_until(lambda: len(list(trials.glob("0*.json"))) > 0, BOUND_S)
@@ -111,15 +159,30 @@ def test_a_campaign_that_was_killed_goes_on_where_it_was(small: Path, tmp_path: 
     assert {name: (trials / name).stat().st_mtime_ns for name in there} == there
     # What was done is not done again, and another campaign's folder is left alone.
     other = campaign(small, *options, "--seed", "9")
-    assert (other.returncode, "holds another campaign; it differs in seed" in other.stderr) == (2, True)
+    assert (other.returncode, "holds another campaign; it differs in seed" in other.stderr) == (
+        2,
+        True,
+    )
 
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
-    options = ["--realtime", "--injections", "99", "--seconds", "9", "--kinds", "kill", "--faultless", "0"]
+    options = [
+        "--realtime",
+        "--injections",
+        "99",
+        "--seconds",
+        "9",
+        "--kinds",
+        "kill",
+        "--faultless",
+        "0",
+    ]
     options += ["--out", str(out)]
-    process = subprocess.Popen([*COMMAND, str(small), *options], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*COMMAND, str(small), *options], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
     try:
         assert process.stdout is not None
         assert any(line.endswith(" in real time\n") for line in process.stdout)
@@ -134,15 +197,31 @@ def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_
     assert (report["interrupted"], report["summary"]["left_behind"]) == (True, 0)
 
 
-@pytest.mark.parametrize("numbers", [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT,) * 2])
+@pytest.mark.parametrize(
+    "numbers", [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT,) * 2]
+)
 def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_before(
-    small: Path, write: Callable[[str, str], Path], tmp_path: Path, numbers: tuple[signal.Signals, ...]
+    small: Path,
+    write: Callable[[str, str], Path],
+    tmp_path: Path,
+    numbers: tuple[signal.Signals, ...],
 ) -> None:
     write("stalling.py", STALLING)
     text = small.read_text().replace("python_path = [", f'python_path = ["{tmp_path}", ')
     small.write_text(text.replace("two_levels:Upper", "stalling:Stalling"))
     out = tmp_path / "campaign"
-    options = ["--lockstep", "--injections", "9", "--seconds", "9", "--kinds", "kill", "--out", str(out), "--json"]
+    options = [
+        "--lockstep",
+        "--injections",
+        "9",
+        "--seconds",
+        "9",
+        "--kinds",
+        "kill",
+        "--out",
+        str(out),
+        "--json",
+    ]
     process = subprocess.Popen(
         [*COMMAND, str(small), *options],
         cwd=ROOT,
@@ -168,7 +247,9 @@ def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_befo
         assert json.loads((out / "campaign.json").read_text()) == report
     assert racks
     wait_until(lambda: not [name for name in racks if named(name)])
-    assert not [path.name for path in SHM_FOLDER.iterdir() if any(name in path.name for name in racks)]
+    assert not [
+        path.name for path in SHM_FOLDER.iterdir() if any(name in path.name for name in racks)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -184,7 +265,9 @@ def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_befo
         (["--set", "clock.wake=no"], 'clock.wake = "no": '),
     ],
 )
-def test_bad_input_is_one_line_that_lists_what_is_valid(small: Path, options: list[str], line: str) -> None:
+def test_bad_input_is_one_line_that_lists_what_is_valid(
+    small: Path, options: list[str], line: str
+) -> None:
     done = campaign(small, *options)
     assert (done.returncode, done.stdout) == (2, "")
     (told,) = done.stderr.splitlines()

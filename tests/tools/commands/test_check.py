@@ -19,7 +19,10 @@ from rack.tools.timing.tables import forecast_lines
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
-FITS = ("--set", "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }")
+FITS = (
+    "--set",
+    "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }",
+)
 FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")
 FAILING = ("fig3", "fig4-overload")
 """Configs that show what does not fit."""
@@ -101,7 +104,12 @@ def test_json_holds_everything_with_both_sides(small: Path) -> None:
     assert not timing["holds"]
     verdict = next(v for v in timing["verdicts"] if v["equation"] == "3.8")
     assert (verdict["left"], verdict["sign"], verdict["right"]) == (3e6, "<", 1.8e6)
-    assert (verdict["margin"], verdict["holds"], verdict["subject"], verdict["unit"]) == (-1.2e6, False, "lower", "ns")
+    assert (verdict["margin"], verdict["holds"], verdict["subject"], verdict["unit"]) == (
+        -1.2e6,
+        False,
+        "lower",
+        "ns",
+    )
     level = timing["levels"][0]
     assert (level["cycle_ns"], level["residual_ns"], level["planning_ns"], level["slice_ns"]) == (
         2_500_000,
@@ -161,7 +169,8 @@ def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
 
 
 def test_a_fix_carries_the_measured_budgets(small: Path, recorded: Path, tmp_path: Path) -> None:
-    # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was measured.
+    # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was
+    # measured.
     done = check(small, "--from", recorded, "--percentile", 50, "--fix")
     assert done.returncode == 0, done.stderr
     fixed = tmp_path / "fixed.toml"
@@ -185,15 +194,37 @@ def test_a_folder_that_is_no_run_is_refused_in_one_line(small: Path, tmp_path: P
 def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> None:
     done = check(small, "--set", "board.upper.budget.plan_ms=6")
     assert done.returncode == 2
-    assert done.stderr == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"
+    assert (
+        done.stderr
+        == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"
+    )
 
 
 @pytest.mark.slow
 def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
-    done = check("cyclic", "--set", "schedule.major_ms=40", "--set", "board.even.budget.process_ms=3.1")
+    done = check(
+        "cyclic", "--set", "schedule.major_ms=40", "--set", "board.even.budget.process_ms=3.1"
+    )
     rows = [line.split() for line in done.stdout.splitlines()]
-    assert "static schedule, ms: 10 frames of 4, 4 ticks; every budget with two context switches:" in done.stdout
-    assert ["1", "0,", "2", "...", "8", "even", "1", "3.14", "-0.14", "end", "of", "frame", "FAILS"] in rows
+    assert (
+        "static schedule, ms: 10 frames of 4, 4 ticks; every budget with two context switches:"
+        in done.stdout
+    )
+    assert [
+        "1",
+        "0,",
+        "2",
+        "...",
+        "8",
+        "even",
+        "1",
+        "3.14",
+        "-0.14",
+        "end",
+        "of",
+        "frame",
+        "FAILS",
+    ] in rows
     assert ["1", "1,", "3", "...", "9", "fast", "0", "0.94", "0.06", "odd", "ok"] in rows
     assert "core 1, frame 0: 'even' lacks 0.14 ms when the frame ends" in done.stdout
     assert done.returncode == 1
@@ -209,9 +240,23 @@ def test_the_static_schedule_is_in_the_json_document() -> None:
 @pytest.mark.slow
 def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
-    (line,) = (line for line in check(*words, "--verbose").stdout.splitlines() if line.startswith("patience: "))
-    assert line.startswith("patience: 'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms). ")
-    assert "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque put in 10.372 J" in line
+    (line,) = (
+        line
+        for line in check(*words, "--verbose").stdout.splitlines()
+        if line.startswith("patience: ")
+    )
+    assert line.startswith(
+        "patience: 'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms). "
+    )
+    assert (
+        "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque put in"
+        " 10.372 J" in line
+    )
     assert "patience" not in check(*words).stdout
     (found,) = json.loads(check(*words, "--json").stdout)["patience"]
-    assert (found["board"], found["ms"], found["cycles"], found["energy_j"]) == ("servo", 10.0, 4, 10.372)
+    assert (found["board"], found["ms"], found["cycles"], found["energy_j"]) == (
+        "servo",
+        10.0,
+        4,
+        10.372,
+    )

@@ -1,6 +1,8 @@
-"""`rack check` of mutated configs: whatever they contain, it ends in time with exit status 0, 1 or 2.
+"""`rack check` of mutated configs: whatever they contain, it ends in time with exit status 0, 1 or
+2.
 
-1 has one meaning: the config is valid, and its timing does not fit. Everything else is a mistake, one per line.
+1 has one meaning: the config is valid, and its timing does not fit. Everything else is a mistake,
+one per line.
 """
 
 from __future__ import annotations
@@ -32,7 +34,26 @@ BOUND_S = 20
 DEEP: list[Any] = []
 for _ in range(40):
     DEEP = [DEEP]
-PLAIN = (True, False, 0, 1, -1, 3, 99, 2**31, 2**63 - 1, 2**70, 0.0, 0.5, 2.5, 1e-9, 1e9, 5e-324, 1e300, -1e300)
+PLAIN = (
+    True,
+    False,
+    0,
+    1,
+    -1,
+    3,
+    99,
+    2**31,
+    2**63 - 1,
+    2**70,
+    0.0,
+    0.5,
+    2.5,
+    1e-9,
+    1e9,
+    5e-324,
+    1e300,
+    -1e300,
+)
 ODD = (
     float("inf"),
     float("-inf"),
@@ -48,13 +69,27 @@ ODD = (
 )
 LISTS = ([], [1], [1.0] * 6, ["a"], [[]], [0] * 1000, {}, {"a": 1}, {"": {}}, {"every": 8}, DEEP)
 VALUES = (*PLAIN, *ODD, *LISTS)
-KEYS = ("", "x", "every", "rate_hz", "below", "planner", "params", "a.b", "two\nlines", "k" * 300, "model")
+KEYS = (
+    "",
+    "x",
+    "every",
+    "rate_hz",
+    "below",
+    "planner",
+    "params",
+    "a.b",
+    "two\nlines",
+    "k" * 300,
+    "model",
+)
 
 
 def texts() -> dict[str, dict[str, Any]]:
-    """Every shipped config, as written and resolved; tables that are not a whole rack extend one that is."""
+    """Every shipped config, as written and resolved; tables that are not a whole rack extend one
+    that is."""
     found = {
-        str(path.relative_to(CONFIGS)): tomllib.loads(path.read_text()) for path in sorted(CONFIGS.rglob("*.toml"))
+        str(path.relative_to(CONFIGS)): tomllib.loads(path.read_text())
+        for path in sorted(CONFIGS.rglob("*.toml"))
     }
     for place, tables in found.items():
         if "model" in tables.get("robot", {}):
@@ -69,7 +104,13 @@ TEXTS = texts()
 
 def paths(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Yield the way to every value."""
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    items = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else ()
+    )
     for key, value in items:
         yield (*path, key)
         yield from paths(value, (*path, key))
@@ -83,13 +124,16 @@ def at(node: Any, path: tuple[Any, ...]) -> Any:
 
 @st.composite
 def spoilt(draw: st.DrawFn) -> str:
-    """Draw the text of a config with one to three changes that a user, or an attacker, might make."""
+    """Draw the text of a config with one to three changes that a user, or an attacker, might
+    make."""
     tables = copy.deepcopy(TEXTS[draw(st.sampled_from(sorted(TEXTS)))])
     for _ in range(draw(st.integers(1, 3))):
         ways = list(paths(tables))
         *way, key = draw(st.sampled_from(ways))
         holder = at(tables, tuple(way))
-        change = draw(st.sampled_from(("replace", "replace", "swap", "delete", "rename", "add", "double")))
+        change = draw(
+            st.sampled_from(("replace", "replace", "swap", "delete", "rename", "add", "double"))
+        )
         if change == "delete":
             del holder[key]
         elif change == "rename" and isinstance(holder, dict):
@@ -111,11 +155,14 @@ def spoilt(draw: st.DrawFn) -> str:
 
 @st.composite
 def torn(draw: st.DrawFn, text: str) -> str:
-    """Draw text that was edited without care: a line twice, a line less, the end lost, a stray piece."""
+    """Draw text that was edited without care: a line twice, a line less, the end lost, a stray
+    piece."""
     lines = text.splitlines()
     line = draw(st.integers(0, len(lines) - 1))
     piece = draw(
-        st.sampled_from(("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", "nan", "1e400"))
+        st.sampled_from(
+            ("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", "nan", "1e400")
+        )
     )
     column = draw(st.integers(0, len(lines[line])))
     return draw(
@@ -124,7 +171,11 @@ def torn(draw: st.DrawFn, text: str) -> str:
                 [*lines[: line + 1], *lines[line:]],
                 [*lines[:line], *lines[line + 1 :]],
                 lines[:line],
-                [*lines[:line], lines[line][:column] + piece + lines[line][column:], *lines[line + 1 :]],
+                [
+                    *lines[:line],
+                    lines[line][:column] + piece + lines[line][column:],
+                    *lines[line + 1 :],
+                ],
                 [*lines[:line], lines[line].partition("=")[0] + "= " + piece, *lines[line + 1 :]],
             )
         ).map("\n".join)
@@ -165,7 +216,9 @@ def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dic
 def judge(status: int, document: dict[str, Any]) -> None:
     if status == 2:
         assert document["error"]
-        assert all(line and line.isprintable() and len(line) <= MAX_LINE for line in document["error"])
+        assert all(
+            line and line.isprintable() and len(line) <= MAX_LINE for line in document["error"]
+        )
     else:
         assert status == (0 if document["timing"]["holds"] else 1)
 
@@ -220,8 +273,16 @@ def test_what_made_rack_check_hang_or_fall_is_a_mistake_on_one_line(
     assert [line.startswith(f"{place} ") for line in document["error"]] == [True]
 
 
-def test_the_longest_cycles_and_plans_there_are_are_judged_in_time(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_longest_cycles_and_plans_there_are_are_judged_in_time(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     settings = ("clock.period_ms=0.01", "timing.clock_ms=0.009999", "board.level.every=1000000")
-    slow = ("board.level.core=0", "board.level.within_cycles=10000", "board.level.budget.process_ms=0.5")
-    status, document = check(capsys, "fig2", *(word for setting in (*settings, *slow) for word in ("--set", setting)))
+    slow = (
+        "board.level.core=0",
+        "board.level.within_cycles=10000",
+        "board.level.budget.process_ms=0.5",
+    )
+    status, document = check(
+        capsys, "fig2", *(word for setting in (*settings, *slow) for word in ("--set", setting))
+    )
     assert (status, document["timing"]["holds"]) == (1, False)

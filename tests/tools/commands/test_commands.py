@@ -62,12 +62,17 @@ HEAVY = ("mujoco", "numba", "numpy", "pyarrow", "pydantic", "rerun", "typer")
 
 
 def imported(*arguments: object) -> set[str]:
-    """Run a command as a process of its own; return which of the heavy libraries it has imported."""
+    """Run a command as a process of its own; return which of the heavy libraries it has
+    imported."""
     command = [sys.executable, "-X", "importtime", *RACK[1:], *map(str, arguments)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout
-    names = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    names = {
+        line.rpartition("|")[2].strip()
+        for line in done.stderr.splitlines()
+        if line.startswith("import time:")
+    }
     assert "rack.tools.console.interrupt" in names
     return names & {*HEAVY}
 
@@ -82,7 +87,9 @@ def imported(*arguments: object) -> set[str]:
         (["list"], set()),
     ],
 )
-def test_a_command_starts_without_libraries_that_it_does_not_need(arguments: list[str], needed: set[str]) -> None:
+def test_a_command_starts_without_libraries_that_it_does_not_need(
+    arguments: list[str], needed: set[str]
+) -> None:
     assert imported(*arguments) <= needed
 
 
@@ -94,7 +101,9 @@ def test_a_look_at_a_rack_needs_numpy_and_nothing_else(small: Path, rack_name: s
         assert rack_name in rack("list").stdout
 
 
-def test_a_report_that_is_there_is_shown_without_any(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_report_that_is_there_is_shown_without_any(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     folder = small_run(tmp_path_factory)
     rack("report", folder)
     assert imported("report", folder) == set()
@@ -112,8 +121,20 @@ def test_help_has_a_whole_line_for_every_command() -> None:
 
 
 @pytest.mark.slow
-def test_run_prints_one_json_document_and_nothing_else(small: Path, rack_name: str, tmp_path: Path) -> None:
-    done = rack("run", small, "--seconds", 1, "--set", f"name={rack_name}", "--out", tmp_path / "run", "--json")
+def test_run_prints_one_json_document_and_nothing_else(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    done = rack(
+        "run",
+        small,
+        "--seconds",
+        1,
+        "--set",
+        f"name={rack_name}",
+        "--out",
+        tmp_path / "run",
+        "--json",
+    )
     report = json.loads(done.stdout)
     assert (done.returncode, done.stderr) == (0, ""), report["outcome"]
     assert (report["rack"], report["worked"], report["outcome"]["ticks"]) == (rack_name, True, 400)
@@ -133,14 +154,37 @@ def test_run_prints_one_json_document_and_nothing_else(small: Path, rack_name: s
     unrecorded = json.loads(bare.stdout)
     assert (bare.returncode, bare.stderr) == (0, "")
     assert unrecorded.keys() == report.keys()
-    for key in ("rack", "mode", "clock_ms", "worked", "outcome", "digest", "simulated_s", "missed", "skipped"):
+    for key in (
+        "rack",
+        "mode",
+        "clock_ms",
+        "worked",
+        "outcome",
+        "digest",
+        "simulated_s",
+        "missed",
+        "skipped",
+    ):
         assert unrecorded[key] == report[key], key
-    assert (unrecorded["folder"], unrecorded["misses"], unrecorded["recording"]) == (None, None, "none")
+    assert (unrecorded["folder"], unrecorded["misses"], unrecorded["recording"]) == (
+        None,
+        None,
+        "none",
+    )
     assert unrecorded["tasks"]["lower"].keys() <= report["tasks"]["lower"].keys()
 
 
-def test_a_config_with_mistakes_is_refused_before_anything_starts(small: Path, rack_name: str, tmp_path: Path) -> None:
-    settings = ["--set", f"name={rack_name}", "--set", "clock.wake=no", "--set", "board.lower.above=uper"]
+def test_a_config_with_mistakes_is_refused_before_anything_starts(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    settings = [
+        "--set",
+        f"name={rack_name}",
+        "--set",
+        "clock.wake=no",
+        "--set",
+        "board.lower.above=uper",
+    ]
     done = rack("run", small, *settings, "--out", tmp_path / "run")
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 2
@@ -166,7 +210,9 @@ def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_running_rack_can_be_seen_and_stopped(running: subprocess.Popen[str], rack_name: str) -> None:
+def test_a_running_rack_can_be_seen_and_stopped(
+    running: subprocess.Popen[str], rack_name: str
+) -> None:
     listed = {entry["rack"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
     assert listed[rack_name] == "running"
     seen = json.loads(rack("status", rack_name, "--json").stdout)
@@ -191,7 +237,9 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_what_a_killed_launcher_leaves_is_cleaned(running: subprocess.Popen[str], rack_name: str) -> None:
+def test_what_a_killed_launcher_leaves_is_cleaned(
+    running: subprocess.Popen[str], rack_name: str
+) -> None:
     running.kill()
     running.wait(BOUND_S)
     seen = rack("status", rack_name)

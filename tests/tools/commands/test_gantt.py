@@ -19,7 +19,12 @@ def run(tmp_path: Path) -> Path:
     ms = (0, 0, 1, 3, 4)
     levels = [cycle(4 * n, 2000, *(1000 * (8 * n + at) for at in ms)) for n in range(20)]
     plans = [
-        cycle(4 * n, 2000, *(1000 * (8 * n + at) for at in (4, 4, 4, 14, 15 if n != 10 else 23)), planned=True)
+        cycle(
+            4 * n,
+            2000,
+            *(1000 * (8 * n + at) for at in (4, 4, 4, 14, 15 if n != 10 else 23)),
+            planned=True,
+        )
         for n in range(0, 20, 2)
     ]
     recorded(tmp_path / "run", load("fig2"), {"level": levels, "level.planner": plans})
@@ -36,17 +41,23 @@ def run(tmp_path: Path) -> Path:
         ("fig4-overload", ["PPPPPPU-----PPPPPPU-----", "CRXXXXWCRXXXXWCRXXXXWCRX"]),
     ],
 )
-def test_a_figure_is_printed_as_in_the_paper_and_drawn(name: str, rows: list[str], tmp_path: Path) -> None:
+def test_a_figure_is_printed_as_in_the_paper_and_drawn(
+    name: str, rows: list[str], tmp_path: Path
+) -> None:
     shown = rack("gantt", name, "--out", tmp_path / "out")
     assert (shown.returncode, shown.stderr) == (0, "")
-    assert [line.split()[-1] for line in shown.stdout.splitlines() if line.startswith("core ")] == rows
+    assert [
+        line.split()[-1] for line in shown.stdout.splitlines() if line.startswith("core ")
+    ] == rows
     assert ("late: level" in shown.stdout) == (name in ("fig3", "fig4-overload"))
     assert (tmp_path / "out" / "gantt.png").read_bytes().startswith(b"\x89PNG")
     assert ElementTree.parse(tmp_path / "out" / "gantt.svg").getroot().tag.endswith("svg")
     assert str(tmp_path / "out" / "gantt.png") in shown.stdout
 
 
-def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_ms(tmp_path: Path) -> None:
+def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_ms(
+    tmp_path: Path,
+) -> None:
     shown = rack("gantt", "fig2", "--process", "level=3,2", "--to-ms", 16, "--out", tmp_path)
     assert "RXXXWPPPRXXWPPPU\n" in shown.stdout
     assert "R X W P | R X W P U: 10 of 10 plans" in shown.stdout
@@ -63,7 +74,10 @@ def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> No
     assert (update["start_ms"], update["end_ms"], update["task"]) == (22, 23, "level.planner")
     late = [(job["task"], job["release_ms"], job["end_ms"]) for job in panel["jobs"] if job["late"]]
     assert late == [("level.planner", 0, 23)]
-    assert sum(panel["patterns"]["level"]["plans"].values()) == panel["counts"]["level.planner"]["jobs"]
+    assert (
+        sum(panel["patterns"]["level"]["plans"].values())
+        == panel["counts"]["level.planner"]["jobs"]
+    )
     assert [Path(path).name for path in found["pictures"]] == ["gantt.png", "gantt.svg"]
 
 
@@ -88,7 +102,9 @@ def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
     config = load("fig2")
     level = config.board["level"].model_copy(update={"budget": None})
     rows = [cycle(4 * n, 2000, *[8000 * n] * 4, 8000 * n + 1000) for n in range(9)]
-    recorded(tmp_path / "run", config.model_copy(update={"board": {"level": level}}), {"level": rows})
+    recorded(
+        tmp_path / "run", config.model_copy(update={"board": {"level": level}}), {"level": rows}
+    )
     shown = rack("gantt", tmp_path / "run", "--json")
     found = json.loads(shown.stdout)
     assert [panel["kind"] for panel in found["panels"]] == ["measured"]
@@ -97,7 +113,11 @@ def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -> None:
-    recorded(tmp_path / "run", load("fig2", ["clock.mode=lockstep"]), {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]})
+    recorded(
+        tmp_path / "run",
+        load("fig2", ["clock.mode=lockstep"]),
+        {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]},
+    )
     shown = rack("gantt", tmp_path / "run")
     assert "fig2: schedule, 0 to 32 ms" in shown.stdout
     assert "ran in lockstep: time stood still" in shown.stdout
@@ -122,7 +142,9 @@ def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
     (panel,) = json.loads(shown.stdout)["panels"]
     assert (panel["frame_ms"], panel["to_ms"]) == (4, 8)
     text = rack("gantt", "cyclic", "--out", tmp_path, "--from-ms", 4, "--to-ms", 16).stdout
-    assert [line.split() for line in text.splitlines() if line.startswith("frame")] == [["frame", "|1", "|2", "|3"]]
+    assert [line.split() for line in text.splitlines() if line.startswith("frame")] == [
+        ["frame", "|1", "|2", "|3"]
+    ]
 
 
 def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
@@ -141,8 +163,14 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
         (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
-        (["fig2", "--process", "arm=3"], "--process arm: no board of that name has a budget; boards: level"),
-        (["fig2", "--from-ms", "5", "--to-ms", "5"], "5 to 5 ms: --to-ms must be later than --from-ms"),
+        (
+            ["fig2", "--process", "arm=3"],
+            "--process arm: no board of that name has a budget; boards: level",
+        ),
+        (
+            ["fig2", "--from-ms", "5", "--to-ms", "5"],
+            "5 to 5 ms: --to-ms must be later than --from-ms",
+        ),
         (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
     ],
 )
@@ -164,13 +192,21 @@ def test_a_rack_without_budgets_has_no_schedule(tmp_path: Path) -> None:
 
 
 def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:
-    assert "outside the run, which lasts from 0 to 160 ms" in rack("gantt", run, "--from-ms", 500).stderr
-    assert "the config of a run cannot be changed" in rack("gantt", run, "--set", "clock.speed=2").stderr
+    assert (
+        "outside the run, which lasts from 0 to 160 ms"
+        in rack("gantt", run, "--from-ms", 500).stderr
+    )
+    assert (
+        "the config of a run cannot be changed"
+        in rack("gantt", run, "--set", "clock.speed=2").stderr
+    )
 
 
 def test_a_schedule_without_end_is_refused_in_one_line() -> None:
     settings = ("clock.period_ms=0.01", "timing.clock_ms=0.001", "board.level.every=1000000")
     done = rack("gantt", "fig2", *(word for setting in settings for word in ("--set", setting)))
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("no schedule: 10 slices of the slowest task, 20000 ms each, hold ")
+    assert done.stderr.startswith(
+        "no schedule: 10 slices of the slowest task, 20000 ms each, hold "
+    )
     assert len(done.stderr.splitlines()) == 1

@@ -65,20 +65,31 @@ def test_a_fault_begins_at_the_next_tick_and_says_which(running: str) -> None:
 
 
 def test_waiting_is_for_the_end_of_a_fault(running: str) -> None:
-    done = rack("inject", running, "watch", "mute", "--cycles", "5", "--mailbox", "watch.status", "--wait")
+    done = rack(
+        "inject", running, "watch", "mute", "--cycles", "5", "--mailbox", "watch.status", "--wait"
+    )
     assert done.returncode == 0
     assert done.stdout.startswith("mute of watch (watch.status): ticks ")
     told = done.stdout.split()
-    assert int(told[told.index("to") + 1].rstrip(",")) - int(told[told.index("ticks") + 1]) == 5 * 8 - 1
+    assert (
+        int(told[told.index("to") + 1].rstrip(",")) - int(told[told.index("ticks") + 1])
+        == 5 * 8 - 1
+    )
 
 
 def test_a_fault_can_wait_for_a_tick_and_for_a_condition(running: str) -> None:
     tick = Segment.attach(running).words[System.TICK] + 2000
-    drop = json.loads(rack("inject", running, "wave", "drop", "--tick", str(tick), "--for", "5ms", "--json").stdout)
+    drop = json.loads(
+        rack(
+            "inject", running, "wave", "drop", "--tick", str(tick), "--for", "5ms", "--json"
+        ).stdout
+    )
     # Later only by the ticks that a busy clock leaves out.
     assert drop["begins"] >= tick
     condition = "watch.status.state == executing"
-    assert rack("inject", running, "wave", "drop", "--when", condition, "--for", "5ms").returncode == 0
+    assert (
+        rack("inject", running, "wave", "drop", "--when", condition, "--for", "5ms").returncode == 0
+    )
 
 
 NEVER = ("watch", "mute", "--when", "watch.status.state == error")
@@ -90,7 +101,10 @@ def test_a_fault_with_a_condition_is_armed_and_can_be_withdrawn(running: str) ->
     assert (done.returncode, answer["stage"]) == (0, "waiting")
     number = answer["fault"]
     assert answer["waits_for"] == "watch.status.state == error"
-    armed = f"armed, waits for {answer['waits_for']}; to withdraw it: rack inject {running} --withdraw {number}"
+    armed = (
+        f"armed, waits for {answer['waits_for']}; to withdraw it: rack inject {running} --withdraw"
+        f" {number}"
+    )
     assert answer["message"] == f"mute of watch: {armed}"
     entry = FaultTable(Segment.attach(running)).entries[number]
     assert rack("inject", running, "--withdraw", str(number)).stdout == "mute of watch: withdrawn\n"
@@ -104,7 +118,9 @@ def test_waiting_ends_at_its_time_out_and_says_for_what_it_was(running: str) -> 
     done = rack("inject", running, *NEVER, "--wait", "--timeout", "0.2")
     assert (done.returncode, done.stdout) == (1, "")
     at_once, ended = done.stderr.splitlines()
-    assert at_once.startswith("mute of watch: armed, waits for watch.status.state == error; to withdraw it: ")
+    assert at_once.startswith(
+        "mute of watch: armed, waits for watch.status.state == error; to withdraw it: "
+    )
     assert ended == f"timed out after 0.2 s: {at_once}"
     rack("inject", running, "--withdraw", at_once.split()[-1])
 
@@ -121,15 +137,29 @@ def test_the_faults_of_a_rack_are_listed(running: str) -> None:
     ("words", "line"),
     [
         (["wve", "kill"], f'board = "wve": no such task; tasks: {TASKS}'),
-        (["wave", "kil"], f'kind = "kil": no such kind; kinds: {", ".join(kind.name for kind in KINDS)}'),
-        (["wave", "drop", "size=1"], "size = 1: drop has no such parameter; parameters: probability"),
-        (["wave", "drop", "probability"], "'probability': a parameter must be key=value, as in size=0.05"),
+        (
+            ["wave", "kil"],
+            f'kind = "kil": no such kind; kinds: {", ".join(kind.name for kind in KINDS)}',
+        ),
+        (
+            ["wave", "drop", "size=1"],
+            "size = 1: drop has no such parameter; parameters: probability",
+        ),
+        (
+            ["wave", "drop", "probability"],
+            "'probability': a parameter must be key=value, as in size=0.05",
+        ),
         (["wave", "kill", "--timeout", "1"], "--timeout needs --wait; give both, or neither"),
-        (["wave"], "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list"),
+        (
+            ["wave"],
+            "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list",
+        ),
     ],
     ids=lambda given: " ".join(given) if isinstance(given, list) else "",
 )
-def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: list[str], line: str) -> None:
+def test_what_cannot_be_is_one_line_that_says_what_can(
+    running: str, words: list[str], line: str
+) -> None:
     done = rack("inject", running, *words)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(line)
@@ -141,13 +171,29 @@ def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: list
     [
         ("drop", {"probability": "2"}, "probability = 2: out of range; permitted: 0.001 to 1; "),
         ("drop", {"probability": "often"}, 'probability = "often": should be a valid number, '),
-        ("mute", {"mailbox": "sea"}, "mailbox = \"sea\": 'wave' does not write it; it writes: wave.status"),
+        (
+            "mute",
+            {"mailbox": "sea"},
+            "mailbox = \"sea\": 'wave' does not write it; it writes: wave.status",
+        ),
         ("mute", {"for": "1h"}, 'for = "1h": should be a time, as in "0.5s", "20ms" or 0.5; '),
-        ("mute", {"for": "1s", "cycles": "1"}, "cycles = 1: for is also given; permitted: one of for,"),
+        (
+            "mute",
+            {"for": "1s", "cycles": "1"},
+            "cycles = 1: for is also given; permitted: one of for,",
+        ),
         ("kill", {"tick": "0"}, "tick = 0: has passed; the rack is at tick "),
         ("kill", {"phase": "1.5"}, 'phase = "1.5": should be less than 1; '),
-        ("kill", {"when": "sea"}, 'when = "sea": must be mailbox.field == value, as in "elemental_move.status.verb'),
-        ("self-test", {}, 'kind = "self-test": a running rack has passed its self-tests; give it in the config'),
+        (
+            "kill",
+            {"when": "sea"},
+            'when = "sea": must be mailbox.field == value, as in "elemental_move.status.verb',
+        ),
+        (
+            "self-test",
+            {},
+            'kind = "self-test": a running rack has passed its self-tests; give it in the config',
+        ),
         ("hog", {}, "for: missing; a hog must have an end: --for or --cycles"),
     ],
 )
@@ -164,7 +210,11 @@ def test_a_fault_that_a_running_rack_cannot_have_is_not_added(
 def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
     words = Segment.attach(running).words
     done = rack("estop", running)
-    assert (done.returncode, words[System.EMERGENCY_STOP], words[System.DEMAND]) == (0, 1, Demand.BRAKE)
+    assert (done.returncode, words[System.EMERGENCY_STOP], words[System.DEMAND]) == (
+        0,
+        1,
+        Demand.BRAKE,
+    )
     assert "emergency stop latched at tick" in done.stdout
     assert "EMERGENCY STOP  arm: brake" in rack("status", running).stdout.splitlines()[0]
     words[System.ACFAIL] = 1
@@ -173,7 +223,11 @@ def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
     assert words[System.EMERGENCY_STOP] == 1
     words[System.ACFAIL] = 0
     reset = json.loads(rack("estop", running, "--reset", "--json").stdout)
-    assert (reset["emergency_stop"], words[System.EMERGENCY_STOP], words[System.DEMAND]) == (False, 0, Demand.NONE)
+    assert (reset["emergency_stop"], words[System.EMERGENCY_STOP], words[System.DEMAND]) == (
+        False,
+        0,
+        Demand.NONE,
+    )
 
 
 @pytest.mark.parametrize("command", [["inject", "{}", "wave", "kill"], ["estop", "{}"]])
@@ -190,7 +244,9 @@ def test_the_help_lists_every_kind_with_its_means_bound_and_parameters() -> None
         assert kind.means in line
         assert str(kind.bound) in line
         for parameter in kind.parameters:
-            assert any(line.split()[:2] == [kind.name, parameter.name] for line in shown.splitlines())
+            assert any(
+                line.split()[:2] == [kind.name, parameter.name] for line in shown.splitlines()
+            )
     listed = json.loads(rack("inject", "--list", "--json").stdout)
     assert [kind["name"] for kind in listed] == [kind.name for kind in KINDS]
 
@@ -201,7 +257,9 @@ def test_a_clock_that_gives_out_no_tick_begins_no_fault(
 ) -> None:
     monkeypatch.setattr(live, "BEGIN_S", 0.05)
     with Rack(load(small, [f"name={rack_name}"])) as launched:
-        with pytest.raises(Failure, match=r"kill of lower: the clock has not begun it within 0.05 s"):
+        with pytest.raises(
+            Failure, match=r"kill of lower: the clock has not begun it within 0.05 s"
+        ):
             LiveRack(rack_name).inject({"board": "lower", "kind": "kill"}, wait=False)
         (entry,) = FaultTable(launched.segment).staged((Stage.WAITING,))
         assert entry[Entry.FROM] == -1

@@ -1,4 +1,5 @@
-"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a recording."""
+"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a
+recording."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ WATCHDOG_S = 50.0
 
 
 @pytest.mark.slow
-def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: str, tmp_path: Path) -> None:
+def test_a_rack_that_runs_can_be_recorded_until_its_end(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     with Rack(config) as rack:
         rack.start()
@@ -56,11 +59,16 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(small: Path, rack_name: 
     assert report["tasks"]["lower"]["traced"] > 0
     ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
     assert ticks[-1] == rack.outcome.ticks - 1
-    assert read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist() == ticks.tolist()
+    assert (
+        read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist()
+        == ticks.tolist()
+    )
 
 
 @pytest.mark.slow
-def test_racks_that_work_together_are_recorded_on_one_time_line(rack_name: str, tmp_path: Path) -> None:
+def test_racks_that_work_together_are_recorded_on_one_time_line(
+    rack_name: str, tmp_path: Path
+) -> None:
     names = [f"{rack_name}-a", f"{rack_name}-b"]
     one, other = configs(ring_texts(names, lan=WATCHED), tmp_path, "adapter.lan.rate_hz=100")
     port = one.adapter.lan.listen[0].rpartition(":")[2]
@@ -69,10 +77,24 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(rack_name: str, 
         near.start()
         folder = tmp_path / "run"
         # One from its own machine, one from afar.
-        command = [*RACK, "record", names[1], "--with", f"127.0.0.1:{port}/{names[0]}", "--out", str(folder), "--json"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as recorder:
+        command = [
+            *RACK,
+            "record",
+            names[1],
+            "--with",
+            f"127.0.0.1:{port}/{names[0]}",
+            "--out",
+            str(folder),
+            "--json",
+        ]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT
+        ) as recorder:
             deadline = time.monotonic() + WATCHDOG_S
-            while not all((folder / name / "run.rrd").is_file() for name in names) and time.monotonic() < deadline:
+            while (
+                not all((folder / name / "run.rrd").is_file() for name in names)
+                and time.monotonic() < deadline
+            ):
                 near.watch(0.02)
                 far.watch(0.02)
             near.stop("recorded")
@@ -104,7 +126,10 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
     folders = [folder / name for name in names] if count > 1 else [folder]
     others = [word for name in names[1:] for word in ("--with", name)]
     with ExitStack() as stack:
-        racks = [stack.enter_context(Rack(load(small, [f"name={name}", "clock.mode=realtime"]))) for name in names]
+        racks = [
+            stack.enter_context(Rack(load(small, [f"name={name}", "clock.mode=realtime"])))
+            for name in names
+        ]
         for rack in racks:
             rack.start()
         command = [*RACK, "record", names[0], *others, "--out", str(folder), "--json"]
@@ -124,7 +149,10 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
 
 
 def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path) -> None:
-    places = [recorded(machine, others, tmp_path / machine.rack) for machine, others in ((A, [B]), (B, []))]
+    places = [
+        recorded(machine, others, tmp_path / machine.rack)
+        for machine, others in ((A, [B]), (B, []))
+    ]
     runs, out = [place.folder for place in places], tmp_path / "both.rrd"
     replay(runs, out)
     made = out.read_bytes()
@@ -143,11 +171,15 @@ def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path)
     replay([tmp_path], tmp_path / "again.rrd")
     lanes = [f"/{name}/boards/2-pulse/executor" for name in "ab"]
     for lane in lanes:
-        again, first = (read(file, lane, "StateChange:state") for file in (tmp_path / "again.rrd", out))
+        again, first = (
+            read(file, lane, "StateChange:state") for file in (tmp_path / "again.rrd", out)
+        )
         assert again.ticks.tolist() == first.ticks.tolist()
 
 
-def test_a_window_without_a_screen_says_what_to_do_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_without_a_screen_says_what_to_do_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(Failure, match=r"no screen: .*: rerun run\.rrd"):

@@ -1,4 +1,5 @@
-"""`rack step`: a rack in lockstep holds between ticks, goes on by cycles, and ends when it is stopped meanwhile."""
+"""`rack step`: a rack in lockstep holds between ticks, goes on by cycles, and ends when it is
+stopped meanwhile."""
 
 from __future__ import annotations
 
@@ -23,8 +24,19 @@ def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A rack that counts, held before tick 0."""
     path = tmp_path / "counting.toml"
     path.write_text(counting(tmp_path))
-    command = [*RACK, "run", str(path), "--no-record", "--lockstep", "--step", "--set", f"name={rack_name}"]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [
+        *RACK,
+        "run",
+        str(path),
+        "--no-record",
+        "--lockstep",
+        "--step",
+        "--set",
+        f"name={rack_name}",
+    ]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     wait_until(lambda: is_held(rack_name), BOUND_S)
     yield process
     process.kill()
@@ -49,7 +61,9 @@ def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_a_held_rack_goes_on_by_cycles_and_ticks(held: subprocess.Popen[str], rack_name: str) -> None:
+def test_a_held_rack_goes_on_by_cycles_and_ticks(
+    held: subprocess.Popen[str], rack_name: str
+) -> None:
     assert [stepped(rack_name)[0] for _ in range(3)] == [1, 9, 17]
     assert stepped(rack_name, "--ticks", "3")[0] == 20
     tick, level = stepped(rack_name, "--until", "counter")
@@ -58,7 +72,10 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(held: subprocess.Popen[str], ra
     tick, level = stepped(rack_name, "--until", "counter")
     assert (tick, level["row"]) == (41, "row 4 'turn', now in 'down', table saw")
     given = rack("command", rack_name, "counter", "table", "slow")
-    assert given.stdout == "command to 'counter', table slow: waits for the next step of the rack, which is held\n"
+    assert (
+        given.stdout
+        == "command to 'counter', table slow: waits for the next step of the rack, which is held\n"
+    )
     tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
     assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
@@ -67,7 +84,9 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(held: subprocess.Popen[str], ra
 
 
 @pytest.mark.slow
-def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(held: subprocess.Popen[str], rack_name: str) -> None:
+def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(
+    held: subprocess.Popen[str], rack_name: str
+) -> None:
     assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs on\n"
     words = Segment.attach(rack_name).words
     wait_until(lambda: words[System.TICK] > 100 and not words[System.HELD])
@@ -89,7 +108,10 @@ def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[str], rack_na
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("--ticks", "1", "--until", "counter"), "--ticks counts ticks, --cycles and --until count cycles"),
+        (
+            ("--ticks", "1", "--until", "counter"),
+            "--ticks counts ticks, --cycles and --until count cycles",
+        ),
         (("--run", "--ticks", "1"), "--run lets the rack run on; leave out the steps"),
     ],
 )

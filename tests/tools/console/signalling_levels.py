@@ -1,4 +1,5 @@
-"""A level that sends its launcher a signal at the moment of its life that MOMENT names, as often as SIGNALS has it."""
+"""A level that sends its launcher a signal at the moment of its life that MOMENT names, as often as
+SIGNALS has it."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ def send(moment: str) -> None:
     """Send the signals when this is their moment."""
     if os.environ["MOMENT"] == moment:
         # The launcher starts the crate, and the crate forks the boards.
-        here = {"config": os.getpid, "crate": os.getppid}.get(moment, lambda: parent_of(os.getppid()))
+        here = {"config": os.getpid, "crate": os.getppid}.get(
+            moment, lambda: parent_of(os.getppid())
+        )
         for number in os.environ["SIGNALS"].split():
             os.kill(here(), int(number))
 

@@ -1,4 +1,5 @@
-"""SIGINT, SIGTERM and SIGHUP at any moment of a run: the exit status says which, and nothing is left."""
+"""SIGINT, SIGTERM and SIGHUP at any moment of a run: the exit status says which, and nothing is
+left."""
 
 from __future__ import annotations
 
@@ -24,8 +25,12 @@ BEGUN = ("cycle", "close", "report")
 class Run:
     """`rack run` of a small rack whose upper level sends signals."""
 
-    def __init__(self, small: Path, name: str, folder: Path, moment: str = "", numbers: tuple[int, ...] = ()) -> None:
-        text = small.read_text().replace("two_levels:Upper", "tests.tools.console.signalling_levels:Signalling")
+    def __init__(
+        self, small: Path, name: str, folder: Path, moment: str = "", numbers: tuple[int, ...] = ()
+    ) -> None:
+        text = small.read_text().replace(
+            "two_levels:Upper", "tests.tools.console.signalling_levels:Signalling"
+        )
         small.write_text(text.replace("two_levels:", "tests.two_levels:"))
         self.name, self.folder = name, folder
         seconds = () if moment == "cycle" else ("--seconds", "0.5")
@@ -41,7 +46,11 @@ class Run:
                 *seconds,
             ],
             cwd=ROOT,
-            env={**os.environ, "MOMENT": moment, "SIGNALS": " ".join(str(int(number)) for number in numbers)},
+            env={
+                **os.environ,
+                "MOMENT": moment,
+                "SIGNALS": " ".join(str(int(number)) for number in numbers),
+            },
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -49,7 +58,8 @@ class Run:
         )
 
     def ended(self) -> tuple[int, str]:
-        """Wait for the end; return the exit status, as a shell has it, and what was said on stderr."""
+        """Wait for the end; return the exit status, as a shell has it, and what was said on
+        stderr."""
         try:
             _, said = self.process.communicate(timeout=BOUND_S)
         finally:
@@ -59,11 +69,15 @@ class Run:
         return (128 - status if status < 0 else status), said
 
     def reported(self, said: str) -> bool:
-        """Return whether there is a report; a slow machine has no time for it in 2 s, and then it says so."""
-        return (self.folder / "report.json").is_file() or "no time for the report: 'rack report" in said
+        """Return whether there is a report; a slow machine has no time for it in 2 s, and then it
+        says so."""
+        return (
+            self.folder / "report.json"
+        ).is_file() or "no time for the report: 'rack report" in said
 
     def leaves_nothing(self) -> bool:
-        """Return whether no shared memory is left; the boards die with the crate, a moment later."""
+        """Return whether no shared memory is left; the boards die with the crate, a moment
+        later."""
         wait_until(lambda: not named(f"{self.name}:") and not children_of(self.process.pid))
         return not [path.name for path in SHM_FOLDER.iterdir() if self.name in path.name]
 
@@ -71,7 +85,8 @@ class Run:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("moment", "number"),
-    # Each moment once, and each signal during the launch. During the run: SIGHUP below, SIGINT in test_commands.py.
+    # Each moment once, and each signal during the launch. During the run: SIGHUP below, SIGINT in
+    # test_commands.py.
     [("config", HUP), ("crate", TERM), ("self-test", INT), ("cycle", TERM), ("close", INT)],
 )
 def test_a_signal_at_any_moment_ends_a_run_and_leaves_nothing(
@@ -122,7 +137,9 @@ def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
 
 
 @pytest.mark.slow
-def test_a_terminal_that_is_gone_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path) -> None:
+def test_a_terminal_that_is_gone_ends_a_run_in_order(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
     pid, terminal = pty.fork()
     if pid == 0:
         words = ["run", str(small), "--set", f"name={rack_name}", "--set", "clock.mode=realtime"]
@@ -134,7 +151,8 @@ def test_a_terminal_that_is_gone_ends_a_run_in_order(small: Path, rack_name: str
     os.close(terminal)
     _, status = os.waitpid(pid, 0)
     assert os.waitstatus_to_exitcode(status) == 128 + HUP
-    # Ended in order, and not by the bound of the wait for that: nobody has heard that there was no time.
+    # Ended in order, and not by the bound of the wait for that: nobody has heard that there was no
+    # time.
     assert '"SIGHUP received"' in log.read_text()
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]
 

@@ -33,7 +33,14 @@ def test_columns_that_may_be_missing_go_before_anything_is_wrapped() -> None:
         "elemental_move      7",
     ]
     assert list(table(HEAD, ROWS, 56, ("count",))) == list(table(HEAD, ROWS))
-    assert next(table(HEAD, ROWS, 55, ("count",))).split() == ["task", "what", "it", "says", "of", "itself"]
+    assert next(table(HEAD, ROWS, 55, ("count",))).split() == [
+        "task",
+        "what",
+        "it",
+        "says",
+        "of",
+        "itself",
+    ]
 
 
 def test_a_table_without_rows_is_its_head() -> None:

@@ -1,4 +1,5 @@
-"""What is read from a rack's memory at the end of a run: the levels' last states, the arm, the faults that struck."""
+"""What is read from a rack's memory at the end of a run: the levels' last states, the arm, the
+faults that struck."""
 
 from __future__ import annotations
 
@@ -35,7 +36,11 @@ def box(message: MessageType, name: str) -> MailboxSpec:
     )
 
 
-BOXES = box(TASK_STATUS, "task.status"), box(SERVO_STATUS, "servo.status"), box(ARM_STATE, "arm.state")
+BOXES = (
+    box(TASK_STATUS, "task.status"),
+    box(SERVO_STATUS, "servo.status"),
+    box(ARM_STATE, "arm.state"),
+)
 
 
 def write(segment: Segment, name: str, **fields: object) -> None:
@@ -46,7 +51,9 @@ def write(segment: Segment, name: str, **fields: object) -> None:
     writer.write(0)
 
 
-def test_the_last_states_of_levels_are_told_with_their_reasons(make_bus: MakeBus) -> None:  # noqa: F811
+def test_the_last_states_of_levels_are_told_with_their_reasons(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(*BOXES, *TASKS)
     assert levels_of(segment) == ""
     write(segment, "arm.state", tick=1)
@@ -77,8 +84,14 @@ def test_only_a_level_that_gave_up_for_its_time_is_late(
     assert is_late(segment) is late
 
 
-@pytest.mark.parametrize(("speed", "rests"), [(0.5 * AT_REST, True), (-0.5 * AT_REST, True), (-2 * AT_REST, False)])
-def test_the_arm_is_as_its_board_last_reported_it(make_bus: MakeBus, speed: float, rests: bool) -> None:  # noqa: F811
+@pytest.mark.parametrize(
+    ("speed", "rests"), [(0.5 * AT_REST, True), (-0.5 * AT_REST, True), (-2 * AT_REST, False)]
+)
+def test_the_arm_is_as_its_board_last_reported_it(
+    make_bus: MakeBus,  # noqa: F811
+    speed: float,
+    rests: bool,
+) -> None:
     segment = make_bus(*BOXES, *TASKS)
     still = arm_of(segment)
     assert (still.violations, still.touches, still.is_at_rest) == (0, 0, True)
@@ -87,7 +100,9 @@ def test_the_arm_is_as_its_board_last_reported_it(make_bus: MakeBus, speed: floa
     assert (end.violations, end.touches, end.is_at_rest) == (3, 2, rests)
 
 
-def test_strikes_are_the_table_s_and_kills_from_outside_come_last(make_bus: MakeBus) -> None:  # noqa: F811
+def test_strikes_are_the_table_s_and_kills_from_outside_come_last(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = make_bus(*BOXES, *TASKS)
     table = FaultTable(segment)
     bias, mute = KINDS["sensor-bias"], KINDS["mute"]
@@ -97,12 +112,25 @@ def test_strikes_are_the_table_s_and_kills_from_outside_come_last(make_bus: Make
     begun.words[Entry.STAGE] = Stage.ACTIVE
     begun.acted(43)
     first, second, last = strikes(segment, JOINTS, [Killed("task", 60, 5_000)])
-    assert (first.kind, first.board, first.began, first.tick, first.count) == ("sensor-bias", "servo", 40, 43, 1)
+    assert (first.kind, first.board, first.began, first.tick, first.count) == (
+        "sensor-bias",
+        "servo",
+        40,
+        43,
+        1,
+    )
     assert (first.joint, first.mailboxes) == ("elbow", ("servo.status",))
     assert first.injection is not None
     assert (first.injection.seed, first.injection.parameters) == (7, joint)
     # It waits, so it has not begun.
     assert (second.kind, second.began, second.tick, second.count) == ("mute", -1, -1, 0)
     assert (second.fault, second.joint) == (waits.index, "")
-    assert (last.fault, last.kind, last.board, last.began, last.ends, last.tick) == (-1, EXTERNAL, "task", 60, 60, 60)
+    assert (last.fault, last.kind, last.board, last.began, last.ends, last.tick) == (
+        -1,
+        EXTERNAL,
+        "task",
+        60,
+        60,
+        60,
+    )
     assert last.mailboxes == ("task.status",)

@@ -28,7 +28,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     path = tmp_path_factory.mktemp("hang")
     (path / "small.toml").write_text(SMALL)
-    config = load(path / "small.toml", [f"name={path.parent.name}-hang", f"fault=[{HANG}, {NEVER}]"])
+    config = load(
+        path / "small.toml", [f"name={path.parent.name}-hang", f"fault=[{HANG}, {NEVER}]"]
+    )
     run_rack(config, 3.0, path / "run", Display())
     return path / "run"
 
@@ -41,7 +43,12 @@ def report(folder: Path) -> Report:
 @pytest.mark.slow
 def test_a_fault_is_reported_with_its_detection_reaction_and_recovery(report: Report) -> None:
     hang = report["faults"][0]
-    assert (hang["kind"], hang["board"], hang["struck"], hang["seen"]) == ("hang", "upper", 80, "detected")
+    assert (hang["kind"], hang["board"], hang["struck"], hang["seen"]) == (
+        "hang",
+        "upper",
+        80,
+        "detected",
+    )
     assert (hang["found_by"], hang["found_as"], hang["is_within"]) == ("clock", "hang", True)
     # Four releases of eight ticks unanswered.
     assert 0 < hang["delay_cycles"] <= hang["bound_cycles"] == 5
@@ -66,8 +73,19 @@ def test_the_report_says_the_same_whenever_it_is_made(folder: Path, report: Repo
 def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
     lines = markdown(report).splitlines()
     head = lines.index("## Faults: 2")
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[head + 2 : head + 6]]
-    assert cells[0] == ["fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after"]
+    cells = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines[head + 2 : head + 6]
+    ]
+    assert cells[0] == [
+        "fault",
+        "target",
+        "at tick",
+        "found as",
+        "after",
+        "bound",
+        "reactions",
+        "recovered after",
+    ]
     assert cells[2][:4] == ["hang", "upper", "80", "hang by clock"]
     assert cells[2][5] == "5 cycles"
     assert cells[3][:4] == ["hang", "lower", "-", "not struck"]
@@ -90,10 +108,16 @@ def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
 
     (tmp_path / "small.toml").write_text(SMALL)
     mute = f'fault=[{{ kind = "mute", board = "lower", tick = 80{lasts} }}]'
-    run_rack(load(tmp_path / "small.toml", [f"name={rack_name}", mute]), 2.0, tmp_path / "run", Display())
+    run_rack(
+        load(tmp_path / "small.toml", [f"name={rack_name}", mute]), 2.0, tmp_path / "run", Display()
+    )
     report = write_report(tmp_path / "run")[0]
     (fault,) = report["faults"]
-    assert (fault["seen"], fault["found_as"], fault["is_recovered"]) == ("detected", "mute", bool(lasts))
+    assert (fault["seen"], fault["found_as"], fault["is_recovered"]) == (
+        "detected",
+        "mute",
+        bool(lasts),
+    )
     row = next(line for line in markdown(report).splitlines() if line.startswith("| mute"))
     assert row.strip("| ").endswith(recovered)
 
@@ -106,16 +130,23 @@ def test_a_run_without_faults_has_no_such_section(report: Report) -> None:
 
 def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder: Path) -> None:
     lane = read(folder / "run.rrd", "/events/upper", "StateChange:state").values.ravel().tolist()
-    # The fault ends with its board's process; who hears of which first is open, and the reaction stays in sight.
+    # The fault ends with its board's process; who hears of which first is open, and the reaction
+    # stays in sight.
     assert [state for state in lane if state] == ["fault", "died", "reaction", "recovery"]
     assert "" not in lane[lane.index("died") :]
     text = read(folder / "run.rrd", "/log/events", "TextLog:text").values.ravel().tolist()
     levels = read(folder / "run.rrd", "/log/events", "TextLog:level").values.ravel().tolist()
     level_of = {line.partition(":")[0]: level for line, level in zip(text, levels, strict=True)}
-    assert (level_of["fault"], level_of["detection"], level_of["recovery"]) == ("WARN", "ERROR", "INFO")
+    assert (level_of["fault"], level_of["detection"], level_of["recovery"]) == (
+        "WARN",
+        "ERROR",
+        "INFO",
+    )
 
 
-def test_the_graph_of_boards_shows_who_is_lost_until_it_is_back(folder: Path, report: Report) -> None:
+def test_the_graph_of_boards_shows_who_is_lost_until_it_is_back(
+    folder: Path, report: Report
+) -> None:
     from rack.tools.viewer.style import STATES
 
     names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()

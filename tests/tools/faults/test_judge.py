@@ -74,16 +74,25 @@ def test_a_detection_long_after_the_end_of_a_fault_is_of_something_else() -> Non
 
 def test_of_two_overlapping_faults_each_has_its_own_detection() -> None:
     both = [strike("corrupt", "lower", 100, 200), strike("mute", "upper", 120, 200, place=1)]
-    events = found(103, "damaged", "upper", "lower.status"), found(137, "mute", "lower", "upper.command")
+    events = (
+        found(103, "damaged", "upper", "lower.status"),
+        found(137, "mute", "lower", "upper.command"),
+    )
     faults = verdict(both, *events).faults
-    assert [(f.kind, f.seen, f.delay) for f in faults] == [("corrupt", "detected", 3), ("mute", "detected", 17)]
+    assert [(f.kind, f.seen, f.delay) for f in faults] == [
+        ("corrupt", "detected", 3),
+        ("mute", "detected", 17),
+    ]
 
 
 def test_one_alarm_is_the_detection_of_one_of_two_equal_faults() -> None:
     both = [strike("corrupt", "lower", 100, 200), strike("corrupt", "lower", 101, 200, place=1)]
     faults = verdict(both, found(103, "damaged", "upper", "lower.status")).faults
     assert [fault.seen for fault in faults] == ["detected", "missed"]
-    events = found(103, "damaged", "upper", "lower.status"), found(111, "damaged", "upper", "lower.status")
+    events = (
+        found(103, "damaged", "upper", "lower.status"),
+        found(111, "damaged", "upper", "lower.status"),
+    )
     assert [fault.seen for fault in verdict(both, *events).faults] == ["detected", "detected"]
 
 
@@ -92,7 +101,12 @@ def test_a_death_that_the_rack_finds_late_is_late_whatever_its_neighbours_find(k
     killed, stale = strike(kind, "lower", 100), found(104, "stale", "upper", "lower.status")
     died = Event(100 * TICK_NS + 49_900_000, 101, "died", "lower", "died", "died")
     fault = judged(killed, stale, died)
-    assert (fault.found_by, fault.delay_ms, fault.bound_ms, fault.is_within) == ("the Rack", 49.9, 50.0, True)
+    assert (fault.found_by, fault.delay_ms, fault.bound_ms, fault.is_within) == (
+        "the Rack",
+        49.9,
+        50.0,
+        True,
+    )
     late = replace(died, time_ns=100 * TICK_NS + 50_100_000)
     assert not judged(killed, stale, late).is_within
     # Nobody but the Rack has noticed: that is no detection of a death.
@@ -108,20 +122,27 @@ def test_the_death_of_another_board_is_no_detection_and_unexplained() -> None:
 
 def test_ticks_that_the_clock_left_out_are_not_counted() -> None:
     skips = [event(106, "miss", "clock_skipped", board, value=5.0) for board in ("upper", "lower")]
-    fault = judged(strike("mute", "lower", 100, 150), *skips, found(115, "mute", "upper", "lower.status"))
+    fault = judged(
+        strike("mute", "lower", 100, 150), *skips, found(115, "mute", "upper", "lower.status")
+    )
     # The two tasks tell of the same five ticks.
     assert (fault.delay, fault.is_within) == (10, True)
 
 
 def test_a_skip_of_the_clock_is_found_by_the_ticks_that_it_leaves_out() -> None:
-    fault = judged(strike("clock-skip", "clock", 100), event(101, "miss", "clock_skipped", "lower", value=1.0))
+    fault = judged(
+        strike("clock-skip", "clock", 100), event(101, "miss", "clock_skipped", "lower", value=1.0)
+    )
     assert (fault.seen, fault.delay, fault.bound, fault.is_within) == ("detected", 1, 1, True)
 
 
-@pytest.mark.parametrize(("subject", "seen"), [("elbow", "detected"), ("wrist", "missed"), ("", "detected")])
+@pytest.mark.parametrize(
+    ("subject", "seen"), [("elbow", "detected"), ("wrist", "missed"), ("", "detected")]
+)
 def test_a_fault_of_a_joint_is_found_at_that_joint(subject: str, seen: str) -> None:
     fault = judged(
-        strike("command-nan", "lower", 100, 110, joint="elbow"), found(100, "command_invalid", "lower", subject)
+        strike("command-nan", "lower", 100, 110, joint="elbow"),
+        found(100, "command_invalid", "lower", subject),
     )
     assert fault.seen == seen
 
@@ -146,13 +167,21 @@ def test_recovery_lasts_until_the_last_reaction_is_undone() -> None:
         event(340, "recovery", "brakes_opened", "lower"),
     )
     fault = judged(strike("kill", "lower", 100), *events)
-    assert (fault.reactions, fault.is_recovered, fault.recovery) == (("restart", "brakes_closed"), True, 240)
+    assert (fault.reactions, fault.is_recovered, fault.recovery) == (
+        ("restart", "brakes_closed"),
+        True,
+        240,
+    )
 
 
 def test_brakes_that_closed_for_missed_cycles_are_open_again_when_that_is_told() -> None:
-    fault = judged(strike("overrun", "lower", 100), event(104, "reaction", "brakes_closed", "lower", value=3.0))
+    fault = judged(
+        strike("overrun", "lower", 100), event(104, "reaction", "brakes_closed", "lower", value=3.0)
+    )
     assert (fault.reactions, fault.is_recovered, fault.recovery) == (("brakes_closed",), True, 4)
-    demanded = judged(strike("sensor-nan", "lower", 100), event(100, "reaction", "brakes_closed", "lower"))
+    demanded = judged(
+        strike("sensor-nan", "lower", 100), event(100, "reaction", "brakes_closed", "lower")
+    )
     assert not demanded.is_recovered
 
 
@@ -167,14 +196,20 @@ def test_a_reaction_long_after_a_fault_is_not_its_own() -> None:
 
 
 def test_a_reaction_that_is_not_undone_is_no_recovery() -> None:
-    events = (event(100, "reaction", "restart", "lower"), event(300, "recovery", "rejoined", "upper"))
+    events = (
+        event(100, "reaction", "restart", "lower"),
+        event(300, "recovery", "rejoined", "upper"),
+    )
     fault = judged(strike("kill", "lower", 100), *events)
     assert (fault.is_recovered, fault.recovery) == (False, None)
 
 
 def test_reactions_behind_the_next_fault_are_of_that_one() -> None:
     both = [strike("command-nan", "lower", 100, 110), strike("kill", "lower", 500, place=1)]
-    events = (event(500, "reaction", "restart", "lower"), event(700, "recovery", "rejoined", "lower"))
+    events = (
+        event(500, "reaction", "restart", "lower"),
+        event(700, "recovery", "rejoined", "lower"),
+    )
     first, second = verdict(both, *events).faults
     assert (first.reactions, first.recovery) == ((), None)
     assert (second.reactions, second.recovery) == (("restart",), 200)
@@ -182,7 +217,9 @@ def test_reactions_behind_the_next_fault_are_of_that_one() -> None:
 
 def test_a_detection_without_a_fault_is_unexplained_and_a_miss_is_not() -> None:
     false = found(4000, "stale", "upper", "lower.status")
-    found_out = verdict([strike("mute", "lower", 100, 150)], false, event(4000, "miss", "late", "clock", "lower"))
+    found_out = verdict(
+        [strike("mute", "lower", 100, 150)], false, event(4000, "miss", "late", "clock", "lower")
+    )
     assert found_out.unexplained == (false,)
 
 
@@ -207,7 +244,8 @@ def test_a_fault_explains_what_its_kind_leads_to_and_nothing_else(other: Event) 
 
 
 def test_a_fault_explains_nothing_after_its_window() -> None:
-    # Its bound, a cycle and two seconds and a quarter for a restart, the last message's way, a quarter of a second.
+    # Its bound, a cycle and two seconds and a quarter for a restart, the last message's way, a
+    # quarter of a second.
     late = found(100 + 2 + 1 + 900 + (1 + 8) + 100 + 1, "stale", "upper", "lower.status")
     in_time = replace(late, tick=late.tick - 1)
     assert verdict([strike("kill", "lower", 100)], late).unexplained == (late,)
@@ -215,7 +253,10 @@ def test_a_fault_explains_nothing_after_its_window() -> None:
 
 
 def test_what_a_task_finds_has_the_tick_of_its_release_which_may_be_before_the_fault() -> None:
-    in_slice, before = found(97, "masquerade", "lower.planner", "lower.status"), found(90, "masquerade", "upper", "")
+    in_slice, before = (
+        found(97, "masquerade", "lower.planner", "lower.status"),
+        found(90, "masquerade", "upper", ""),
+    )
     early = replace(in_slice, tick=94)
     forged = strike("masquerade", "lower", 100)
     assert verdict([forged], in_slice).unexplained == ()
@@ -236,7 +277,9 @@ def test_a_reaction_that_a_kind_must_have_and_that_does_not_come_is_lacking() ->
 
 
 @pytest.mark.parametrize(("opened", "recovered"), [(110 + 100, True), (110 + 101, False)])
-def test_what_was_done_must_be_undone_within_the_bound_of_the_kind(opened: int, recovered: bool) -> None:
+def test_what_was_done_must_be_undone_within_the_bound_of_the_kind(
+    opened: int, recovered: bool
+) -> None:
     events = (
         found(100, "command_invalid", "lower"),
         event(100, "reaction", "brakes_closed", "lower"),
@@ -247,7 +290,9 @@ def test_what_was_done_must_be_undone_within_the_bound_of_the_kind(opened: int, 
     assert (fault.is_recovered, fault.recovery_bound) == (recovered, 110)
 
 
-def test_a_fault_that_may_be_latched_is_recovered_from_when_it_is_and_the_task_ends_with_it() -> None:
+def test_a_fault_that_may_be_latched_is_recovered_from_when_it_is_and_the_task_ends_with_it() -> (
+    None
+):
     events = (
         event(100, "reaction", "brakes_closed", "lower"),
         event(900, "reaction", "latched", "lower"),
@@ -261,8 +306,12 @@ def test_a_fault_that_may_be_latched_is_recovered_from_when_it_is_and_the_task_e
     assert not judged(strike("command-nan", "lower", 100, 2000), *events).is_recovered
 
 
-def test_an_obstacle_that_moves_may_meet_an_arm_that_a_fault_has_kept_and_nothing_else_may() -> None:
-    hit = replace(found(300, "collision", "lower", "arm"), text="unintended contact: 'arm' touches 'post'")
+def test_an_obstacle_that_moves_may_meet_an_arm_that_a_fault_has_kept_and_nothing_else_may() -> (
+    None
+):
+    hit = replace(
+        found(300, "collision", "lower", "arm"), text="unintended contact: 'arm' touches 'post'"
+    )
     events = (
         event(100, "reaction", "brakes_closed", "lower"),
         event(110, "recovery", "brakes_opened", "lower"),
@@ -280,14 +329,19 @@ def test_an_obstacle_that_moves_may_meet_an_arm_that_a_fault_has_kept_and_nothin
 
 
 def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() -> None:
-    events = (found(100, "command_invalid", "lower"), event(100, "reaction", "brakes_closed", "lower"))
+    events = (
+        found(100, "command_invalid", "lower"),
+        event(100, "reaction", "brakes_closed", "lower"),
+    )
     nan = strike("command-nan", "lower", 100, 110)
     assert judge([nan], [*events, event(209, "end", "")], REAL_TIME).faults[0].is_recovered
     assert not judge([nan], [*events, event(210, "end", "")], REAL_TIME).faults[0].is_recovered
 
 
 def test_what_is_latched_is_no_reaction_to_a_fault_that_cannot_be() -> None:
-    muted = judged(strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"), flows(152))
+    muted = judged(
+        strike("mute", "lower", 100, 150), event(110, "reaction", "latched", "lower"), flows(152)
+    )
     assert (muted.reactions, muted.is_recovered) == ((), True)
 
 
@@ -307,7 +361,9 @@ def test_struck_messages_are_recovered_from_when_they_flow_again(
     seen: list[Event], recovered: bool, after: int | None
 ) -> None:
     # A message is due a tick after the end, and read a tick later; then a quarter of a second.
-    fault = judged(strike("mute", "lower", 100, 150), found(107, "mute", "upper", "lower.status"), *seen)
+    fault = judged(
+        strike("mute", "lower", 100, 150), found(107, "mute", "upper", "lower.status"), *seen
+    )
     assert (fault.seen, fault.is_recovered, fault.recovery, fault.recovery_bound) == (
         *("detected", recovered, after),
         50 + 1 + 1 + 100,
@@ -319,11 +375,16 @@ def test_nothing_recovers_from_a_fault_of_messages_without_an_end() -> None:
     fault = judge([silent], [flows(99), mute, event(200, "end", "")], REAL_TIME).faults[0]
     assert (fault.seen, fault.struck, fault.is_recovered) == ("detected", 100, False)
     # One that was to end says nothing yet.
-    assert judge([replace(silent, ends=900)], [mute, event(200, "end", "")], REAL_TIME).faults[0].seen == "not struck"
+    assert (
+        judge([replace(silent, ends=900)], [mute, event(200, "end", "")], REAL_TIME).faults[0].seen
+        == "not struck"
+    )
 
 
 def test_a_plan_is_recovered_from_whenever_the_next_one_comes_and_undecided_without_one() -> None:
-    layout = replace(LAYOUT, mailboxes=(*LAYOUT.mailboxes, box("lower.plan", "lower.planner", "lower", 4)))
+    layout = replace(
+        LAYOUT, mailboxes=(*LAYOUT.mailboxes, box("lower.plan", "lower.planner", "lower", 4))
+    )
     forged = replace(strike("masquerade", "lower.planner", 100), mailboxes=("lower.plan",))
     run = Circumstances(layout, offset_ns=0)
     late = verdict([forged], flows(9000, "lower.plan"), run=run).faults[0]
@@ -332,10 +393,17 @@ def test_a_plan_is_recovered_from_whenever_the_next_one_comes_and_undecided_with
 
 
 @pytest.mark.parametrize(("tick", "within"), [(118, True), (127, True), (128, False)])
-def test_the_delay_of_a_fault_counts_from_its_strike_and_its_bound_from_when_it_shows(tick: int, within: bool) -> None:
+def test_the_delay_of_a_fault_counts_from_its_strike_and_its_bound_from_when_it_shows(
+    tick: int, within: bool
+) -> None:
     weak = replace(strike("actuator-saturated", "lower", 100, 150), hidden=15, count=30)
     fault = judged(weak, found(tick, "actuator", "lower", "elbow"))
-    assert (fault.struck, fault.delay, fault.bound, fault.is_within) == (100, tick - 100, 15 + 12, within)
+    assert (fault.struck, fault.delay, fault.bound, fault.is_within) == (
+        100,
+        tick - 100,
+        15 + 12,
+        within,
+    )
 
 
 def test_misses_that_no_fault_explains_are_counted_apart_from_detections() -> None:
@@ -349,7 +417,13 @@ def test_in_lockstep_a_death_is_bounded_in_ticks_for_the_wall_clock_means_nothin
     died = Event(900 * TICK_NS, 99, "died", "lower", "died", "died")
     fault = judged(strike("kill", "lower", 100), died, run=LOCKSTEP)
     # It strikes before its tick is given out: the Rack may see the tick before.
-    assert (fault.seen, fault.delay, fault.bound, fault.delay_ms, fault.is_within) == ("detected", 0, 2, None, True)
+    assert (fault.seen, fault.delay, fault.bound, fault.delay_ms, fault.is_within) == (
+        "detected",
+        0,
+        2,
+        None,
+        True,
+    )
 
 
 def test_in_lockstep_a_death_that_the_clock_knows_nothing_of_has_neighbours_for_its_bound() -> None:
@@ -361,11 +435,18 @@ def test_in_lockstep_a_death_that_the_clock_knows_nothing_of_has_neighbours_for_
 def test_brakes_that_are_engaged_when_a_fault_strikes_need_not_be_engaged_for_it() -> None:
     torque = strike("command-limit", "lower", 100, 110, joint="elbow")
     refused = found(100, "command_limit", "lower", "elbow")
-    engaged, released = event(60, "reaction", "brakes_closed"), event(110, "recovery", "brakes_opened")
+    engaged, released = (
+        event(60, "reaction", "brakes_closed"),
+        event(110, "recovery", "brakes_opened"),
+    )
     assert judged(torque, refused, engaged, released).lacking == ()
-    assert judged(torque, refused, engaged, replace(released, tick=99)).lacking == ("brakes_closed",)
+    assert judged(torque, refused, engaged, replace(released, tick=99)).lacking == (
+        "brakes_closed",
+    )
     # For missed cycles they were engaged until there was torque again.
-    assert judged(torque, refused, replace(engaged, value=3.0), released).lacking == ("brakes_closed",)
+    assert judged(torque, refused, replace(engaged, value=3.0), released).lacking == (
+        "brakes_closed",
+    )
 
 
 def test_what_is_too_late_for_one_fault_and_in_time_for_the_next_is_of_the_next() -> None:
@@ -376,7 +457,9 @@ def test_what_is_too_late_for_one_fault_and_in_time_for_the_next_is_of_the_next(
 
 
 @pytest.mark.parametrize(("count", "seen"), [(4, "not struck"), (5, "missed")])
-def test_a_fault_of_the_arm_that_is_over_before_it_must_be_found_has_not_struck(count: int, seen: str) -> None:
+def test_a_fault_of_the_arm_that_is_over_before_it_must_be_found_has_not_struck(
+    count: int, seen: str
+) -> None:
     off = strike("actuator-off", "lower", 100, 150, joint="elbow", count=count)
     assert judged(off).seen == seen
     late = replace(off, count=4)
@@ -392,7 +475,10 @@ def test_no_motor_at_fault_explains_an_alarm_about_another() -> None:
 
 def test_a_fault_of_the_arm_that_is_found_has_struck_however_slight_it_was() -> None:
     slight = replace(strike("actuator-off", "lower", 100, 150), count=0)
-    own, other = found(104, "actuator", "lower", "elbow"), found(104, "sensor_range", "lower", "elbow")
+    own, other = (
+        found(104, "actuator", "lower", "elbow"),
+        found(104, "sensor_range", "lower", "elbow"),
+    )
     found_out = verdict([slight], own, other)
     fault = found_out.faults[0]
     assert (fault.seen, fault.struck, fault.delay, fault.bound) == ("detected", 100, 4, None)

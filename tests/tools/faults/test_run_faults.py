@@ -21,13 +21,19 @@ def run(config: Path | str, name: str, *arguments: str | Path) -> subprocess.Com
     return rack("run", config, "--set", f"name={name}", *arguments)
 
 
-def test_a_run_with_a_script_repeats_with_its_faults(small: Path, rack_name: str, tmp_path: Path) -> None:
+def test_a_run_with_a_script_repeats_with_its_faults(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
     script = tmp_path / "hang.toml"
     script.write_text(HANG)
-    done = run(small, rack_name, "--faults", script, "--seconds", "2", "--out", tmp_path / "run", "--json")
+    done = run(
+        small, rack_name, "--faults", script, "--seconds", "2", "--out", tmp_path / "run", "--json"
+    )
     assert done.returncode == 0, done.stderr
     # The resolved config holds the script: it needs no file to run again.
-    again = run(tmp_path / "run" / "config.toml", rack_name, "--seconds", "2", "--no-record", "--json")
+    again = run(
+        tmp_path / "run" / "config.toml", rack_name, "--seconds", "2", "--no-record", "--json"
+    )
     assert again.returncode == 0, again.stderr
     report, repeated = json.loads(done.stdout), json.loads(again.stdout)
     assert report["digest"] == repeated["digest"]
@@ -39,10 +45,19 @@ def test_a_run_with_a_script_repeats_with_its_faults(small: Path, rack_name: str
 @pytest.mark.parametrize(
     ("script", "line"),
     [
-        ("noisy", f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'),
+        (
+            "noisy",
+            f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path',
+        ),
         ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task to strike"),
-        ("[[fault]]\nkind = 'kill'\nboard = 'servo'", 'fault[0].board = "servo": no such task; tasks: upper, lower'),
-        ("[[fault]]\nkind = 'hog'\nboard = 'lower'", 'fault[0].kind = "hog": hog needs real time: in lockstep time'),
+        (
+            "[[fault]]\nkind = 'kill'\nboard = 'servo'",
+            'fault[0].board = "servo": no such task; tasks: upper, lower',
+        ),
+        (
+            "[[fault]]\nkind = 'hog'\nboard = 'lower'",
+            'fault[0].kind = "hog": hog needs real time: in lockstep time',
+        ),
         ("[[fault]\n", "script.toml: not TOML: "),
         ("[run]\n", "script.toml: run: a fault script contains [[fault]] tables and nothing else"),
     ],
@@ -65,12 +80,24 @@ def test_a_script_that_does_not_fit_is_refused_before_anything_starts(
 BIAS = '[[fault]]\nkind = "sensor-bias"\nboard = "servo"\njoint = 2\nsize = 0.31\ntick = 1000\n'
 
 
-def test_a_sensor_that_stays_wrong_ends_the_task_with_its_joint_and_value(rack_name: str, tmp_path: Path) -> None:
+def test_a_sensor_that_stays_wrong_ends_the_task_with_its_joint_and_value(
+    rack_name: str, tmp_path: Path
+) -> None:
     script = tmp_path / "bias.toml"
     script.write_text(BIAS)
-    arguments = ("--lockstep", "--set", "board.servo.params.patience=0.5", "--faults", script, "--no-record", "--json")
+    arguments = (
+        "--lockstep",
+        "--set",
+        "board.servo.params.patience=0.5",
+        "--faults",
+        script,
+        "--no-record",
+        "--json",
+    )
     done = run("nasrem", rack_name, *arguments)
     outcome = json.loads(done.stdout)["outcome"]
     assert (done.returncode, outcome["cause"]) == (1, "task failed")
-    assert "sensor of 'j3' reads -2.79 rad, off by 0.31; not over within 0.5 s" in json.dumps(outcome)
+    assert "sensor of 'j3' reads -2.79 rad, off by 0.31; not over within 0.5 s" in json.dumps(
+        outcome
+    )
     assert outcome["ticks"] < 4000

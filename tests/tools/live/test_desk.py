@@ -46,10 +46,14 @@ def end(process: subprocess.Popen[str], name: str) -> None:
 
 
 @pytest.fixture(scope="module", params=["realtime", "lockstep"])
-def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def running(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[str]:
     """The name of a rack that runs until it is stopped."""
     name = f"test-command-{request.param}-{os.getpid()}"
-    process = start(tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}")
+    process = start(
+        tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}"
+    )
     yield name
     end(process, name)
 
@@ -66,7 +70,9 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
     assert answer["taken_up"] % 8 == 0
     again = rack("command", running, "upper", "resume")
     assert again.returncode == 0
-    assert again.stdout.startswith(f"command {answer['serial'] + 1} to 'upper', resume: given at tick ")
+    assert again.stdout.startswith(
+        f"command {answer['serial'] + 1} to 'upper', resume: given at tick "
+    )
 
 
 def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
@@ -81,10 +87,14 @@ def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     running: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A level that never completes it.
-    monkeypatch.setattr(Replies, "look", lambda replies: replace(replies.reply, fate="taken", taken_up=0))
+    monkeypatch.setattr(
+        Replies, "look", lambda replies: replace(replies.reply, fate="taken", taken_up=0)
+    )
     still = f", not done; in force until: rack command {running} upper resume$"
     with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
-        LiveDesk(LocalRack(running)).give({"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0)
+        LiveDesk(LocalRack(running)).give(
+            {"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0
+        )
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
@@ -101,7 +111,9 @@ def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
 
 
 def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
-    rows = {row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)}
+    rows = {
+        row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)
+    }
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
     assert rows["lower"]["takes"] == "hold, resume, modify twice on|off"
 
@@ -117,20 +129,31 @@ REFUSED = {
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
     "nothing that is said": (("upper", "halt"), "'setpoint', 'goto', 'modify', 'table' or 'do'"),
-    "not for this level": (("lower", "setpoint", "joints=1"), "'lower' does not take setpoint; it takes: hold, resume"),
+    "not for this level": (
+        ("lower", "setpoint", "joints=1"),
+        "'lower' does not take setpoint; it takes: hold, resume",
+    ),
     "no goal": (("upper", "goto"), "goal: missing; goto of 'upper' takes one of: home"),
-    "no word": (("upper", "goto", "hom"), "'hom': not a goal; permitted: home, joints=..., position=..."),
+    "no word": (
+        ("upper", "goto", "hom"),
+        "'hom': not a goal; permitted: home, joints=..., position=...",
+    ),
     "no number": (
         ("upper", "goto", "joints=1,x"),
         "'joints=1,x': 'x' is not a number; permitted: numbers separated by commas",
     ),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
-    "a tick that has passed": (("upper", "hold", "--tick", "0"), "tick = 0: has passed; the rack is at tick "),
+    "a tick that has passed": (
+        ("upper", "hold", "--tick", "0"),
+        "tick = 0: has passed; the rack is at tick ",
+    ),
 }
 
 
 @pytest.mark.parametrize(("words", "reason"), REFUSED.values(), ids=REFUSED)
-def test_bad_usage_is_one_line_and_status_2(running: str, words: tuple[str, ...], reason: str) -> None:
+def test_bad_usage_is_one_line_and_status_2(
+    running: str, words: tuple[str, ...], reason: str
+) -> None:
     done = rack("command", running, *words)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
@@ -145,7 +168,9 @@ def test_a_rack_that_is_not_there_is_one_line() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(running: str, end: signal.Signals) -> None:
+def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
+    running: str, end: signal.Signals
+) -> None:
     table = OperatorTable(Segment.attach(running))
     command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)

@@ -18,8 +18,16 @@ PROGRESS = TaskProgress(5, 25, 1, 4, "executing", "")
 SNAPSHOT = Snapshot("demo", "running", 1200, 3.0, 0, (), "none", (), (ROW, PLANNER), PROGRESS)
 
 
-MOVE = replace(PLANNER, task="elemental_move.planner", exec_ms=1027.97, lateness_ms=1969.67, state="executing")
-HOLD = Hold("task", 15268, 38.17, "diverted by the operator (goto home)", "rack command a-rack-of-mine task resume")
+MOVE = replace(
+    PLANNER, task="elemental_move.planner", exec_ms=1027.97, lateness_ms=1969.67, state="executing"
+)
+HOLD = Hold(
+    "task",
+    15268,
+    38.17,
+    "diverted by the operator (goto home)",
+    "rack command a-rack-of-mine task resume",
+)
 
 
 def shown(snapshot: Snapshot, width: int) -> str:
@@ -33,26 +41,44 @@ def test_the_table_has_a_line_for_every_task() -> None:
     lines = shown(SNAPSHOT, 120).splitlines()
     servo = next(line for line in lines if " servo " in line)
     counts = ["1200", "1201", "3", "4", "1"]
-    assert servo.split() == ["2", "servo", "1", "FIFO", "80", "400", *counts, "0.25", "-", "executing"]
+    assert servo.split() == [
+        "2",
+        "servo",
+        "1",
+        "FIFO",
+        "80",
+        "400",
+        *counts,
+        "0.25",
+        "-",
+        "executing",
+    ]
     planner = next(line for line in lines if "servo.planner" in line)
     assert planner.split()[3] == "other"
     assert "action 1/4, move 5/25" in lines[-1]
 
 
 def test_reasons_and_utility_lines_are_shown() -> None:
-    snapshot = replace(SNAPSHOT, lines=("EMERGENCY STOP",), tasks=(replace(ROW, reason="joint 'j2': too far"),))
+    snapshot = replace(
+        SNAPSHOT, lines=("EMERGENCY STOP",), tasks=(replace(ROW, reason="joint 'j2': too far"),)
+    )
     assert "EMERGENCY STOP" in shown(snapshot, 120)
     assert "servo: joint 'j2': too far" in shown(snapshot, 120)
     assert line_of(snapshot).endswith("EMERGENCY STOP  servo: joint 'j2': too far")
 
 
 def test_the_line_counts_over_all_tasks() -> None:
-    assert "3.00 s  tick 1200  missed 3  skipped 4  task executing, action 1/4, move 5/25" in line_of(SNAPSHOT)
+    assert (
+        "3.00 s  tick 1200  missed 3  skipped 4  task executing, action 1/4, move 5/25"
+        in line_of(SNAPSHOT)
+    )
 
 
 def test_faults_demands_and_lost_boards_are_shown() -> None:
     lost = replace(PLANNER, state="lost")
-    snapshot = replace(SNAPSHOT, demand="brake", faults=("mute of servo (servo.status)",), tasks=(ROW, lost))
+    snapshot = replace(
+        SNAPSHOT, demand="brake", faults=("mute of servo (servo.status)",), tasks=(ROW, lost)
+    )
     lines = shown(snapshot, 120).splitlines()
     assert lines[0].endswith("arm: brake")
     assert next(line for line in lines if "servo.planner" in line).split()[-1] == "lost"
@@ -90,7 +116,9 @@ def test_the_table_has_as_many_columns_as_fit_and_cuts_none(width: int) -> None:
 def test_what_holds_the_rack_is_shown_with_a_command_that_is_not_torn() -> None:
     snapshot = replace(SNAPSHOT, holds=(HOLD,))
     narrow, wide = shown(snapshot, 80).splitlines(), shown(snapshot, 160).splitlines()
-    assert "  to release: rack command a-rack-of-mine task resume" in (line.rstrip() for line in narrow)
+    assert "  to release: rack command a-rack-of-mine task resume" in (
+        line.rstrip() for line in narrow
+    )
     assert HOLD.line in (line.rstrip() for line in wide)
     assert line_of(snapshot).endswith(HOLD.line)
 

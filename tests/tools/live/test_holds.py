@@ -40,7 +40,9 @@ def give(segment: Segment, *whats: Operation) -> None:
     writer.close()
 
 
-def answer(segment: Segment, standing: Operation, order: int, given: Answer, state: State = State.EXECUTING) -> None:
+def answer(
+    segment: Segment, standing: Operation, order: int, given: Answer, state: State = State.EXECUTING
+) -> None:
     writer = open_writer(segment, "upper.status")
     message = writer.message
     message.standing, message.order, message.answer, message.state = standing, order, given, state
@@ -63,9 +65,13 @@ def test_an_operators_hold_says_since_when_and_how_to_release_it(segment: Segmen
 def test_a_diversion_says_where_to_and_whether_it_is_there(segment: Segment) -> None:
     give(segment, Operation.GOTO)
     answer(segment, Operation.GOTO, 1, Answer.TAKEN)
-    assert lines(segment)[0].startswith("upper diverted by the operator (goto home), since 0.25 s; ")
+    assert lines(segment)[0].startswith(
+        "upper diverted by the operator (goto home), since 0.25 s; "
+    )
     answer(segment, Operation.GOTO, 1, Answer.DONE)
-    assert lines(segment)[0].startswith("upper diverted by the operator (goto home, done), since 0.25 s; ")
+    assert lines(segment)[0].startswith(
+        "upper diverted by the operator (goto home, done), since 0.25 s; "
+    )
 
 
 def test_a_command_that_was_refused_leaves_the_one_before_it_standing(segment: Segment) -> None:
@@ -102,7 +108,14 @@ def test_a_standstill_is_one_event_for_each_hold(segment: Segment) -> None:
         segment.words[System.TICK] = round(second / TICK_S)
         events += list(standstill.look())
     (event,) = events
-    assert (event.kind, event.code, event.subject, event.since) == ("held", "standstill", "upper", 100)
+    assert (event.kind, event.code, event.subject, event.since) == (
+        "held",
+        "standstill",
+        "upper",
+        100,
+    )
     # Held since 0.25 s, looked at every second.
     assert event.tick == round((STILL_S + 1) / TICK_S)
-    assert event.text.startswith("nothing has moved for 6 s: upper held by the operator (hold), since 0.25 s; ")
+    assert event.text.startswith(
+        "nothing has moved for 6 s: upper held by the operator (hold), since 0.25 s; "
+    )

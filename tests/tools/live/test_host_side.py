@@ -1,4 +1,5 @@
-"""The host side on the command line: a prompt, what status and check show, and replays of recorded entries."""
+"""The host side on the command line: a prompt, what status and check show, and replays of recorded
+entries."""
 
 from __future__ import annotations
 
@@ -60,9 +61,15 @@ def test_entries_of_another_rack_are_refused_in_one_line(
     other.write_text(text.replace("[host", 'reads.number = "bridge.others"\n\n[host'))
     done = rack("run", other, "--entries", run, "--no-record")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"--entries {run}: bridge.others: no such mailbox; needed: number 1, 24 bytes\n"
+    assert (
+        done.stderr
+        == f"--entries {run}: bridge.others: no such mailbox; needed: number 1, 24 bytes\n"
+    )
     none = rack("run", "k1607", "--set", f"name={rack_name}", "--entries", run, "--no-record")
-    assert (none.returncode, none.stderr) == (2, f"--entries {run}: '{rack_name}' has no bus adapter\n")
+    assert (none.returncode, none.stderr) == (
+        2,
+        f"--entries {run}: '{rack_name}' has no bus adapter\n",
+    )
 
 
 def test_check_shows_the_host_side_and_leaves_it_out_of_the_timing(hosted: Path) -> None:
@@ -76,18 +83,28 @@ def test_check_shows_the_host_side_and_leaves_it_out_of_the_timing(hosted: Path)
 @contextmanager
 def console(hosted: Path, name: str) -> Iterator[Rack]:
     """Run a rack with an external host board."""
-    settings = [f"name={name}", "host.program.external=true", "host.program.program=host_programs:Console"]
+    settings = [
+        f"name={name}",
+        "host.program.external=true",
+        "host.program.program=host_programs:Console",
+    ]
     with Rack(load(hosted, settings)) as running:
         running.start()
         yield running
 
 
 @pytest.mark.slow
-def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(hosted: Path, rack_name: str) -> None:
+def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
+    hosted: Path, rack_name: str
+) -> None:
     with console(hosted, rack_name) as running:
         assert any("--entries RUN repeats a run" in event.text for event in running.events)
         first = subprocess.Popen(
-            [*RACK, "prompt", rack_name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+            [*RACK, "prompt", rack_name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
         )
         assert first.stdin is not None
         assert first.stdout is not None
@@ -97,13 +114,18 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(hosted: Path, r
                 continue
             second = rack("prompt", rack_name)
             assert second.returncode == 1
-            assert second.stderr == f"host board 'program' is run by process {first.pid} already; permitted: one\n"
+            assert (
+                second.stderr
+                == f"host board 'program' is run by process {first.pid} already; permitted: one\n"
+            )
             status = rack("status", rack_name).stdout
             assert f"program  {first.pid}  running     1         0" in status
             first.kill()
         # A prompt that was killed leaves its place to the next one.
         script = hosted.parent / "more.py"
-        script.write_text("number(5)\nwhile bus.read('sum').value.sum < 9:\n    bus.wait(1.0)\nbus.finish()\n")
+        script.write_text(
+            "number(5)\nwhile bus.read('sum').value.sum < 9:\n    bus.wait(1.0)\nbus.finish()\n"
+        )
         done = rack("prompt", rack_name, "program", script)
         assert (done.returncode, done.stderr) == (0, "")
         while running.watch(0.5):
@@ -113,12 +135,17 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(hosted: Path, r
 
 
 @pytest.mark.slow
-def test_a_script_that_fails_is_one_line_and_unknown_boards_are_refused(hosted: Path, rack_name: str) -> None:
+def test_a_script_that_fails_is_one_line_and_unknown_boards_are_refused(
+    hosted: Path, rack_name: str
+) -> None:
     with console(hosted, rack_name):
         script = hosted.parent / "bad.py"
         script.write_text("number(1 / 0)\n")
         done = rack("prompt", rack_name, "program", script)
-        assert (done.returncode, done.stderr) == (1, f"{script}: ZeroDivisionError: division by zero\n")
+        assert (done.returncode, done.stderr) == (
+            1,
+            f"{script}: ZeroDivisionError: division by zero\n",
+        )
         wrong = rack("prompt", rack_name, "adder")
         assert wrong.returncode == 2
         assert wrong.stderr.startswith(

@@ -1,4 +1,5 @@
-"""Interrupts as users see them: in `rack status`, in the report of a run, and message by message."""
+"""Interrupts as users see them: in `rack status`, in the report of a run, and message by
+message."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from tests.tools.recordings import recorded as write_recording
 
 
 def recorded(folder: Path, name: str, *settings: str) -> Recording:
-    """Run the rack of tests of interrupts, and return its recording, without waiting for a recorder to start."""
+    """Run the rack of tests of interrupts, and return its recording, without waiting for a recorder
+    to start."""
     path = folder / "hub.toml"
     path.write_text(RACK)
     config = load(path, [f"name={name}", *settings])
@@ -44,12 +46,18 @@ def test_status_shows_every_inbox(tmp_path: Path, rack_name: str) -> None:
         assert empty.line == "interrupts of hub: 0 served, at most 0 of 2 waited"
         rack.run(SECONDS)
         (full,) = RackMonitor(rack.segment).look().inboxes
-    assert full.line == f"interrupts of hub: {3 * (TICKS - 1)} served, at most 2 of 2 waited, {2 * (TICKS - 1)} lost"
+    assert (
+        full.line
+        == f"interrupts of hub: {3 * (TICKS - 1)} served, at most 2 of 2 waited, {2 * (TICKS - 1)}"
+        " lost"
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [(SMALL,), (SMALL, OVERLOADED)], ids=["burst", "overload"])
-def test_a_recording_tells_what_the_board_itself_had(tmp_path: Path, rack_name: str, settings: tuple[str, ...]) -> None:
+def test_a_recording_tells_what_the_board_itself_had(
+    tmp_path: Path, rack_name: str, settings: tuple[str, ...]
+) -> None:
     recording = recorded(tmp_path, rack_name, *settings)
     board = replayed(recording, recording.layout.task("hub").slot)
     had = recording.signal("hub.status", "cycle")
@@ -68,7 +76,10 @@ def test_the_report_holds_losses_and_latencies(tmp_path: Path, rack_name: str) -
     assert (inbox["board"], inbox["depth"], inbox["waiting"]) == ("hub", 2, 2)
     assert (inbox["served"], inbox["lost"]) == (3 * TICKS, 2 * TICKS)
     assert inbox["latency_us"]["max"] == 3 * inbox["latency_us"]["min"]
-    assert f"Interrupts of hub: {3 * TICKS} messages served, at most 2 waiting, room for 2, {2 * TICKS} lost" in text
+    assert (
+        f"Interrupts of hub: {3 * TICKS} messages served, at most 2 waiting, room for 2,"
+        f" {2 * TICKS} lost" in text
+    )
 
 
 @pytest.mark.slow
@@ -80,7 +91,12 @@ def test_interrupts_come_at_even_times_and_a_tick_old(tmp_path: Path, rack_name:
         **{f"figure{at}": 0 for at in range(2, BOARDS)},
     }
     for one in found.values():
-        assert (one.mailbox, one.protocol, one.sent, one.overtaken) == (f"{one.writer}.status", "interrupt", TICKS, 0)
+        assert (one.mailbox, one.protocol, one.sent, one.overtaken) == (
+            f"{one.writer}.status",
+            "interrupt",
+            TICKS,
+            0,
+        )
     first, last = found["figure4"], found["figure0"]
     assert first.jitter_ms is not None
     assert first.age_ms is not None
@@ -89,7 +105,9 @@ def test_interrupts_come_at_even_times_and_a_tick_old(tmp_path: Path, rack_name:
 
 
 @pytest.mark.slow
-def test_an_overloaded_handler_makes_arrivals_uneven_and_old(tmp_path: Path, rack_name: str) -> None:
+def test_an_overloaded_handler_makes_arrivals_uneven_and_old(
+    tmp_path: Path, rack_name: str
+) -> None:
     found = times(recorded(tmp_path, rack_name, OVERLOADED))
     jitter = [one.jitter_ms["max"] for one in found.values() if one.jitter_ms is not None]
     ages = [one.age_ms["p50"] for one in found.values() if one.age_ms is not None]
@@ -111,7 +129,9 @@ def test_messages_visible_at_once_are_measured_alike(tmp_path: Path, rack_name: 
 
 @pytest.mark.slow
 def test_a_slow_reader_is_overtaken(tmp_path: Path, rack_name: str) -> None:
-    found = times(recorded(tmp_path, rack_name, "board.hub.every=10", "protocol.default=time-slice"))
+    found = times(
+        recorded(tmp_path, rack_name, "board.hub.every=10", "protocol.default=time-slice")
+    )
     for one in found.values():
         assert (one.protocol, one.sent, one.lost) == ("time-slice", TICKS, 0)
         # Of ten messages it sees one.

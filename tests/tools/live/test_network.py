@@ -1,4 +1,5 @@
-"""What users see of the network: the other racks, and what passes, of a running rack and in its report."""
+"""What users see of the network: the other racks, and what passes, of a running rack and in its
+report."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ from rack.tools.timing.analysis.network import network
 from rack.tools.timing.analysis.report_markdown import _network
 from tests.boards.lan.racks import rack_text
 
-TEXT = rack_text("one", "tcp/127.0.0.1:7447", [], "other-one", peers=["third"], lan='on_peer_loss = "go on"')
+TEXT = rack_text(
+    "one", "tcp/127.0.0.1:7447", [], "other-one", peers=["third"], lan='on_peer_loss = "go on"'
+)
 COUNTS = {
     "taken": 7,
     "missing": 1,
@@ -58,7 +61,9 @@ def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> Non
     found = Network(segment)
     assert found.peers() == (PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),)
     assert found.imports() == (
-        ImportRow("lan.other", "other-one/pulse.status", *COUNTS.values(), age_ticks=16, age_s=0.04),
+        ImportRow(
+            "lan.other", "other-one/pulse.status", *COUNTS.values(), age_ticks=16, age_s=0.04
+        ),
     )
     assert found.exports() == (ExportRow("lan.pulse", "pulse.status", 12),)
 
@@ -67,7 +72,12 @@ def test_the_table_of_a_rack_shows_them_too(segment: Segment) -> None:
     terminal = Console(width=200, record=True, file=StringIO())
     terminal.print(RackView(RackMonitor(segment).look()))
     text = terminal.export_text()
-    for shown in ("other-one  lost", "lan.other  other-one/pulse.status", "16  0.040", "lan.pulse  pulse.status"):
+    for shown in (
+        "other-one  lost",
+        "lan.other  other-one/pulse.status",
+        "16  0.040",
+        "lan.pulse  pulse.status",
+    ):
         assert shown in text
 
 
@@ -80,7 +90,10 @@ def test_check_shows_the_exchange() -> None:
     found = inventory(config, wire(config), [])
     assert found["network"]["peers"] == ("other-one", "third")
     text = "\n".join(inventory_lines(found))
-    assert "network: listen tcp/127.0.0.1:7447; works with other-one, third; lost after 200 ms: go on" in text
+    assert (
+        "network: listen tcp/127.0.0.1:7447; works with other-one, third; lost after 200 ms: go on"
+        in text
+    )
     assert "lan.other  in   other-one/pulse.status        50          100" in text
 
 
@@ -96,7 +109,11 @@ class Recorded:
         """Return a field of a mailbox."""
         port, _, name = field.partition(".")
         if mailbox == "lan.status":
-            values = {"age_s": [-1.0, 0.02, 0.04], "sent": [0, 1, 2], **{key: [0, 0, n] for key, n in COUNTS.items()}}
+            values = {
+                "age_s": [-1.0, 0.02, 0.04],
+                "sent": [0, 1, 2],
+                **{key: [0, 0, n] for key, n in COUNTS.items()},
+            }
             return np.array(values[name])
         peer = {"presence": [1, 2, 2], "launches": [1, 1, 2], "losses": [0, 1, 1]}
         return np.array(peer[port] if mailbox == "lan.peer_other_one" else [0, 0, 0])

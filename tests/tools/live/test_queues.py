@@ -19,7 +19,9 @@ FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
 
 
 @pytest.mark.slow
-def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(tmp_path: Path, rack_name: str) -> None:
+def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(
+    tmp_path: Path, rack_name: str
+) -> None:
     path = tmp_path / "queues.toml"
     path.write_text(QUEUES)
     config = load(path, [f"name={rack_name}", *FULL])
@@ -50,5 +52,9 @@ def test_check_shows_the_depth_of_a_queue(tmp_path: Path) -> None:
     path = tmp_path / "queues.toml"
     path.write_text(QUEUES)
     config = load(path, list(FULL))
-    (line,) = (line for line in inventory_lines(inventory(config, wire(config), [])) if "upper.requests " in line)
+    (line,) = (
+        line
+        for line in inventory_lines(inventory(config, wire(config), []))
+        if "upper.requests " in line
+    )
     assert "queue of 7" in line

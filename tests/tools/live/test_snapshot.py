@@ -1,4 +1,5 @@
-"""A look at a rack's memory: who is lost, who was restarted, what is demanded, which faults are active."""
+"""A look at a rack's memory: who is lost, who was restarted, what is demanded, which faults are
+active."""
 
 from __future__ import annotations
 
@@ -42,7 +43,11 @@ def test_restarts_are_the_writers_that_came_after_the_first(segment: Segment) ->
     assert row(segment, "lower").restarts == 0
     for _ in range(3):
         open_writer(segment, "lower.status").close()
-    assert [row(segment, name).restarts for name in ("lower", "lower.planner", "upper")] == [2, 0, 0]
+    assert [row(segment, name).restarts for name in ("lower", "lower.planner", "upper")] == [
+        2,
+        0,
+        0,
+    ]
 
 
 def test_a_fault_is_shown_while_it_is_active(segment: Segment) -> None:

@@ -1,7 +1,9 @@
-"""A client on another machine, as a program: runs `rack` commands one after the other, each as its own process would.
+"""A client on another machine, as a program: runs `rack` commands one after the other, each as its
+own process would.
 
-`python -m tests.tools.network.client WORDS...`, each a JSON list, prints a JSON list: status, stdout, stderr of each.
-What they need of the network is imported once, and no process is forked from one that has the network's threads.
+`python -m tests.tools.network.client WORDS...`, each a JSON list, prints a JSON list: status,
+stdout, stderr of each. What they need of the network is imported once, and no process is forked
+from one that has the network's threads.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Commands on HOST/RACK: a real rack on loopback, looked at, commanded and stopped by its address."""
+"""Commands on HOST/RACK: a real rack on loopback, looked at, commanded and stopped by its
+address."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ NOT_PERMITTED = "rack '{}' does not permit '{}' to {}; its config: adapter.lan.p
 
 
 class Far(NamedTuple):
-    """A rack that runs: its name here, its address from afar, and the events that its launcher has printed."""
+    """A rack that runs: its name here, its address from afar, and the events that its launcher has
+    printed."""
 
     name: str
     address: str
@@ -80,9 +82,15 @@ def started(folder: Path, mode: str, *settings: str) -> Iterator[Far]:
     name, port = f"test-afar-{mode}-{os.getpid()}", free_port()
     config, log = folder / "far.toml", folder / "log"
     config.write_text(COMMANDED + OF_LAN.format(port=port))
-    given = [word for setting in (f"name={name}", f"clock.mode={mode}", *settings) for word in ("--set", setting)]
+    given = [
+        word
+        for setting in (f"name={name}", f"clock.mode={mode}", *settings)
+        for word in ("--set", setting)
+    ]
     with log.open("w") as out:
-        process = subprocess.Popen([*RACK, "run", str(config), "--no-record", *given], cwd=ROOT, stdout=out, stderr=out)
+        process = subprocess.Popen(
+            [*RACK, "run", str(config), "--no-record", *given], cwd=ROOT, stdout=out, stderr=out
+        )
     try:
         wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
         assert process.poll() is None, log.read_text()
@@ -122,7 +130,11 @@ def shape(document: Any) -> Any:
         return {key: shape(value) for key, value in document.items()}
     if isinstance(document, list):
         return [shape(item) for item in document]
-    return "number" if isinstance(document, float | int) and not isinstance(document, bool) else document
+    return (
+        "number"
+        if isinstance(document, float | int) and not isinstance(document, bool)
+        else document
+    )
 
 
 @pytest.mark.slow
@@ -134,7 +146,10 @@ def test_a_status_from_afar_has_the_fields_of_the_local_one(far: Far) -> None:
     document = json.loads(seen.out)
     assert shape(document) == shape(near)
     assert document["tick"] > near["tick"]
-    assert all(row["cycles"] > before["cycles"] for row, before in zip(document["tasks"], near["tasks"], strict=True))
+    assert all(
+        row["cycles"] > before["cycles"]
+        for row, before in zip(document["tasks"], near["tasks"], strict=True)
+    )
 
 
 @pytest.mark.slow
@@ -171,9 +186,14 @@ def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
         NOT_PERMITTED.format(far.name, "watcher", "stop"),
         NOT_PERMITTED.format(far.name, "nobody", "watch"),
         f"no rack 'other' at {far.port}; racks there: {far.name}",
-        f"rack '{far.name}' resets an emergency stop on its own machine alone: rack estop {far.name} --reset",
-        f"RACK = {far.address}: this command works on the rack's own machine alone; permitted from afar: list --lan, "
-        "status, top, command, estop",
+        (
+            f"rack '{far.name}' resets an emergency stop on its own machine alone: rack estop"
+            f" {far.name} --reset"
+        ),
+        (
+            f"RACK = {far.address}: this command works on the rack's own machine alone; permitted"
+            " from afar: list --lan, status, top, command, estop"
+        ),
     ]
     assert [one.status for one in ended] == [1, 1, 1, 1, 1, 2]
 
@@ -181,12 +201,21 @@ def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
 @pytest.mark.slow
 @REALTIME
 def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far) -> None:
-    shown, closed = afar(f"list --lan {far.port} --json", f"list --lan {far.port} --as nobody --json")
+    shown, closed = afar(
+        f"list --lan {far.port} --json", f"list --lan {far.port} --as nobody --json"
+    )
     found = next(row for row in json.loads(shown.out) if row["host"] == far.port)
-    assert (found["rack"], found["state"], found["peers"]) == (far.name, "running", [["elsewhere", "awaited"]])
+    assert (found["rack"], found["state"], found["peers"]) == (
+        far.name,
+        "running",
+        [["elsewhere", "awaited"]],
+    )
     assert found["age_s"] > 0
     hidden = next(row for row in json.loads(closed.out) if row["host"] == far.port)
-    assert (hidden["state"], hidden["detail"]) == ("closed", NOT_PERMITTED.format(far.name, "nobody", "watch"))
+    assert (hidden["state"], hidden["detail"]) == (
+        "closed",
+        NOT_PERMITTED.format(far.name, "nobody", "watch"),
+    )
 
 
 @REALTIME
@@ -196,8 +225,12 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
     assert stopped.status == 0, stopped.err
     assert json.loads(stopped.out)["emergency_stop"] is True
     assert segment.words[System.EMERGENCY_STOP] == 1
-    assert f"to release: rack estop {far.name} --reset, on its own machine" in " ".join(seen.out.split())
-    wait_until(lambda: "'operator' has set the emergency stop from another machine" in far.log.read_text())
+    assert f"to release: rack estop {far.name} --reset, on its own machine" in " ".join(
+        seen.out.split()
+    )
+    wait_until(
+        lambda: "'operator' has set the emergency stop from another machine" in far.log.read_text()
+    )
     assert rack("estop", far.name, "--reset").returncode == 0
     assert segment.words[System.EMERGENCY_STOP] == 0
     segment.close()
@@ -208,7 +241,10 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
 def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
     segment = Segment.attach(far.name)
     table = OperatorTable(segment)
-    with client("top", far.address) as top, client("command", far.address, "upper", "hold", "--tick", LATE) as command:
+    with (
+        client("top", far.address) as top,
+        client("command", far.address, "upper", "hold", "--tick", LATE) as command,
+    ):
         assert top.stdout is not None
         assert top.stdout.readline().startswith(far.name)
         wait_until(table.waiting)
@@ -234,10 +270,18 @@ def test_who_watches_sees_the_run_stop(far: Far) -> None:
 @pytest.mark.slow
 def test_a_host_that_cannot_be_reached_is_one_line() -> None:
     port = free_port()
-    ended = afar(f"status 127.0.0.1:{port}/x", "status 127.0.0.1:99999/x", "status 127.0.0.1/X!", "list localhost")
+    ended = afar(
+        f"status 127.0.0.1:{port}/x",
+        "status 127.0.0.1:99999/x",
+        "status 127.0.0.1/X!",
+        "list localhost",
+    )
     assert [one.err.strip() for one in ended] == [
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
-        'HOST = "127.0.0.1:99999": not a host; permitted: a name or address, as in 10.0.0.5 or cell:7447',
+        (
+            'HOST = "127.0.0.1:99999": not a host; permitted: a name or address, as in 10.0.0.5 or'
+            " cell:7447"
+        ),
         'RACK = "127.0.0.1/X!": not a rack; permitted: RACK, or HOST/RACK, as in 10.0.0.5/cell',
         "HOST = localhost: needs --lan, as in: rack list --lan localhost",
     ]

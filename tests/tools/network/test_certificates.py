@@ -18,7 +18,9 @@ SHARED = ["authority.pem", "authority-key.pem", "secret"]
 
 def test_a_set_is_made_for_every_name(tmp_path: Path) -> None:
     folder = tmp_path / "new/certs"
-    done = rack("lan", "certificates", folder, "--for", "cell=10.0.0.1,cell.local", "--for", "operator")
+    done = rack(
+        "lan", "certificates", folder, "--for", "cell=10.0.0.1,cell.local", "--for", "operator"
+    )
     assert (done.returncode, done.stderr) == (0, "")
     names = [*SHARED, "cell.pem", "cell-key.pem", "operator.pem", "operator-key.pem"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
@@ -61,7 +63,9 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     done = rack("lan", "certificates", tmp_path, "--for", "puma", "--for", "cell")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{tmp_path}: cell.pem, cell-key.pem exist already; nothing is overwritten\n"
+    assert (
+        done.stderr == f"{tmp_path}: cell.pem, cell-key.pem exist already; nothing is overwritten\n"
+    )
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -108,7 +112,9 @@ def test_a_name_or_address_that_cannot_be_is_one_line(tmp_path: Path, given: str
 
 
 def test_a_name_given_twice_is_refused(tmp_path: Path) -> None:
-    done = rack("lan", "certificates", tmp_path / "certs", "--for", "cell", "--for", "cell=10.0.0.1")
+    done = rack(
+        "lan", "certificates", tmp_path / "certs", "--for", "cell", "--for", "cell=10.0.0.1"
+    )
     assert (done.returncode, done.stderr) == (2, '--for = "cell=10.0.0.1": cell is named twice\n')
 
 

@@ -1,4 +1,5 @@
-"""The mirror of a segment: equal to it byte for byte where it was fetched, and read by the same readers."""
+"""The mirror of a segment: equal to it byte for byte where it was fetched, and read by the same
+readers."""
 
 from __future__ import annotations
 
@@ -73,9 +74,15 @@ def test_the_mirror_of_everything_equals_the_segment_ring_by_ring(ran: Segment) 
         assert here.rows.tobytes() == there.rows.tobytes()
         assert here.lost == there.lost
     for task in ran.layout.tasks:
-        assert trace_ring(mirror, task.name).drain().rows.tobytes() == trace_ring(ran, task.name).drain().rows.tobytes()
+        assert (
+            trace_ring(mirror, task.name).drain().rows.tobytes()
+            == trace_ring(ran, task.name).drain().rows.tobytes()
+        )
     for owner in ran.map.alarms:
-        assert alarm_ring(mirror, owner).drain().rows.tobytes() == alarm_ring(ran, owner).drain().rows.tobytes()
+        assert (
+            alarm_ring(mirror, owner).drain().rows.tobytes()
+            == alarm_ring(ran, owner).drain().rows.tobytes()
+        )
 
 
 def test_every_stretch_fetched_is_equal_byte_for_byte(ran: Segment) -> None:
@@ -144,9 +151,14 @@ def test_messages_between_two_refreshes_are_missing_unless_they_are_followed(ran
     mirror = Mirror("far/rack", Window(ran))
     mirror.follow("lower.status")
     mirror.refresh()
-    followed, sampled = (MailboxRing(mirror, name).drain() for name in ("lower.status", "upper.status"))
+    followed, sampled = (
+        MailboxRing(mirror, name).drain() for name in ("lower.status", "upper.status")
+    )
     assert np.array_equal(followed.rows, MailboxRing(ran, "lower.status").drain().rows)
-    assert sampled.rows["serial"].tolist() == MailboxRing(ran, "upper.status").drain().rows["serial"].tolist()[-2:]
+    assert (
+        sampled.rows["serial"].tolist()
+        == MailboxRing(ran, "upper.status").drain().rows["serial"].tolist()[-2:]
+    )
 
 
 def test_a_request_is_followed_until_it_is_issued(ran: Segment) -> None:
@@ -172,11 +184,15 @@ def test_another_version_is_refused_in_one_line(ran: Segment, word: Head) -> Non
         words[word] += 1
         return [words.tobytes(), *found[1:]], answer
 
-    with pytest.raises(SegmentError, match="rack 'far/rack': another version; this program mirrors"):
+    with pytest.raises(
+        SegmentError, match="rack 'far/rack': another version; this program mirrors"
+    ):
         Mirror("far/rack", forged)
 
 
-@pytest.mark.parametrize(("word", "value"), [(Head.LAYOUT_SIZE, 1 << 40), (Head.LAYOUT_AT, -8), (Head.SIZE, 1 << 40)])
+@pytest.mark.parametrize(
+    ("word", "value"), [(Head.LAYOUT_SIZE, 1 << 40), (Head.LAYOUT_AT, -8), (Head.SIZE, 1 << 40)]
+)
 def test_a_head_that_lies_is_refused(ran: Segment, word: Head, value: int) -> None:
     window = Window(ran)
 
@@ -195,7 +211,9 @@ def test_a_head_that_lies_is_refused(ran: Segment, word: Head, value: int) -> No
 def test_the_clocks_of_the_other_machine_are_known(ran: Segment) -> None:
     def elsewhere(stretches: Sequence[Stretch]) -> tuple[list[bytes], DeskAnswer]:
         found, _ = Window(ran)(stretches)
-        return found, DeskAnswer(Code.GRANTED, 0, time.monotonic_ns() + 5_000_000_000, 7_000_000_000)
+        return found, DeskAnswer(
+            Code.GRANTED, 0, time.monotonic_ns() + 5_000_000_000, 7_000_000_000
+        )
 
     mirror = Mirror("far/rack", elsewhere)
     assert mirror.monotonic_offset_ns == pytest.approx(5e9, abs=1e9)

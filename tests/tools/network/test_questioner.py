@@ -22,7 +22,8 @@ HERE = "127.0.0.1"
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two sets of credentials that know nothing of each other, each for a rack `cell` and an operator."""
+    """Two sets of credentials that know nothing of each other, each for a rack `cell` and an
+    operator."""
     found = [tmp_path_factory.mktemp("set") / name for name in ("ours", "theirs")]
     for folder in found:
         make_credentials(folder, {"cell": [HERE], "operator": []}, days=1)
@@ -38,7 +39,9 @@ def listening(credentials: Credentials | None) -> Iterator[HostAddress]:
             connection, _ = server.accept()
             with connection, suppress(ssl.SSLError, OSError):
                 if credentials is not None:
-                    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=credentials.authority)
+                    context = ssl.create_default_context(
+                        ssl.Purpose.CLIENT_AUTH, cafile=credentials.authority
+                    )
                     context.load_cert_chain(credentials.certificate, credentials.key)
                     context.verify_mode = ssl.CERT_REQUIRED
                     context.wrap_socket(connection, server_side=True).close()
@@ -64,10 +67,14 @@ def test_those_of_one_set_reach_each_other(folders: tuple[Path, Path]) -> None:
 def test_a_rack_of_another_set_is_refused(folders: tuple[Path, Path]) -> None:
     ours, theirs = folders
     with listening(Credentials(theirs, "cell")) as at:
-        assert refusal(at, Asker("operator", str(ours))).startswith("its certificate is refused here: ")
+        assert refusal(at, Asker("operator", str(ours))).startswith(
+            "its certificate is refused here: "
+        )
 
 
-def test_a_rack_that_knows_another_authority_refuses(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_rack_that_knows_another_authority_refuses(
+    folders: tuple[Path, Path], tmp_path: Path
+) -> None:
     ours, theirs = folders
     # It shows a certificate that we trust, and trusts others than we are.
     rack = Credentials(ours, "cell")
@@ -90,4 +97,6 @@ def test_a_missing_certificate_is_named(folders: tuple[Path, Path]) -> None:
 def test_another_machine_is_not_asked_without_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket.socket, "getpeername", lambda self: ("192.0.2.7", 7447))
     with listening(None) as at:
-        assert refusal(at, Asker()) == "not this machine, so it needs certificates; see --certificates"
+        assert (
+            refusal(at, Asker()) == "not this machine, so it needs certificates; see --certificates"
+        )

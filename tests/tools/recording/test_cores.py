@@ -1,4 +1,5 @@
-"""What the machine did to its cores: time that the hypervisor took, misses meanwhile, and the processor's frequency."""
+"""What the machine did to its cores: time that the hypervisor took, misses meanwhile, and the
+processor's frequency."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(cores, "CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(cores, "CPUFREQ", tmp_path)
     monkeypatch.setattr(cores, "FREQUENCY_S", 0.0)
-    (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t: fpu\n\nprocessor\t: 1\nflags\t: fpu\n")
+    (tmp_path / "cpuinfo").write_text(
+        "processor\t: 0\nflags\t: fpu\n\nprocessor\t: 1\nflags\t: fpu\n"
+    )
     steal(tmp_path, 3, 7)
     return tmp_path
 
@@ -66,7 +69,9 @@ def test_a_kernel_that_counts_no_steal_is_not_measured(machine: Path) -> None:
 def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None:
     found = CoreMeter()
     for mhz in ("2600.000", "1200.5"):
-        (machine / "cpuinfo").write_text(f"processor\t: 0\ncpu MHz\t\t: {mhz}\n\nprocessor\t: 1\ncpu MHz\t\t: 900\n")
+        (machine / "cpuinfo").write_text(
+            f"processor\t: 0\ncpu MHz\t\t: {mhz}\n\nprocessor\t: 1\ncpu MHz\t\t: 900\n"
+        )
         found.look()
     assert found.record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
     # A core of its own file; another is switched off.
@@ -79,9 +84,12 @@ def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None
 
 
 def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
-    """Return a recording in real time with three misses, and what the machine did to its cores meanwhile."""
+    """Return a recording in real time with three misses, and what the machine did to its cores
+    meanwhile."""
     late = [Cycle(tick, (0.1, 0.1, 2.6, 0.1), flags=int(Flag.MISSED)) for tick in (10, 20, 30)]
-    found = recorded(folder, load(config, ["clock.mode=realtime", "board.lower.core=1"]), {"lower": late})
+    found = recorded(
+        folder, load(config, ["clock.mode=realtime", "board.lower.core=1"]), {"lower": late}
+    )
     found.cores = record
     return found
 
@@ -101,15 +109,24 @@ def test_misses_are_told_apart_by_core_and_time(small: Path, tmp_path: Path) -> 
     }
     assert (report["stalls"]["lost"], report["stalls"]["during_steal"]) == (3, 1)
     taken = f"core {core} for 0.20 %, core {core + 1} for 0.60 % of the run"
-    assert f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due meanwhile" in markdown(report)
+    assert (
+        f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due meanwhile"
+        in markdown(report)
+    )
 
 
 def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> None:
-    quiet = report_of(run(tmp_path / "run", small, CoreRecord(S, (), ((0, 2600.0, 2600.0), (1, 2600.0, 2650.0)))))
+    quiet = report_of(
+        run(tmp_path / "run", small, CoreRecord(S, (), ((0, 2600.0, 2600.0), (1, 2600.0, 2650.0))))
+    )
     assert quiet["steal"]["measured"]
     assert quiet["frequency_mhz"]["1"] == {"min": 2600.0, "max": 2650.0}
-    assert not [line for line in markdown(quiet).splitlines() if "hypervisor" in line or "frequency" in line]
-    slow = report_of(run(tmp_path / "run", small, CoreRecord(S, (), ((0, 800.0, 2600.0), (1, 2600.0, 2600.0)))))
+    assert not [
+        line for line in markdown(quiet).splitlines() if "hypervisor" in line or "frequency" in line
+    ]
+    slow = report_of(
+        run(tmp_path / "run", small, CoreRecord(S, (), ((0, 800.0, 2600.0), (1, 2600.0, 2600.0))))
+    )
     assert "- the processor changed its frequency: core 0 800 to 2600 MHz\n" in markdown(slow)
     unknown = report_of(run(tmp_path / "run", small, UNMEASURED))
     assert not unknown["steal"]["measured"]
@@ -117,7 +134,9 @@ def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_recording_keeps_what_the_machine_did(small: Path, tmp_path: Path, rack_name: str) -> None:
+def test_a_recording_keeps_what_the_machine_did(
+    small: Path, tmp_path: Path, rack_name: str
+) -> None:
     config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
     run_rack(config, 0.3, tmp_path / "run", Display())
     record = Recording(tmp_path / "run").cores

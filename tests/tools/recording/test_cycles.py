@@ -1,4 +1,5 @@
-"""Measured budgets: what levels took of a processor, on made-up traces and on racks that compute for known times."""
+"""Measured budgets: what levels took of a processor, on made-up traces and on racks that compute
+for known times."""
 
 from __future__ import annotations
 
@@ -32,11 +33,18 @@ def config(small: Path) -> RackConfig:
     return load(small, settings)
 
 
-def test_cycles_that_nobody_disturbed_are_as_they_were_stamped(config: RackConfig, tmp_path: Path) -> None:
-    trace = [Cycle(SETTLED + k, (0.05, 0.1, 1.0 + 0.1 * k, 0.2), processor=1.5 + 0.1 * k) for k in range(4)]
+def test_cycles_that_nobody_disturbed_are_as_they_were_stamped(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    trace = [
+        Cycle(SETTLED + k, (0.05, 0.1, 1.0 + 0.1 * k, 0.2), processor=1.5 + 0.1 * k)
+        for k in range(4)
+    ]
     found = measured_budgets(recorded(tmp_path / "run", config, {"lower": trace}))
     assert found == {
-        "lower": Budget(read_ns=MS // 10, process_ns=1_300_000, write_ns=MS // 5, exchange_ns=MS // 20),
+        "lower": Budget(
+            read_ns=MS // 10, process_ns=1_300_000, write_ns=MS // 5, exchange_ns=MS // 20
+        ),
     }
 
 
@@ -46,9 +54,12 @@ def test_longest_times_need_not_have_met_in_one_cycle(config: RackConfig, tmp_pa
     assert (found.read_ns, found.process_ns) == (MS // 2, 2 * MS)
 
 
-def test_what_an_executor_preempted_is_not_its_planners_time(config: RackConfig, tmp_path: Path) -> None:
+def test_what_an_executor_preempted_is_not_its_planners_time(
+    config: RackConfig, tmp_path: Path
+) -> None:
     executor = [Cycle(SETTLED + k, PLAIN) for k in range(4)]
-    # Released with the executor's first cycle: 1.3 ms pass before it runs, 1.3 ms each in P and in U.
+    # Released with the executor's first cycle: 1.3 ms pass before it runs, 1.3 ms each in P and in
+    # U.
     plan = Cycle(SETTLED, (0.0, 0.1, 3.1, 2.6), late=1.4, processor=3.2, flags=PLANNED)
     recording = recorded(tmp_path / "run", config, {"lower": executor, "lower.planner": [plan]})
     found = measured_budgets(recording)["lower"]
@@ -62,14 +73,19 @@ def test_time_lost_to_what_left_no_trace_is_taken_off_what_is_longer_than_usual(
 ) -> None:
     usual = [Cycle(SETTLED + k, PLAIN) for k in range(10)]
     stolen = Cycle(SETTLED + 10, (0.0, 0.1, 1.0, 1.2), processor=1.3)
-    found = measured_budgets(recorded(tmp_path / "run", config, {"lower": [*usual, stolen]}))["lower"]
+    found = measured_budgets(recorded(tmp_path / "run", config, {"lower": [*usual, stolen]}))[
+        "lower"
+    ]
     assert (found.process_ns, found.write_ns) == (MS, MS // 5)
 
 
-def test_no_part_of_a_cycle_is_longer_than_its_processor_time(config: RackConfig, tmp_path: Path) -> None:
+def test_no_part_of_a_cycle_is_longer_than_its_processor_time(
+    config: RackConfig, tmp_path: Path
+) -> None:
     random = np.random.default_rng(5)
     trace = [
-        Cycle(SETTLED + k, tuple(random.uniform(0, 1, 4)), processor=float(random.uniform(0.1, 3))) for k in range(300)
+        Cycle(SETTLED + k, tuple(random.uniform(0, 1, 4)), processor=float(random.uniform(0.1, 3)))
+        for k in range(300)
     ]
     cycles = cycles_of(recorded(tmp_path / "run", config, {"lower": trace}))["lower"]
     assert np.all(cycles.parts >= 0)
@@ -84,30 +100,44 @@ def test_a_process_that_starts_up_is_not_counted(config: RackConfig, tmp_path: P
     trace = [Cycle(tick, cold if tick in (0, 39, 80, 119) else PLAIN) for tick in ticks]
     event = {"kind": "recovery", "code": "rejoined", "time_ns": 0, "text": ""}
     rejoined, other = event | {"board": "lower", "tick": 80}, event | {"board": "upper", "tick": 45}
-    found = measured_budgets(recorded(tmp_path / "run", config, {"lower": trace}, [rejoined, other]))["lower"]
+    found = measured_budgets(
+        recorded(tmp_path / "run", config, {"lower": trace}, [rejoined, other])
+    )["lower"]
     assert found.process_ns == MS
     late = [Cycle(tick, cold if tick == 45 else PLAIN) for tick in ticks]
-    found = measured_budgets(recorded(tmp_path / "late", config, {"lower": late}, [rejoined, other]))["lower"]
+    found = measured_budgets(
+        recorded(tmp_path / "late", config, {"lower": late}, [rejoined, other])
+    )["lower"]
     assert found.process_ns == 2_200_000
 
 
-def test_a_run_shorter_than_the_start_up_is_counted_all_the_same(config: RackConfig, tmp_path: Path) -> None:
-    found = measured_budgets(recorded(tmp_path / "run", config, {"lower": [Cycle(k, PLAIN) for k in range(5)]}))
+def test_a_run_shorter_than_the_start_up_is_counted_all_the_same(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    found = measured_budgets(
+        recorded(tmp_path / "run", config, {"lower": [Cycle(k, PLAIN) for k in range(5)]})
+    )
     assert found["lower"].process_ns == MS
 
 
-def test_a_percentile_leaves_out_what_a_host_stalls_now_and_then(config: RackConfig, tmp_path: Path) -> None:
+def test_a_percentile_leaves_out_what_a_host_stalls_now_and_then(
+    config: RackConfig, tmp_path: Path
+) -> None:
     trace = [Cycle(SETTLED + k, (0.0, 0.1, 9.0 if k == 500 else 1.0, 0.2)) for k in range(1000)]
     recording = recorded(tmp_path / "run", config, {"lower": trace})
     assert measured_budgets(recording)["lower"].process_ns == 9 * MS
     assert measured_budgets(recording, 99.0)["lower"].process_ns == MS
 
 
-def test_a_recording_without_the_new_times_is_refused_in_one_line(config: RackConfig, tmp_path: Path) -> None:
+def test_a_recording_without_the_new_times_is_refused_in_one_line(
+    config: RackConfig, tmp_path: Path
+) -> None:
     folder = recorded(tmp_path / "run", config, {"lower": [Cycle(SETTLED, PLAIN)]}).folder
     table = pq.read_table(folder / "cycles.parquet")
     pq.write_table(table.drop_columns(["plan_ns", "processor_ns"]), folder / "cycles.parquet")
-    with pytest.raises(Failure, match=r"no column plan_ns, processor_ns: .*run the rack again") as refused:
+    with pytest.raises(
+        Failure, match=r"no column plan_ns, processor_ns: .*run the rack again"
+    ) as refused:
         measured_budgets(Recording(folder))
     assert refused.value.status == 2
     assert "\n" not in str(refused.value)
@@ -117,19 +147,33 @@ def test_a_recording_without_the_new_times_is_refused_in_one_line(config: RackCo
 def figure(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """A run of fig2, in the mode that is the fixture's parameter, with an executor of 1 ms."""
     folder = tmp_path_factory.mktemp("figure") / "run"
-    settings = [f"name=test-cycles-{os.getpid()}", f"clock.mode={request.param}", "board.level.params.process_ms=1.0"]
+    settings = [
+        f"name=test-cycles-{os.getpid()}",
+        f"clock.mode={request.param}",
+        "board.level.params.process_ms=1.0",
+    ]
     assert run_rack(load("fig2", settings), 2.0, folder, Display()).outcome.cause == "time over"
     return Recording(folder)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("figure", ["realtime", "lockstep"], indirect=True)
-def test_a_level_that_computes_for_known_times_is_measured_to_have_taken_them(figure: Recording) -> None:
+def test_a_level_that_computes_for_known_times_is_measured_to_have_taken_them(
+    figure: Recording,
+) -> None:
     # The median of all cycles: a host that takes the machine away must not fail this test.
     found = measured_budgets(figure, 50.0)["level"]
-    expected = {"read_ns": 1.0, "process_ns": 1.0, "write_ns": 1.0, "plan_ns": 6.0, "update_ns": 1.0}
+    expected = {
+        "read_ns": 1.0,
+        "process_ns": 1.0,
+        "write_ns": 1.0,
+        "plan_ns": 6.0,
+        "update_ns": 1.0,
+    }
     # Each access and each look at the clock takes some time more than asked for.
-    assert {name: getattr(found, name) / MS for name in expected} == pytest.approx(expected, rel=0.08, abs=0.15)
+    assert {name: getattr(found, name) / MS for name in expected} == pytest.approx(
+        expected, rel=0.08, abs=0.15
+    )
 
 
 @pytest.mark.parametrize("figure", ["realtime"], indirect=True)

@@ -1,4 +1,5 @@
-"""The recorder: everything that was written, in order, and no trace of itself in what was written."""
+"""The recorder: everything that was written, in order, and no trace of itself in what was
+written."""
 
 from __future__ import annotations
 
@@ -20,11 +21,17 @@ from rack.tools.timing.analysis.report import report_of
 from tests.shared_runs import SMALL_S, small_run
 
 TICKS = 1600
-POINT = MessageType("point", 1, (Field("at", "f8", "m", "place", (3,)), Field("id", "u2", "1", "number")))
+POINT = MessageType(
+    "point", 1, (Field("at", "f8", "m", "place", (3,)), Field("id", "u2", "1", "number"))
+)
 PATH = MessageType(
     "path",
     1,
-    (Field("count", "u2", "1", "points"), Field("points", POINT, "", "way", (4,)), Field("why", "S8", "", "")),
+    (
+        Field("count", "u2", "1", "points"),
+        Field("points", POINT, "", "way", (4,)),
+        Field("why", "S8", "", ""),
+    ),
 )
 
 
@@ -37,7 +44,12 @@ def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None
     report = report_of(recording)
     assert report["recording"] == "complete"
     assert not any(recording.lost.values())
-    assert set(recording.mailboxes) == {"upper.command", "upper.status", "lower.status", "lower.plan"}
+    assert set(recording.mailboxes) == {
+        "upper.command",
+        "upper.status",
+        "lower.status",
+        "lower.plan",
+    }
     for mailbox in recording.mailboxes:
         serials = recording.signal(mailbox, "serial")
         assert np.array_equal(serials, np.arange(1, len(serials) + 1))
@@ -51,16 +63,22 @@ def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None
 
 def test_signals_are_what_the_levels_wrote(recording: Recording) -> None:
     goals = recording.signal("upper.command", "goal")
-    # Each goal is one more than the count that the level below had reached: the status of the cycle before.
+    # Each goal is one more than the count that the level below had reached: the status of the cycle
+    # before.
     assert goals[0] == 1
     assert np.all(np.diff(goals) >= 0)
     assert goals[-1] > 20
-    ticks, visible_at = recording.signal("lower.plan", "tick"), recording.signal("lower.plan", "visible_at")
+    ticks, visible_at = (
+        recording.signal("lower.plan", "tick"),
+        recording.signal("lower.plan", "visible_at"),
+    )
     assert np.array_equal(visible_at, ticks + 4)
 
 
 @pytest.mark.slow
-def test_recording_changes_nothing_in_a_run(small: Path, rack_name: str, recording: Recording) -> None:
+def test_recording_changes_nothing_in_a_run(
+    small: Path, rack_name: str, recording: Recording
+) -> None:
     unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
     assert unrecorded.outcome.digest == report_of(recording)["digest"]
 

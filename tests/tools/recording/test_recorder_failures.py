@@ -1,4 +1,5 @@
-"""Recordings that fail: the run continues, what was written stays readable, and the user gets a message."""
+"""Recordings that fail: the run continues, what was written stays readable, and the user gets a
+message."""
 
 from __future__ import annotations
 
@@ -121,7 +122,9 @@ def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
     assert sink.calls == [("servo", [0]), 0, ("servo", [1]), 1, ("servo", [2]), 2, "end"]
 
 
-def test_a_recorder_in_a_hurry_does_without_a_sink_that_is_not_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recorder_in_a_hurry_does_without_a_sink_that_is_not_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("rack.tools.recording.recorder.recorder.HURRIED_S", 0.05)
     may_open, sink, notes = threading.Event(), Taking(), list[str]()
 
@@ -195,12 +198,17 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
 
 
 class AtTick(Display):
-    """Strikes the recorder of the run, by default with a signal, `times` times, when the run has got to some tick."""
+    """Strikes the recorder of the run, by default with a signal, `times` times, when the run has
+    got to some tick."""
 
     period_s = 0.05
 
     def __init__(
-        self, number: signal.Signals, tick: int = FIRST_BLOCK, view: Path | None = None, times: int = 1
+        self,
+        number: signal.Signals,
+        tick: int = FIRST_BLOCK,
+        view: Path | None = None,
+        times: int = 1,
     ) -> None:
         self._number, self._tick, self._view, self._times = number, tick, view, times
         self._view_began = 0
@@ -228,7 +236,8 @@ class AtTick(Display):
 
 
 class FillingDisk(AtTick):
-    """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is full."""
+    """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is
+    full."""
 
     def __init__(self) -> None:
         super().__init__(signal.SIGKILL)
@@ -259,13 +268,18 @@ def realtime(config: RackConfig) -> RackConfig:
 
 
 @pytest.mark.slow
-def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config: RackConfig, tmp_path: Path) -> None:
+def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
+    config: RackConfig, tmp_path: Path
+) -> None:
     display = AtTick(signal.SIGKILL)
     result = run_rack(config, LONG_S, tmp_path / "run", display)
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
-    assert notes_of(recording)[0] == "the recorder ended with status -9; restarted, 1 of at most 3 times"
+    assert (
+        notes_of(recording)[0]
+        == "the recorder ended with status -9; restarted, 1 of at most 3 times"
+    )
     # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
     serials = recording.signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
@@ -278,7 +292,9 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(config:
 
 
 @pytest.mark.slow
-def test_recorders_killed_before_their_first_block_cost_no_row(config: RackConfig, tmp_path: Path) -> None:
+def test_recorders_killed_before_their_first_block_cost_no_row(
+    config: RackConfig, tmp_path: Path
+) -> None:
     # Each new one, too, is struck as soon as it is there.
     display = AtTick(signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
     result = run_rack(config, LONG_S, tmp_path / "run", display)
@@ -289,7 +305,9 @@ def test_recorders_killed_before_their_first_block_cost_no_row(config: RackConfi
 
 
 @pytest.mark.slow
-def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(config: RackConfig, tmp_path: Path) -> None:
+def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(
+    config: RackConfig, tmp_path: Path
+) -> None:
     display = AtTick(signal.SIGSTOP)
     result = run_rack(config, LONG_S, tmp_path / "run", display)
     assert display.struck
@@ -321,22 +339,30 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     taken = counts(recording)
     missing = {name: ticks - taken[name] for name in ("lower", "lower.status")}
     assert missing["lower"] > ticks / 4
-    assert {name: result.rows_lost[name] for name in missing} == missing == {n: recording.lost[n] for n in missing}
+    assert (
+        {name: result.rows_lost[name] for name in missing}
+        == missing
+        == {n: recording.lost[n] for n in missing}
+    )
     worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
     (gap,) = recording.gaps()
     # Slow rings lack what came since their last message.
     assert (gap.first <= taken["lower"], gap.last) == (True, ticks - 1)
     assert set(gap.rings) == set(result.rows_lost)
-    assert result.recording == (
-        f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing (and rows of {len(result.rows_lost) - 1} more "
-        f"tasks and mailboxes); {gap}; the recorder ended with status -9"
+    assert (
+        result.recording
+        == f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing (and rows of"
+        f" {len(result.rows_lost) - 1} more tasks and mailboxes); {gap}; the recorder ended with"
+        " status -9"
     )
     assert result.failure().endswith(result.recording)
     report, text = write_report(tmp_path / "run")
     assert f"Times of lower are from {taken['lower']:,} of {ticks:,} cycles." in text
     assert f"- {gap}" in text
     assert report["gaps"] == [{"first": gap.first, "last": gap.last, "rings": gap.rings}]
-    assert f"lower: judged by {taken['lower']:,} of {ticks:,} cycles" in analysis_text(Analysis.of(recording))
+    assert f"lower: judged by {taken['lower']:,} of {ticks:,} cycles" in analysis_text(
+        Analysis.of(recording)
+    )
 
 
 @pytest.mark.slow
@@ -358,22 +384,30 @@ def test_rows_that_no_recorder_took_are_missing(config: RackConfig, tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["drop", "corrupt", "delay", "reorder", "masquerade"])
-def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(small: Path, rack_name: str, kind: str) -> None:
+def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(
+    small: Path, rack_name: str, kind: str
+) -> None:
     """Faults of messages, and a recorder that is killed after them."""
     lasts = "" if kind == "masquerade" else ", for = '0.4s'"
     faults = f"fault=[{{ kind = '{kind}', board = 'lower', at = 0.4{lasts} }}]"
     folder = small.parent / "run"
-    result = run_rack(load(small, [f"name={rack_name}", faults]), LONG_S, folder, AtTick(signal.SIGKILL))
+    result = run_rack(
+        load(small, [f"name={rack_name}", faults]), LONG_S, folder, AtTick(signal.SIGKILL)
+    )
     assert result.recording == "complete"
     serials = Recording(folder).signal("lower.status", "serial")
     assert np.all(np.diff(serials) > 0)
 
 
 @pytest.mark.slow
-def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(small: Path, rack_name: str) -> None:
+def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(
+    small: Path, rack_name: str
+) -> None:
     """In each cycle as many messages as the ring of a slow task holds in a second."""
     faults = "fault=[{ kind = 'babble', board = 'upper', at = 0.4, for = '1s', writes = 25 }]"
-    result = run_rack(load(small, [f"name={rack_name}", faults]), LONG_S, small.parent / "run", Display())
+    result = run_rack(
+        load(small, [f"name={rack_name}", faults]), LONG_S, small.parent / "run", Display()
+    )
     assert result.faults[0].count > 1
     assert result.recording == "complete"
 
@@ -392,13 +426,17 @@ def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     assert time.monotonic() - display.full_at < FULL_S
     assert len(display.struck) == 1
     assert caught.value.status == 1
-    assert re.fullmatch(f"{tmp_path}/run: File too large: the recording ends at tick [0-9]+", str(caught.value))
+    assert re.fullmatch(
+        f"{tmp_path}/run: File too large: the recording ends at tick [0-9]+", str(caught.value)
+    )
     assert config.name not in racks()
     assert set(children_of(os.getpid())) <= before
 
 
 @pytest.mark.slow
-def test_a_disk_that_is_full_from_the_start_ends_the_run(config: RackConfig, tmp_path: Path) -> None:
+def test_a_disk_that_is_full_from_the_start_ends_the_run(
+    config: RackConfig, tmp_path: Path
+) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / SPOOL).symlink_to("/dev/full")
     with pytest.raises(Failure, match="run: No space left on device: the recording ends at tick 0"):
@@ -423,21 +461,32 @@ def test_what_a_killed_recorder_took_is_readable(
     result = run_rack(realtime(config), LONG_S, tmp_path / "run", display)
     # The run went well, but is not recorded as wanted.
     assert (result.outcome.worked, result.worked) == (True, False)
-    assert re.fullmatch(r"[0-9,]+ of [0-9,]+ rows of lower.* are missing .*ended with status -9", result.recording)
+    assert re.fullmatch(
+        r"[0-9,]+ of [0-9,]+ rows of lower.* are missing .*ended with status -9", result.recording
+    )
     report, _ = write_report(tmp_path / "run")
     assert (report["worked"], report["recording"]) == (False, result.recording)
     assert report["rows_lost"] == result.rows_lost
-    assert notes_of(Recording(tmp_path / "run")) == ["the recorder ended with status -9; the run continues, unrecorded"]
+    assert notes_of(Recording(tmp_path / "run")) == [
+        "the recorder ended with status -9; the run continues, unrecorded"
+    ]
     ticks = pq.read_table(tmp_path / "run" / "signals.parquet", columns=["tick"])["tick"].to_numpy()
     assert ticks.max() > FIRST_BLOCK / 2
     repaired = tmp_path / "repaired.rrd"
-    for command in (["optimize", tmp_path / "run" / "run.rrd", "-o", repaired], ["verify", repaired]):
-        subprocess.run([executable(), "rrd", *command], check=True, capture_output=True, timeout=WATCHDOG_S)
+    for command in (
+        ["optimize", tmp_path / "run" / "run.rrd", "-o", repaired],
+        ["verify", repaired],
+    ):
+        subprocess.run(
+            [executable(), "rrd", *command], check=True, capture_output=True, timeout=WATCHDOG_S
+        )
     assert RrdReader(str(repaired)).stream().filter(content="/boards/**").to_chunks()
 
 
 @pytest.mark.slow
-def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(config: RackConfig, tmp_path: Path) -> None:
+def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(
+    config: RackConfig, tmp_path: Path
+) -> None:
     result = run_rack(realtime(config), 2.0, tmp_path / "run", AtTick(signal.SIGSTOP))
     assert result.outcome.worked
     # The rings hold two seconds: the whole run.
@@ -463,7 +512,9 @@ def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path
             mend(tmp_path)
 
 
-def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(config: RackConfig, tmp_path: Path) -> None:
+def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
+    config: RackConfig, tmp_path: Path
+) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path) as recorder:
         rack.run(0.5)
         recorder.drain()

@@ -1,4 +1,5 @@
-"""Folders of runs that are damaged: one line names the file and what is wrong; what can be read is read."""
+"""Folders of runs that are damaged: one line names the file and what is wrong; what can be read is
+read."""
 
 from __future__ import annotations
 
@@ -86,14 +87,18 @@ def test_signals_without_their_layout_are_named(damaged: Path) -> None:
     refused(damaged, path.name)
 
 
-@pytest.mark.parametrize("text", [bytes(range(256)), b'{"kind": 3}\n', b"[]\n", b'{"kind": "outcome", "outcome": 1}\n'])
+@pytest.mark.parametrize(
+    "text", [bytes(range(256)), b'{"kind": 3}\n', b"[]\n", b'{"kind": "outcome", "outcome": 1}\n']
+)
 def test_events_of_something_else_are_named_with_their_line(damaged: Path, text: bytes) -> None:
     (damaged / "events.jsonl").write_bytes(text)
     with pytest.raises(Failure, match=r"events\.jsonl: (line 1: not an event|not text: byte 128)"):
         write_report(damaged)
 
 
-def test_a_last_line_that_is_cut_is_left_out_and_said(damaged: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_last_line_that_is_cut_is_left_out_and_said(
+    damaged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = damaged / "events.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[0][:20]]))

@@ -1,4 +1,5 @@
-"""What took the cycles of a run: steal, a core that was away without it, a quota. None of it enters a budget."""
+"""What took the cycles of a run: steal, a core that was away without it, a quota. None of it enters
+a budget."""
 
 from __future__ import annotations
 
@@ -24,7 +25,15 @@ from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording.cores import CoreRecord, Stolen
 from rack.tools.recording.cycles import cycles_of, measured_budgets
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.stalls import CLUSTERED, LEAST_STALLS, WINDOW, Absence, Quota, Stalls, stalls_of
+from rack.tools.recording.stalls import (
+    CLUSTERED,
+    LEAST_STALLS,
+    WINDOW,
+    Absence,
+    Quota,
+    Stalls,
+    stalls_of,
+)
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
 from rack.tools.timing.analysis.report import report_of
@@ -64,18 +73,25 @@ def plain(first: int, last: int) -> list[Cycle]:
 
 
 def late_clock(tick: int, since: int, late_ms: float) -> dict[str, Any]:
-    """Return the event of the clock's board that was due at tick `since`, and woke that much later."""
+    """Return the event of the clock's board that was due at tick `since`, and woke that much
+    later."""
     about = {"kind": "miss", "board": "clock", "code": "clock_late", "text": "", "time_ns": 0}
     return about | {"tick": tick, "since": since, "value": late_ms * MS}
 
 
 def run(
-    folder: Path, config: RackConfig, traces: dict[str, list[Cycle]], *events: dict[str, Any], priority: int = 80
+    folder: Path,
+    config: RackConfig,
+    traces: dict[str, list[Cycle]],
+    *events: dict[str, Any],
+    priority: int = 80,
 ) -> Recording:
     """Return a recording whose lower level had a core of its own."""
     lost = {"missed": 0, "skipped": 0}
     places = {"upper": lost | {"core": FIRST, "priority": priority - 10 if priority else 0}}
-    places |= {name: lost | {"core": OTHER, "priority": priority} for name in ("lower", "lower.planner")}
+    places |= {
+        name: lost | {"core": OTHER, "priority": priority} for name in ("lower", "lower.planner")
+    }
     outcome = {"kind": "outcome", "outcome": {}, "tasks": places}
     return recorded(folder, config, traces, [*events, outcome])
 
@@ -84,9 +100,15 @@ def found_in(recording: Recording) -> Stalls:
     return stalls_of(recording)[0]
 
 
-def test_skipped_cycles_are_lost_while_the_hypervisor_had_the_core(config: RackConfig, tmp_path: Path) -> None:
+def test_skipped_cycles_are_lost_while_the_hypervisor_had_the_core(
+    config: RackConfig, tmp_path: Path
+) -> None:
     skipped = Cycle(20, PLAIN, flags=skipping(5))
-    recording = run(tmp_path / "run", config, {"lower": [*plain(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]})
+    recording = run(
+        tmp_path / "run",
+        config,
+        {"lower": [*plain(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]},
+    )
     # Releases 15 to 19 were skipped; the record after them begins at tick 20.
     for first, last, during in ((14.0, 14.8, 0), (15.2, 16.0, 5), (19.2, 19.8, 5), (20.2, 20.9, 0)):
         span = Stolen(int(first * TICK_MS * MS), int(last * TICK_MS * MS), OTHER, 10)
@@ -94,11 +116,15 @@ def test_skipped_cycles_are_lost_while_the_hypervisor_had_the_core(config: RackC
         found = found_in(recording)
         assert (found.lost, found.during_steal) == (7, during)
     recording.cores = CoreRecord(100 * MS, (Stolen(0, 50 * MS, OTHER, 10),))
-    line = f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due meanwhile"
+    line = (
+        f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due meanwhile"
+    )
     assert line in markdown(report_of(recording))
 
 
-def test_stalls_that_end_at_one_phase_of_100_ms_are_named(config: RackConfig, tmp_path: Path) -> None:
+def test_stalls_that_end_at_one_phase_of_100_ms_are_named(
+    config: RackConfig, tmp_path: Path
+) -> None:
     jitter = np.random.default_rng(3).uniform(0, 1.5, 11)
     ends = [*(100.0 * k + 31.2 + jitter[k] for k in range(11)), 1260.0, 1388.0]
     recording = run(tmp_path / "run", config, {"lower": [resumed_at(end) for end in ends]})
@@ -121,21 +147,28 @@ def test_what_may_be_chance_is_not_named(config: RackConfig, tmp_path: Path) -> 
     for seed in range(40):
         # Far enough apart to be stalls of their own.
         ends = np.cumsum(np.random.default_rng(seed).uniform(50, 350, 5 + seed))
-        found = found_in(run(tmp_path / "run", config, {"lower": [resumed_at(float(end)) for end in ends]}))
+        found = found_in(
+            run(tmp_path / "run", config, {"lower": [resumed_at(float(end)) for end in ends]})
+        )
         assert (found.lost, found.quota) == (2 * len(ends), None)
 
 
 def test_the_least_that_is_named_is_rarer_than_once_in_a_thousand() -> None:
     def probability(count: int) -> float:
-        """Return a bound on the probability that some window begins with so many of uniform phases."""
+        """Return a bound on the probability that some window begins with so many of uniform
+        phases."""
         least = math.ceil(CLUSTERED * count) - 1
         more = range(least, count)
-        return count * sum(math.comb(count - 1, k) * WINDOW**k * (1 - WINDOW) ** (count - 1 - k) for k in more)
+        return count * sum(
+            math.comb(count - 1, k) * WINDOW**k * (1 - WINDOW) ** (count - 1 - k) for k in more
+        )
 
     assert max(probability(count) for count in range(LEAST_STALLS, 200)) < 1e-3
 
 
-def test_losses_of_several_tasks_and_cycles_by_one_stall_count_once(config: RackConfig, tmp_path: Path) -> None:
+def test_losses_of_several_tasks_and_cycles_by_one_stall_count_once(
+    config: RackConfig, tmp_path: Path
+) -> None:
     ends = [100.0 * k + 31.2 for k in range(1, 7)]
     upper = [Cycle(int((end - 15) // TICK_MS), PLAIN, late=15.4, flags=MISSED) for end in ends]
     # The stall begins within a cycle, which is late; those after it are skipped.
@@ -146,7 +179,9 @@ def test_losses_of_several_tasks_and_cycles_by_one_stall_count_once(config: Rack
     assert found.quota == Quota(together=6, stalls=6, levels=[])
 
 
-def test_a_level_whose_cycle_agrees_with_the_stalls_is_named_too(small: Path, tmp_path: Path) -> None:
+def test_a_level_whose_cycle_agrees_with_the_stalls_is_named_too(
+    small: Path, tmp_path: Path
+) -> None:
     config = load(small, ["clock.mode=realtime", "board.upper.rate_hz=5"])
     beyond = [resumed_at(200.0 * k + 31.2) for k in range(6)]
     recording = run(tmp_path / "run", config, {"lower": beyond})
@@ -159,16 +194,28 @@ def test_a_level_whose_cycle_agrees_with_the_stalls_is_named_too(small: Path, tm
 
 
 def away() -> dict[str, list[Cycle]]:
-    """Return traces in which the other core was away from tick 50, its release, until 1 ms after tick 52."""
-    return {"lower": [*plain(SETTLED, 50), Cycle(52, PLAIN, late=1.0, flags=skipping(2)), *plain(53, 60)]}
+    """Return traces in which the other core was away from tick 50, its release, until 1 ms after
+    tick 52."""
+    return {
+        "lower": [
+            *plain(SETTLED, 50),
+            Cycle(52, PLAIN, late=1.0, flags=skipping(2)),
+            *plain(53, 60),
+        ]
+    }
 
 
 def test_a_core_that_vanished_without_steal_is_named(config: RackConfig, tmp_path: Path) -> None:
     recording = run(tmp_path / "run", config, away())
     assert found_in(recording).absences == [Absence(OTHER, times=1, longest_ms=6.0, lost=2)]
     report = report_of(recording)
-    assert report["stalls"]["absences"] == [{"core": OTHER, "times": 1, "longest_ms": 6.0, "lost": 2}]
-    line = f"- core {OTHER} ran nothing of the rack though it was due, without steal (stalls: 1, longest 6 ms); 2 of 2 "
+    assert report["stalls"]["absences"] == [
+        {"core": OTHER, "times": 1, "longest_ms": 6.0, "lost": 2}
+    ]
+    line = (
+        f"- core {OTHER} ran nothing of the rack though it was due, without steal (stalls: 1,"
+        " longest 6 ms); 2 of 2 "
+    )
     assert line in markdown(report)
 
 
@@ -178,15 +225,31 @@ def test_a_core_that_ran_another_task_was_there(config: RackConfig, tmp_path: Pa
     assert not found_in(run(tmp_path / "run", config, away() | {"lower.planner": [plan]})).absences
 
 
-def test_a_task_without_real_time_priority_shows_no_absence(config: RackConfig, tmp_path: Path) -> None:
-    # The launch was refused all of them; then only that of a planner, which waited for some program.
+def test_a_task_without_real_time_priority_shows_no_absence(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    # The launch was refused all of them; then only that of a planner, which waited for some
+    # program.
     long = {"upper": [Cycle(48, (0.0, 0.1, 15.0, 0.1)), Cycle(88, PLAIN)]}
-    refused = run(tmp_path / "refused", config, away() | long, late_clock(52, since=50, late_ms=5.9), priority=0)
+    refused = run(
+        tmp_path / "refused",
+        config,
+        away() | long,
+        late_clock(52, since=50, late_ms=5.9),
+        priority=0,
+    )
     assert not found_in(refused).absences
     assert [cycles.stalled for cycles in cycles_of(refused).values()] == [0, 0]
-    waits = {"lower.planner": [Cycle(44, PLAIN, late=6.0, flags=PLANNED), Cycle(60, PLAIN, late=6.0, flags=PLANNED)]}
+    waits = {
+        "lower.planner": [
+            Cycle(44, PLAIN, late=6.0, flags=PLANNED),
+            Cycle(60, PLAIN, late=6.0, flags=PLANNED),
+        ]
+    }
     recording = run(tmp_path / "ordinary", config, {"lower": plain(SETTLED, 42)} | waits)
-    assert [(absence.core, absence.times) for absence in found_in(recording).absences] == [(OTHER, 2)]
+    assert [(absence.core, absence.times) for absence in found_in(recording).absences] == [
+        (OTHER, 2)
+    ]
     recording.ended["tasks"]["lower.planner"]["priority"] = 0
     assert not found_in(recording).absences
 
@@ -197,12 +260,16 @@ def test_what_was_counted_as_steal_is_not_counted_again(config: RackConfig, tmp_
     assert (found_in(recording).during_steal, found_in(recording).absences) == (2, [])
 
 
-def test_cycles_that_no_clock_released_are_lost_to_the_clocks_core(config: RackConfig, tmp_path: Path) -> None:
+def test_cycles_that_no_clock_released_are_lost_to_the_clocks_core(
+    config: RackConfig, tmp_path: Path
+) -> None:
     recording = run(tmp_path / "run", config, away(), late_clock(52, since=50, late_ms=5.9))
     assert found_in(recording).absences == [Absence(FIRST, times=1, longest_ms=5.9, lost=2)]
 
 
-def test_a_clock_whose_core_was_stolen_leaves_the_other_cores_alone(config: RackConfig, tmp_path: Path) -> None:
+def test_a_clock_whose_core_was_stolen_leaves_the_other_cores_alone(
+    config: RackConfig, tmp_path: Path
+) -> None:
     recording = run(tmp_path / "run", config, away(), late_clock(52, since=50, late_ms=5.9))
     recording.cores = CoreRecord(200 * MS, (Stolen(120 * MS, 130 * MS, FIRST, 10),))
     assert found_in(recording).absences == []
@@ -221,19 +288,28 @@ def test_a_run_without_cycles_has_no_stalls(config: RackConfig, tmp_path: Path) 
 
 def test_a_cycle_with_a_stall_in_it_enters_no_budget(config: RackConfig, tmp_path: Path) -> None:
     long = Cycle(50, (0.0, 0.1, 6.3, 0.1))
-    trace = {"lower": [*plain(SETTLED, 50), long, Cycle(53, PLAIN, flags=skipping(2)), *plain(54, 60)]}
+    trace = {
+        "lower": [*plain(SETTLED, 50), long, Cycle(53, PLAIN, flags=skipping(2)), *plain(54, 60)]
+    }
     computed = run(tmp_path / "computed", config, trace)
     assert measured_budgets(computed)["lower"].process_ns == round(6.3 * MS)
     assert cycles_of(computed)["lower"].stalled == 0
     stolen = run(tmp_path / "stolen", config, trace)
     stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
     # The clock's board was away meanwhile, so the whole machine may have been.
-    for recording in (stolen, run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0))):
+    for recording in (
+        stolen,
+        run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0)),
+    ):
         assert measured_budgets(recording)["lower"].process_ns == MS
         analysis = Analysis.of(recording)
         assert "cycles with a stall in them are not judged: lower 1\n" in text(analysis)
         task = document(analysis)["tasks"]["lower"]
-        assert (task["cycles"], task["start_up"], task["stalled"]) == (len(trace["lower"]) - 1, 0, 1)
+        assert (task["cycles"], task["start_up"], task["stalled"]) == (
+            len(trace["lower"]) - 1,
+            0,
+            1,
+        )
         assert [breach.tick for breach in analysis.breaches if not breach.is_judged] == [50]
         # The report's own times are of all cycles.
         assert report_of(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3
@@ -264,7 +340,9 @@ class Stop(Display):
 
 @pytest.mark.slow
 @needs_fifo
-def test_a_stop_of_the_clocks_board_is_a_stall_of_its_core(small: Path, rack_name: str, tmp_path: Path) -> None:
+def test_a_stop_of_the_clocks_board_is_a_stall_of_its_core(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
     slow = ["clock.period_ms=40", "board.upper.rate_hz=5", "board.lower.rate_hz=25"]
     urgent = ["clock.mode=realtime", "clock.priority=10", "board.lower.priority=9"]
     display = Stop()
@@ -275,6 +353,7 @@ def test_a_stop_of_the_clocks_board_is_a_stall_of_its_core(small: Path, rack_nam
     # Ticks 2 and 3 after the stop cannot have been made.
     assert absence.lost >= 2
     assert absence.longest_ms >= 80
-    assert f"- core {FIRST} ran nothing of the rack though it was due, without steal (stalls: " in markdown(
-        report_of(recording)
+    assert (
+        f"- core {FIRST} ran nothing of the rack though it was due, without steal (stalls: "
+        in markdown(report_of(recording))
     )

@@ -1,4 +1,5 @@
-"""Recordings of several racks on one time line: what racks record of each other's clocks leads from one to the next."""
+"""Recordings of several racks on one time line: what racks record of each other's clocks leads from
+one to the next."""
 
 from __future__ import annotations
 
@@ -21,12 +22,15 @@ def check_place(place: RackPlace, own: Machine, line: Machine) -> None:
     true = [line.shows(own.true_ns(int(tick))) - line.epoch_ns for tick in ticks]
     apart_ns = np.abs(found - np.array(true) * line.speed)
     assert apart_ns.max() <= place.uncertainty_ns * line.speed + MS // 1000
-    # It says no more than it has to: what one comparison left open, and the drift where there was none.
+    # It says no more than it has to: what one comparison left open, and the drift where there was
+    # none.
     assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * len(place.shifts)
 
 
 @pytest.mark.parametrize("seen_by", ["first", "second", "both"])
-def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(tmp_path: Path, seen_by: str) -> None:
+def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
+    tmp_path: Path, seen_by: str
+) -> None:
     one = recorded(A, [B] if seen_by != "second" else [], tmp_path / "a")
     other = recorded(B, [A] if seen_by != "first" else [], tmp_path / "b", seed=2)
     first, second = on_one_time_line([one, other])
@@ -35,7 +39,10 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(tmp_path
     assert first.uncertainty_ns == 0
     # The other one's wall clock does not count: it may be wrong.
     stamps = np.array([B.shows(3 * S)])
-    assert second.wall_ns(stamps)[0] - first.wall_ns(np.array([A.shows(3 * S)]))[0] <= second.uncertainty_ns
+    assert (
+        second.wall_ns(stamps)[0] - first.wall_ns(np.array([A.shows(3 * S)]))[0]
+        <= second.uncertainty_ns
+    )
 
 
 def test_racks_that_never_met_are_placed_by_one_that_met_both(tmp_path: Path) -> None:
@@ -52,7 +59,9 @@ def test_racks_that_never_met_are_placed_by_one_that_met_both(tmp_path: Path) ->
 def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
     one = recorded(A, [B], tmp_path / "a")
     later = recorded(replace(B, begins_ns=B.begins_ns + 60 * S), [], tmp_path / "b")
-    with pytest.raises(Failure, match=r"not of the same run: .* 'b' that 'a' met began 60\.00\d s earlier") as refused:
+    with pytest.raises(
+        Failure, match=r"not of the same run: .* 'b' that 'a' met began 60\.00\d s earlier"
+    ) as refused:
         on_one_time_line([one, later])
     assert refused.value.status == 2
     assert "\n" not in str(refused.value)
@@ -78,5 +87,8 @@ def test_in_lockstep_ticks_are_the_time_line(tmp_path: Path) -> None:
 def test_in_lockstep_what_one_took_must_be_what_the_other_wrote(tmp_path: Path) -> None:
     a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
     one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)
-    with pytest.raises(Failure, match=r"not of the same run: what 'a' took from 'b' at 0\.0000 s, in lan\.other, is"):
+    with pytest.raises(
+        Failure,
+        match=r"not of the same run: what 'a' took from 'b' at 0\.0000 s, in lan\.other, is",
+    ):
         on_one_time_line([one, other])

@@ -54,7 +54,8 @@ exchange_ms = 0.25
 plan_ms = 8.0
 update_ms = 0.5
 """
-"""Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles: fits, and could within 2."""
+"""Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles: fits, and
+could within 2."""
 
 Judge = Callable[..., JudgedConfig]
 

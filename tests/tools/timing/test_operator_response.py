@@ -39,11 +39,15 @@ def response(tmp_path_factory: pytest.TempPathFactory) -> OperatorResponse:
     (folder / "told.toml").write_text(COMMANDED)
     given = [("upper", "hold", 101), ("upper", "resume", 176), ("lower", "hold", 250)]
     commands = [CommandConfig(level=level, what=what, tick=tick) for level, what, tick in given]
-    return measured(load(folder / "told.toml", [f"name=test-response-{os.getpid()}"]), folder / "run", *commands)
+    return measured(
+        load(folder / "told.toml", [f"name=test-response-{os.getpid()}"]), folder / "run", *commands
+    )
 
 
 @pytest.mark.slow
-def test_every_command_of_a_run_comes_at_its_predicted_tick(response: OperatorResponse, tmp_path: Path) -> None:
+def test_every_command_of_a_run_comes_at_its_predicted_tick(
+    response: OperatorResponse, tmp_path: Path
+) -> None:
     assert [(c.given, c.sampled, c.predicted, c.acts) for c in response.commands] == [
         (101, 104, 112, 112),
         (176, 184, 192, 192),
@@ -65,9 +69,17 @@ def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Pat
         CommandConfig(level="upper", what="resume", tick=398),
     ]
     response = measured(config(), tmp_path / "run", *given)
-    assert [command.fate for command in response.commands] == ["refused", "superseded", "acted on", "run over"]
+    assert [command.fate for command in response.commands] == [
+        "refused",
+        "superseded",
+        "acted on",
+        "run over",
+    ]
     assert len(response.measured) == 1
-    assert "not measured: 1 to upper (refused), 2 to upper (superseded), 4 to upper (run over)" in response.text()
+    assert (
+        "not measured: 1 to upper (refused), 2 to upper (superseded), 4 to upper (run over)"
+        in response.text()
+    )
 
 
 def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorResponse) -> None:
@@ -87,7 +99,9 @@ def test_a_run_without_commands_has_no_response(config: MakeConfig, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_run_in_real_time_has_responses_by_the_wall_clock(config: MakeConfig, tmp_path: Path) -> None:
+def test_a_run_in_real_time_has_responses_by_the_wall_clock(
+    config: MakeConfig, tmp_path: Path
+) -> None:
     given = [CommandConfig(level="upper", what="hold", tick=101)]
     response = measured(config("clock.mode=realtime"), tmp_path / "run", *given)
     (command,) = response.commands

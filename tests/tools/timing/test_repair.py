@@ -28,13 +28,22 @@ def test_the_first_that_works_is_found_in_few_attempts() -> None:
 
     assert first_that(range(10_000), attempt) == 700
     assert len(attempts) < 25
-    assert [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 7, 100)] == [None, None, 5, 5, 5]
-    assert [first_that(range(30), lambda k, least=least: k if k >= least else None) for least in range(30)] == [
-        *range(30)
+    assert [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 7, 100)] == [
+        None,
+        None,
+        5,
+        5,
+        5,
     ]
+    assert [
+        first_that(range(30), lambda k, least=least: k if k >= least else None)
+        for least in range(30)
+    ] == [*range(30)]
 
 
-def test_older_plans_come_first_then_a_longer_cycle_then_a_core_that_the_machine_lacks(judge: Judge) -> None:
+def test_older_plans_come_first_then_a_longer_cycle_then_a_core_that_the_machine_lacks(
+    judge: Judge,
+) -> None:
     # 8.5 of planning, 5.55 left in a cycle.
     judged = judge("board.lower.within_cycles=1")
     assert settings_for(judged) == [
@@ -46,7 +55,9 @@ def test_older_plans_come_first_then_a_longer_cycle_then_a_core_that_the_machine
     ]
 
 
-def test_a_core_that_the_machine_has_comes_before_older_plans(judge: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_core_that_the_machine_has_comes_before_older_plans(
+    judge: Judge, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1, 2})
     assert settings_for(judge("board.lower.within_cycles=1"))[:2] == [
         {"coupling": "loose", "planner_slot": 4, "planner_core": 2},
@@ -55,17 +66,23 @@ def test_a_core_that_the_machine_has_comes_before_older_plans(judge: Judge, monk
 
 
 def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
-    # Both on core 1, the slow level above the fast one: its 7.2 and 4.45 are more than the fast one's 10.
+    # Both on core 1, the slow level above the fast one: its 7.2 and 4.45 are more than the fast
+    # one's 10.
     settings = ("core=1", "priority=85", "budget.process_ms=5")
-    judged = judge(*(f"board.upper.{setting}" for setting in settings), "board.lower.budget.plan_ms=0.1")
-    assert ("response time", "lower") in {(verdict.equation, verdict.subject) for verdict in judged.failing}
+    judged = judge(
+        *(f"board.upper.{setting}" for setting in settings), "board.lower.budget.plan_ms=0.1"
+    )
+    assert ("response time", "lower") in {
+        (verdict.equation, verdict.subject) for verdict in judged.failing
+    }
     first = changes_for(judged, "lower")[0]
     assert (first.settings, first.text) == ({"priority": 86}, "board 'lower': priority 80 -> 86")
     assert first.after.failing == ()
 
 
 def test_a_longer_cycle_of_a_board_on_the_same_core_is_a_change_too(judge: Judge) -> None:
-    # Every 40 ms 4 cycles of each level, 4.45 and 3.2, and 11.7 of planning: 42.3; with half of the upper level's 35.9.
+    # Every 40 ms 4 cycles of each level, 4.45 and 3.2, and 11.7 of planning: 42.3; with half of the
+    # upper level's 35.9.
     settings = ("core=1", "priority=85", "rate_hz=100", "budget.process_ms=1")
     full = ("timing.clock_ms=2.2", "board.lower.budget.plan_ms=11")
     judged = judge(*(f"board.upper.{setting}" for setting in settings), *full)
@@ -76,7 +93,10 @@ def test_a_longer_cycle_of_a_board_on_the_same_core_is_a_change_too(judge: Judge
 
 def test_a_plan_many_times_as_old_is_no_change(judge: Judge) -> None:
     # 16 cycles leave 88.8 for a plan.
-    late = [settings_for(judge("board.lower.within_cycles=1", f"board.lower.budget.plan_ms={ms}")) for ms in (88, 89)]
+    late = [
+        settings_for(judge("board.lower.within_cycles=1", f"board.lower.budget.plan_ms={ms}"))
+        for ms in (88, 89)
+    ]
     assert [{"within_cycles": 16} in found for found in late] == [True, False]
     assert all(change.get("within_cycles", 0) <= 16 for found in late for change in found)
 
@@ -129,18 +149,35 @@ def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
     assert changes_for(judged, "lower")[0].board == "upper"
 
 
-def test_an_executor_too_long_for_its_cycle_gets_a_longer_one_and_nothing_else(judge: Judge) -> None:
+def test_an_executor_too_long_for_its_cycle_gets_a_longer_one_and_nothing_else(
+    judge: Judge,
+) -> None:
     judged = judge("board.lower.budget.process_ms=9")
     assert settings_for(judged) == [{"every": 8, "rate_hz": None}]
-    assert "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in changes_for(judged, "lower")[0].text
+    assert (
+        "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in changes_for(judged, "lower")[0].text
+    )
 
 
-def test_a_core_of_its_own_with_older_plans_ranks_by_their_age(judge: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_core_of_its_own_with_older_plans_ranks_by_their_age(
+    judge: Judge, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1, 2})
-    loose = ["coupling=loose", "planner_slot=4", "planner_core=1", "within_cycles=2", "budget.plan_ms=24"]
+    loose = [
+        "coupling=loose",
+        "planner_slot=4",
+        "planner_core=1",
+        "within_cycles=2",
+        "budget.plan_ms=24",
+    ]
     # 24.7 of planning need 5 cycles on the core of its executor or of the upper level, 3 alone.
-    judged = judge(*(f"board.lower.{setting}" for setting in loose), "board.upper.budget.process_ms=6")
-    assert settings_for(judged)[:2] == [{"within_cycles": 3, "planner_core": 2}, {"within_cycles": 5}]
+    judged = judge(
+        *(f"board.lower.{setting}" for setting in loose), "board.upper.budget.process_ms=6"
+    )
+    assert settings_for(judged)[:2] == [
+        {"within_cycles": 3, "planner_core": 2},
+        {"within_cycles": 5},
+    ]
 
 
 def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:
@@ -159,17 +196,32 @@ def test_more_cycles_would_do_for_figure_3_if_plans_could_be_old() -> None:
 
 
 def test_a_board_that_waits_for_others_gets_a_core_of_its_own(judge: Judge) -> None:
-    judged = judge("board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1")
+    judged = judge(
+        "board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1"
+    )
     assert {verdict.subject for verdict in judged.failing} >= {"upper"}
     assert {"core": 0} in settings_for(judged, "upper")
 
 
 def test_a_planner_elsewhere_and_a_longer_cycle_together_are_a_last_resort(judge: Judge) -> None:
-    settings = ["budget.process_ms=9", "budget.plan_ms=29", "budget.plan_within_ms=30", "budget.exchange_ms=0"]
+    settings = [
+        "budget.process_ms=9",
+        "budget.plan_ms=29",
+        "budget.plan_within_ms=30",
+        "budget.exchange_ms=0",
+    ]
     alone = ("timing.context_switch_ms=0", "board.upper.rate_hz=16.666666666666668")
-    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 on another core: just.
+    # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of 15 on
+    # another core: just.
     assert settings_for(judge(*(f"board.lower.{setting}" for setting in settings), *alone)) == [
-        {"within_cycles": 2, "coupling": "loose", "planner_slot": 4, "planner_core": 2, "every": 6, "rate_hz": None}
+        {
+            "within_cycles": 2,
+            "coupling": "loose",
+            "planner_slot": 4,
+            "planner_core": 2,
+            "every": 6,
+            "rate_hz": None,
+        }
     ]
 
 

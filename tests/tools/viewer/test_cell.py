@@ -13,7 +13,8 @@ MODEL = """
 <mujoco>
   <asset>
     <mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/>
-    <hfield name="hills" nrow="3" ncol="4" size="2 1 .5 .1" elevation="0 1 2 3  4 5 6 7  8 9 10 11"/>
+    <hfield name="hills" nrow="3" ncol="4" size="2 1 .5 .1"
+           elevation="0 1 2 3  4 5 6 7  8 9 10 11"/>
     <material name="red" rgba="1 0 0 1"/>
   </asset>
   <worldbody>
@@ -47,7 +48,10 @@ def column(model: mujoco.MjModel, geom: str, name: str) -> np.ndarray:
     """Return one component of a geom's shape, one row an instance."""
     shape = shape_of(model, model.geom(geom).id)
     assert shape is not None
-    batches = {b.component_descriptor().component.partition(":")[2]: b for b in shape.as_component_batches()}
+    batches = {
+        b.component_descriptor().component.partition(":")[2]: b
+        for b in shape.as_component_batches()
+    }
     return np.array(batches[name].as_arrow_array().to_pylist())
 
 
@@ -62,7 +66,9 @@ def test_a_capsule_begins_and_ends_where_mujocos_does(model: mujoco.MjModel) -> 
     axis = np.zeros(3)
     mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), np.array([w, x, y, z]))
     end = begin + axis * column(model, "capsule", "lengths")[0]
-    assert np.sort([begin, end], axis=0) == pytest.approx(np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]]), abs=1e-6)
+    assert np.sort([begin, end], axis=0) == pytest.approx(
+        np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]]), abs=1e-6
+    )
 
 
 def test_a_mesh_lies_where_its_file_says_though_mujoco_recentres_it(model: mujoco.MjModel) -> None:
@@ -84,7 +90,9 @@ def test_faces_look_outwards(model: mujoco.MjModel) -> None:
 
 def test_a_height_field_stands_as_high_as_its_data(model: mujoco.MjModel) -> None:
     corners = column(model, "hfield", "vertex_positions")
-    assert np.unique(np.round(corners[:, 2], 5)) == pytest.approx(np.arange(12) / 11 * 0.5 - 1.0, abs=1e-5)
+    assert np.unique(np.round(corners[:, 2], 5)) == pytest.approx(
+        np.arange(12) / 11 * 0.5 - 1.0, abs=1e-5
+    )
     assert corners[:, :2].max(axis=0) == pytest.approx([2.0, 1.0])
     assert len(corners) == 3 * 2 * 2 * 3
 

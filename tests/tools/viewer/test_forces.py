@@ -53,25 +53,43 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
     written = Written(tmp_path)
-    written.write(WRENCH, cell, ContactArrows(written.stream, cell, "wrench", CLOCK_NS).write, wrench=force)
+    written.write(
+        WRENCH, cell, ContactArrows(written.stream, cell, "wrench", CLOCK_NS).write, wrench=force
+    )
     arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
     assert arrows.ticks.tolist() == [0, 20, 40]
-    assert arrows.values[:, 0] == pytest.approx(np.array([[0.0, 0.0, tick / 60.0] for tick in (0, 20, 40)]))
+    assert arrows.values[:, 0] == pytest.approx(
+        np.array([[0.0, 0.0, tick / 60.0] for tick in (0, 20, 40)])
+    )
 
 
-def test_the_arrows_frame_is_at_the_tool_and_turns_with_the_world(tmp_path: Path, cell: Cell) -> None:
+def test_the_arrows_frame_is_at_the_tool_and_turns_with_the_world(
+    tmp_path: Path, cell: Cell
+) -> None:
     data, state = cell.start(), np.zeros(sizes(cell)["state"])
     mujoco.mj_getState(cell.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     written = Written(tmp_path)
-    written.write(ARM_STATE, cell, Poses(written.stream, cell, CLOCK_NS).write, state=np.tile(state, (ROWS, 1)))
+    written.write(
+        ARM_STATE,
+        cell,
+        Poses(written.stream, cell, CLOCK_NS).write,
+        state=np.tile(state, (ROWS, 1)),
+    )
     frames = read(written.file, "/frames", "Transform3D:child_frame").values.ravel()
     row = frames.tolist().index(contacts_of(cell)[0].frame)
     place = read(written.file, "/frames", "Transform3D:translation").values[row, 0]
     assert place == pytest.approx(data.site_xpos[cell.tool], abs=1e-6)
-    assert read(written.file, "/frames", "Transform3D:quaternion").values[row, 0].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert read(written.file, "/frames", "Transform3D:quaternion").values[row, 0].tolist() == [
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    ]
 
 
-def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(tmp_path: Path, cell: Cell) -> None:
+def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
+    tmp_path: Path, cell: Cell
+) -> None:
     wrench, wanted, selected = np.zeros((3, ROWS, 6))
     wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
     written = Written(tmp_path)

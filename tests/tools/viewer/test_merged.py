@@ -1,4 +1,5 @@
-"""Several racks in one recording for the viewer: each below its name, on the time line of the first."""
+"""Several racks in one recording for the viewer: each below its name, on the time line of the
+first."""
 
 from __future__ import annotations
 
@@ -22,13 +23,18 @@ LIVE = ("/recorder/load",)
 
 
 def contents(file: Path) -> dict[tuple[str, str], Any]:
-    """Return all values of all components in a file, in the order of ticks, by entity and component."""
+    """Return all values of all components in a file, in the order of ticks, by entity and
+    component."""
     found: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(str(file)).stream().to_chunks():
         if chunk.entity_path.startswith(("/__", *LIVE)):
             continue
         batch = chunk.to_record_batch()
-        ticks = batch.column("tick").to_pylist() if "tick" in batch.schema.names else [-1] * batch.num_rows
+        ticks = (
+            batch.column("tick").to_pylist()
+            if "tick" in batch.schema.names
+            else [-1] * batch.num_rows
+        )
         for name in batch.schema.names:
             if ":" in name:
                 rows = zip(ticks, map(repr, batch.column(name).to_pylist()), strict=True)
@@ -42,10 +48,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.mark.slow
-def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(run: Recording, tmp_path: Path) -> None:
+def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(
+    run: Recording, tmp_path: Path
+) -> None:
     write_merged(on_one_time_line([run]), tmp_path / "again.rrd")
     again, live = contents(tmp_path / "again.rrd"), contents(run.folder / "run.rrd")
-    # Rows of losses come with each block, and blocks are cut elsewhere; so are the ends of lines of limits.
+    # Rows of losses come with each block, and blocks are cut elsewhere; so are the ends of lines of
+    # limits.
     loose = ("/recorder/rows_lost", "limits")
     assert again.keys() == live.keys()
     for key, rows in live.items():
@@ -72,9 +81,16 @@ def test_each_rack_is_below_its_name(both: Path) -> None:
 
 def test_what_happened_at_one_time_is_at_one_time(both: Path) -> None:
     for machine in (A, B):
-        chunks = RrdReader(str(both)).stream().filter(content=f"/{machine.rack}/boards/2-pulse/executor").to_chunks()
+        chunks = (
+            RrdReader(str(both))
+            .stream()
+            .filter(content=f"/{machine.rack}/boards/2-pulse/executor")
+            .to_chunks()
+        )
         batches = [chunk.to_record_batch() for chunk in chunks if "tick" in chunk.timeline_names]
-        times = np.concatenate([batch.column("sim_time").to_numpy().astype(np.int64) for batch in batches])[::4]
+        times = np.concatenate(
+            [batch.column("sim_time").to_numpy().astype(np.int64) for batch in batches]
+        )[::4]
         true = [A.shows(machine.true_ns(tick)) - A.epoch_ns for tick in range(TICKS)]
         assert np.abs(np.sort(times) - true).max() < MS
         ticks = np.concatenate([batch.column("tick").to_numpy() for batch in batches])[::4]

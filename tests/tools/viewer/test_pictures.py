@@ -1,4 +1,5 @@
-"""Pictures without a screen: where there is no graphics driver either, and who can reach the viewer meanwhile."""
+"""Pictures without a screen: where there is no graphics driver either, and who can reach the viewer
+meanwhile."""
 
 from __future__ import annotations
 
@@ -14,7 +15,11 @@ from rack.tools.viewer.window import ViewerWindow, free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
-NO_DRIVER = {"VK_DRIVER_FILES": "/nowhere", "VK_ICD_FILENAMES": "/nowhere", "WGPU_BACKEND": "vulkan"}
+NO_DRIVER = {
+    "VK_DRIVER_FILES": "/nowhere",
+    "VK_ICD_FILENAMES": "/nowhere",
+    "WGPU_BACKEND": "vulkan",
+}
 LOOPBACK, LISTENS = "0100007F", "0A"
 
 
@@ -33,11 +38,15 @@ def test_without_a_driver_the_cause_and_what_to_install_are_one_line(
         "--at",
         "1",
     ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert "No graphics adapter was found" in line
-    assert re.search("missing packages: apt-get install|no package for it is missing|what Debian calls", line)
+    assert re.search(
+        "missing packages: apt-get install|no package for it is missing|what Debian calls", line
+    )
 
 
 def test_the_viewer_listens_to_this_machine_alone() -> None:
@@ -46,9 +55,15 @@ def test_the_viewer_listens_to_this_machine_alone() -> None:
     try:
         _connected(window, port)
         sockets = [
-            line.split()[1:4] for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()
+            line.split()[1:4]
+            for name in ("tcp", "tcp6")
+            for line in Path("/proc/net", name).read_text().splitlines()
         ]
-        found = [place for place, _, state in sockets if place.endswith(f":{port:04X}") and state == LISTENS]
+        found = [
+            place
+            for place, _, state in sockets
+            if place.endswith(f":{port:04X}") and state == LISTENS
+        ]
     except NoViewerError as error:
         pytest.skip(str(error))
     finally:

@@ -31,7 +31,9 @@ def cell(run: Recording) -> Cell:
 
 
 def test_the_file_is_whole(run: Recording) -> None:
-    verified = subprocess.run([executable(), "rrd", "verify", run.folder / "run.rrd"], capture_output=True, text=True)
+    verified = subprocess.run(
+        [executable(), "rrd", "verify", run.folder / "run.rrd"], capture_output=True, text=True
+    )
     assert verified.returncode == 0, verified.stderr
 
 
@@ -41,7 +43,9 @@ def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
         for quantity, fields in {"position": ["target", "position"], "torque": ["torque"]}.items():
             rows = read(run.folder / "run.rrd", f"/joints/{joint}/{quantity}")
             assert np.array_equal(rows.ticks, ticks)
-            expected = np.column_stack([run.signal("servo.status", field)[:, at] for field in fields])
+            expected = np.column_stack(
+                [run.signal("servo.status", field)[:, at] for field in fields]
+            )
             assert np.array_equal(rows.values, expected)
 
 
@@ -53,7 +57,13 @@ def test_limits_are_the_arms(run: Recording, cell: Cell) -> None:
 
 
 def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
-    states = dict(zip(run.signal("servo.state", "tick").tolist(), run.signal("servo.state", "state"), strict=True))
+    states = dict(
+        zip(
+            run.signal("servo.state", "tick").tolist(),
+            run.signal("servo.state", "state"),
+            strict=True,
+        )
+    )
     file, data = run.folder / "run.rrd", mujoco.MjData(cell.model)
     frames = read(file, "/frames", "Transform3D:child_frame")
     places = read(file, "/frames", "Transform3D:translation").values[:, 0]
@@ -79,7 +89,11 @@ def test_the_planned_path_begins_where_the_tool_is(run: Recording) -> None:
 
 def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
     for task in run.layout.tasks:
-        rows = read(run.folder / "run.rrd", f"/boards/{task.slot}-{task.board}/{task.role}", "StateChange:state")
+        rows = read(
+            run.folder / "run.rrd",
+            f"/boards/{task.slot}-{task.board}/{task.role}",
+            "StateChange:state",
+        )
         cycles = run.cycles[task.name]
         work = "process" if task.role == "executor" else "plan"
         assert np.array_equal(rows.ticks, np.repeat(cycles["tick"], 4))
@@ -91,21 +105,31 @@ def test_spans_of_a_lane_follow_one_another_and_stay_in_their_slices(run: Record
         times = sim_times(run, f"/boards/{task.slot}-{task.board}/{task.role}")
         slice_ns = task.every * task.within_cycles * run.layout.clock_ns
         assert (np.diff(times) >= 0).all()
-        assert (times < np.repeat(run.cycles[task.name]["tick"], 4) * run.layout.clock_ns + slice_ns).all()
+        assert (
+            times < np.repeat(run.cycles[task.name]["tick"], 4) * run.layout.clock_ns + slice_ns
+        ).all()
 
 
 def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
-    made, visible = run.signal("elemental_move.status", "tick"), run.signal("elemental_move.status", "visible_at")
+    made, visible = (
+        run.signal("elemental_move.status", "tick"),
+        run.signal("elemental_move.status", "visible_at"),
+    )
     rows = read(run.folder / "run.rrd", "/ages/elemental_move.status")
-    expected = [(tick - made[visible <= tick].max()) * run.layout.clock_ns * 1e-6 for tick in rows.ticks]
+    expected = [
+        (tick - made[visible <= tick].max()) * run.layout.clock_ns * 1e-6 for tick in rows.ticks
+    ]
     assert rows.values.ravel() == pytest.approx(expected)
-    # Read at once by a board of its own rate or by a slower one: the age is the sampling delay of the paper.
+    # Read at once by a board of its own rate or by a slower one: the age is the sampling delay of
+    # the paper.
     assert rows.values.min() == pytest.approx(250.0)
 
 
 def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> None:
     end_ns = round(NASREM_S * 1e9)
-    for chunk in RrdReader(str(run.folder / "run.rrd")).stream().filter(is_static=False).to_chunks():
+    for chunk in (
+        RrdReader(str(run.folder / "run.rrd")).stream().filter(is_static=False).to_chunks()
+    ):
         if chunk.entity_path.startswith("/__"):
             continue
         assert {"sim_time", "tick", "wall"} <= set(chunk.timeline_names), chunk.entity_path
@@ -117,7 +141,9 @@ def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> No
 
 def test_config_and_events_are_in_it(run: Recording) -> None:
     file = run.folder / "run.rrd"
-    document = RrdReader(str(file)).stream().filter(content="/config").to_chunks()[0].to_record_batch()
+    document = (
+        RrdReader(str(file)).stream().filter(content="/config").to_chunks()[0].to_record_batch()
+    )
     assert run.config in document.column("TextDocument:text")[0].as_py()[0]
     lines = read(file, "/log/events", "TextLog:text").values.ravel().tolist()
     shown = [e for e in run.events if "tick" in e]
@@ -142,7 +168,9 @@ def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
         entity = query.replace("\\", "").removeprefix("+").strip()
         if not entity.startswith(("-", "/signals", "/cell/collision")):
             stem = entity.removesuffix("/**").replace("$origin", "/")
-            assert any(path == stem or path.startswith(stem.rstrip("/") + "/") for path in recorded), query
+            assert any(
+                path == stem or path.startswith(stem.rstrip("/") + "/") for path in recorded
+            ), query
 
 
 @pytest.mark.slow
@@ -157,8 +185,15 @@ def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
 
 
 def sim_times(run: Recording, entity: str) -> np.ndarray:
-    chunks = RrdReader(str(run.folder / "run.rrd")).stream().filter(content=entity, has_timeline="tick").to_chunks()
-    return np.concatenate([c.to_record_batch().column("sim_time").to_numpy().astype(np.int64) for c in chunks])
+    chunks = (
+        RrdReader(str(run.folder / "run.rrd"))
+        .stream()
+        .filter(content=entity, has_timeline="tick")
+        .to_chunks()
+    )
+    return np.concatenate(
+        [c.to_record_batch().column("sim_time").to_numpy().astype(np.int64) for c in chunks]
+    )
 
 
 def test_lockstep_shows_no_time_that_is_held_against_the_clock(run: Recording) -> None:

@@ -1,4 +1,5 @@
-"""The viewer's file of a long run: in parts, so that what the library keeps of one is given back."""
+"""The viewer's file of a long run: in parts, so that what the library keeps of one is given
+back."""
 
 from __future__ import annotations
 
@@ -38,7 +39,12 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
             assert [part.exists() for part in parts] == [end >= place * PART for place in range(4)]
             # All but the newest are complete.
             for part in parts[: end // PART]:
-                subprocess.run([executable(), "rrd", "verify", part], check=True, capture_output=True, timeout=60)
+                subprocess.run(
+                    [executable(), "rrd", "verify", part],
+                    check=True,
+                    capture_output=True,
+                    timeout=60,
+                )
         view.close(TICKS, {})
     ticks = [read(part, "/signals/lower.status/count").ticks for part in parts[:3]]
     assert [len(part) for part in ticks] == [PART] * 3

@@ -1,4 +1,5 @@
-"""A campaign: a faultless run, trials with faults, kills and sizes, and faultless time; each run leaves a file."""
+"""A campaign: a faultless run, trials with faults, kills and sizes, and faultless time; each run
+leaves a file."""
 
 from __future__ import annotations
 
@@ -37,10 +38,11 @@ TRIALS = "trials"
 
 @dataclass(frozen=True)
 class Order:
-    """An order for a campaign. `injections` of each kind; `modes` are True for lockstep, in their order.
+    """An order for a campaign. `injections` of each kind; `modes` are True for lockstep, in their
+    order.
 
-    `seconds`: simulated time of a rack that no task ends. `loads`: for each stretch of faultless time, whether the
-    machine is loaded.
+    `seconds`: simulated time of a rack that no task ends. `loads`: for each stretch of faultless
+    time, whether the machine is loaded.
     """
 
     name: str
@@ -61,7 +63,8 @@ class Order:
 
 
 class Campaign:
-    """One campaign. Raises `ConfigError`, and `Failure` for a task that is not done even without faults."""
+    """One campaign. Raises `ConfigError`, and `Failure` for a task that is not done even without
+    faults."""
 
     def __init__(self, order: Order, folder: Path, progress: Progress) -> None:
         self.order = order
@@ -94,7 +97,9 @@ class Campaign:
             self._ticks = nominal.ticks
             self._inject(results)
             rack = self._under_test(True)
-            results.sizes += self._made(size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1))
+            results.sizes += self._made(
+                size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1)
+            )
             self._run_faultless(results)
         results.is_interrupted = INTERRUPT.number != 0
         return results
@@ -107,33 +112,52 @@ class Campaign:
             there = json.loads(path.read_text())
             if other := [key for key in wanted if wanted[key] != there.get(key)]:
                 differing = ", ".join(key.replace("_", " ") for key in other)
-                raise Failure(f"--out {self.folder}: holds another campaign; it differs in {differing}", 2)
+                raise Failure(
+                    f"--out {self.folder}: holds another campaign; it differs in {differing}", 2
+                )
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(wanted, indent=2) + "\n")
 
     def _under_test(self, lockstep: bool) -> RackUnderTest:
-        return RackUnderTest(self._targets, self._ticks, self._second, restart_s(self._config, lockstep))
+        return RackUnderTest(
+            self._targets, self._ticks, self._second, restart_s(self._config, lockstep)
+        )
 
     def _inject(self, results: Results) -> None:
-        """Make trials until every kind has struck as often as ordered; in real time those that lockstep cannot have."""
+        """Make trials until every kind has struck as often as ordered; in real time those that
+        lockstep cannot have."""
         order = self.order
         both = len(self.order.modes) > 1
         for lockstep in order.modes:
-            kinds = [k for k in self.kinds if needs_real_time(k) != lockstep] if both or lockstep else self.kinds
+            kinds = (
+                [k for k in self.kinds if needs_real_time(k) != lockstep]
+                if both or lockstep
+                else self.kinds
+            )
             lacking = dict.fromkeys(kinds if order.injections else (), order.injections)
             for turn in range(ROUNDS):
                 rack = self._under_test(lockstep)
                 seed = f"{order.seed} {turn}"
                 found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
                 results.trials += found
-                struck = Counter(f.kind for run in found for f in run.faults if f.is_judged and f.seen != "not struck")
-                lacking = {kind: left for kind, count in lacking.items() if (left := count - struck[kind]) > 0}
+                struck = Counter(
+                    f.kind
+                    for run in found
+                    for f in run.faults
+                    if f.is_judged and f.seen != "not struck"
+                )
+                lacking = {
+                    kind: left
+                    for kind, count in lacking.items()
+                    if (left := count - struck[kind]) > 0
+                }
                 if not lacking or INTERRUPT.number:
                     break
             wanted = order.injections
             results.lacking += [
-                f"{k}: struck {wanted - n} of {wanted} times, in {ROUNDS} draws" for k, n in lacking.items()
+                f"{k}: struck {wanted - n} of {wanted} times, in {ROUNDS} draws"
+                for k, n in lacking.items()
             ]
         # Runs of kills alternate between the modes.
         rack = self._under_test(False not in order.modes)
@@ -160,7 +184,8 @@ class Campaign:
         return TrialJob(plan, self.folder / TRIALS / f"{name}.json", self._ticks, seconds)
 
     def _kept(self, job: TrialJob) -> TrialResult | None:
-        """Return the result that is kept of a trial; None for one of another plan, drawn by another version."""
+        """Return the result that is kept of a trial; None for one of another plan, drawn by another
+        version."""
         found = kept(job.path)
         return found if found is not None and found.plan == job.plan else None
 
@@ -169,8 +194,12 @@ class Campaign:
         if (found := self._kept(job)) is None:
             return
         if found.shortfalls and job.plan.number:
-            (self.folder / f"trial-{job.plan.number:04}.toml").write_text(job.plan.toml(self.order.name))
-        self._progress.end(self._guess_s([job.plan]), f"{_text(job.plan)}: {found.ended}", found.shortfalls)
+            (self.folder / f"trial-{job.plan.number:04}.toml").write_text(
+                job.plan.toml(self.order.name)
+            )
+        self._progress.end(
+            self._guess_s([job.plan]), f"{_text(job.plan)}: {found.ended}", found.shortfalls
+        )
 
     def _run_faultless(self, results: Results) -> None:
         """Run without faults, alone or under load, for as long as ordered."""
@@ -180,18 +209,24 @@ class Campaign:
             with ExitStack() as stack:
                 under = stack.enter_context(load()) if is_loaded else ""
                 runs = list(self._calm(place, under))
-            results.faultless.append(Faultless(under, sum(run.ticks for run in runs) / self._second, tuple(runs)))
+            results.faultless.append(
+                Faultless(under, sum(run.ticks for run in runs) / self._second, tuple(runs))
+            )
 
     def _calm(self, place: int, under: str) -> Iterator[TrialResult]:
         """Yield faultless runs in real time."""
         left = self.order.faultless_s
         nth = 0
         while left >= SHORTEST_S and not INTERRUPT.number:
-            self._progress.begin(f"faultless{f' under {under}' if under else ''}, {left:.0f} s left")
+            self._progress.begin(
+                f"faultless{f' under {under}' if under else ''}, {left:.0f} s left"
+            )
             seconds = left if left < self._ticks / self._second else self.order.seconds
             plan = Plan(0, "faultless", lockstep=False)
             job = self._job(plan, seconds)
-            job = TrialJob(plan, job.path.with_stem(f"faultless-{place}-{nth:03}"), job.ticks, seconds)
+            job = TrialJob(
+                plan, job.path.with_stem(f"faultless-{place}-{nth:03}"), job.ticks, seconds
+            )
             if self._kept(job) is None:
                 list(self._workers.run([job], alone=True))
             if (found := self._kept(job)) is None:
@@ -204,7 +239,8 @@ class Campaign:
             self._progress.end(ran_s, found.ended, found.shortfalls)
 
     def _guess_s(self, plans: Sequence[Plan]) -> float:
-        """Estimate the time that runs take: in lockstep a core simulates the default rack in a third of real time."""
+        """Estimate the time that runs take: in lockstep a core simulates the default rack in a
+        third of real time."""
         real_s = self._ticks / self._second
         cores = len(os.sched_getaffinity(0))
         return sum(LAUNCH_S + (real_s / 3.0 / cores if plan.lockstep else real_s) for plan in plans)
@@ -212,6 +248,8 @@ class Campaign:
 
 def _text(plan: Plan) -> str:
     """Return a plan in a few words."""
-    kinds = Counter([*(table["kind"] for table in plan.faults), *(["external kill"] * len(plan.kills))])
+    kinds = Counter(
+        [*(table["kind"] for table in plan.faults), *(["external kill"] * len(plan.kills))]
+    )
     found = ", ".join(f"{count} {kind}" if count > 1 else kind for kind, count in kinds.items())
     return f"trial {plan.number}, {found}" if plan.number else plan.purpose

@@ -1,4 +1,5 @@
-"""Random plans: which faults strike a trial, where, and when. The same seed draws the same plans."""
+"""Random plans: which faults strike a trial, where, and when. The same seed draws the same
+plans."""
 
 from __future__ import annotations
 
@@ -19,15 +20,18 @@ MOST_FAULTS = 40
 LEAD_S = 0.1
 """Simulated time before the first fault, at least."""
 TAIL_S = 1.0
-"""Simulated time at the end of a faultless run in which no fault begins: it must strike a task under way."""
+"""Simulated time at the end of a faultless run in which no fault begins: it must strike a task
+under way."""
 SETTLE_S = 0.1
 """Simulated time between the end of all that a fault may lead to and the next fault."""
 EPISODE = 25
-"""Reads after which a reader reports the next fault of a mailbox again: those of `Episodes`, and some more."""
+"""Reads after which a reader reports the next fault of a mailbox again: those of `Episodes`, and
+some more."""
 AHEAD = 60
 """Waiting faults that are tried for one that still fits into a trial."""
 KILL_GAP_S = 3.5
-"""Simulated time between two kills from outside, at least: a restart takes up to two seconds of real time."""
+"""Simulated time between two kills from outside, at least: a restart takes up to two seconds of
+real time."""
 LEAST_TICKS = 20
 """Least time, in ticks, in which a fault that strikes no mailbox is found and over."""
 SEEDS = 2**31
@@ -35,7 +39,8 @@ SEEDS = 2**31
 
 @dataclass(frozen=True)
 class RackUnderTest:
-    """The rack that plans are drawn for: its targets, ticks of a faultless run and of a second, time of a restart."""
+    """The rack that plans are drawn for: its targets, ticks of a faultless run and of a second,
+    time of a restart."""
 
     targets: Targets
     ticks: int
@@ -51,7 +56,8 @@ class RackUnderTest:
         return max(self.first() + 1, self.ticks - round(TAIL_S * self.second))
 
     def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
-        """Return the ticks from the beginning of a fault to the next: it is found, over, and recovered from."""
+        """Return the ticks from the beginning of a fault to the next: it is found, over, and
+        recovered from."""
         layout = self.targets.layout
         kind = target.record
         tasks = [task.name for task in layout.tasks]
@@ -64,13 +70,20 @@ class RackUnderTest:
         )
         lasts = kind.bound_ticks(entry, layout) or 0
         if not kind.is_over_when_found:
-            lasts = max(lasts, ticks, 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS)
-        return lasts + kind.recovery_ticks(target.board, layout, self.restart_s) + round(SETTLE_S * self.second)
+            lasts = max(
+                lasts, ticks, 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS
+            )
+        return (
+            lasts
+            + kind.recovery_ticks(target.board, layout, self.restart_s)
+            + round(SETTLE_S * self.second)
+        )
 
 
 @dataclass(frozen=True)
 class Card:
-    """One fault that waits for its place in a trial. `ticks`: its length, 0 for a kind that strikes once."""
+    """One fault that waits for its place in a trial. `ticks`: its length, 0 for a kind that strikes
+    once."""
 
     target: Target
     ticks: int
@@ -81,7 +94,8 @@ class Card:
 
     @classmethod
     def draw(cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
-        """Draw a fault as the kind's record says; with a `size`, of a single joint, as a point of a curve."""
+        """Draw a fault as the kind's record says; with a `size`, of a single joint, as a point of a
+        curve."""
         target = rng.choice(rack.targets.by_kind[kind])
         record = target.record
         joints = rack.targets.joints
@@ -97,7 +111,11 @@ class Card:
     @property
     def quiet(self) -> int:
         """Ticks from the last message that a fault has touched to the next fault."""
-        held = self.parameters.get("by", 0) * self.target.cycle if self.target.record.where == "writer" else 0
+        held = (
+            self.parameters.get("by", 0) * self.target.cycle
+            if self.target.record.where == "writer"
+            else 0
+        )
         return self.window - self.ticks - round(held)
 
     def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> dict[str, Any]:
@@ -116,7 +134,9 @@ class Card:
         return {**table, "seed": self.seed, **self.parameters}
 
 
-def fault_plans(rack: RackUnderTest, counts: Mapping[str, int], seed: str, lockstep: bool, first: int) -> list[Plan]:
+def fault_plans(
+    rack: RackUnderTest, counts: Mapping[str, int], seed: str, lockstep: bool, first: int
+) -> list[Plan]:
     """Return plans, numbered from `first`, that have each of these kinds so many times.
 
     Faults come in random order, as many in a trial as fit into the task, one after the other.
@@ -124,11 +144,16 @@ def fault_plans(rack: RackUnderTest, counts: Mapping[str, int], seed: str, locks
     rng = Random(f"{seed} {'lockstep' if lockstep else 'realtime'}")
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     rng.shuffle(kinds)
-    return _packed(rack, first, lockstep, "faults", [Card.draw(rack, kind, rng) for kind in kinds], rng)
+    return _packed(
+        rack, first, lockstep, "faults", [Card.draw(rack, kind, rng) for kind in kinds], rng
+    )
 
 
-def kill_plans(rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int) -> Iterator[Plan]:
-    """Yield plans of kills from outside, `count` in all, in these modes by turns, numbered from `first`."""
+def kill_plans(
+    rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int
+) -> Iterator[Plan]:
+    """Yield plans of kills from outside, `count` in all, in these modes by turns, numbered from
+    `first`."""
     rng = Random(f"{seed} kills")
     gap = KILL_GAP_S * rack.second
     a_run = max(1, int((rack.last() - rack.first()) / gap))
@@ -145,8 +170,11 @@ def kill_plans(rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool]
         )
 
 
-def size_plans(rack: RackUnderTest, kinds: Sequence[str], count: int, seed: int, first: int) -> list[Plan]:
-    """Return plans in lockstep with `count` sizes of every kind that must be found from a certain size."""
+def size_plans(
+    rack: RackUnderTest, kinds: Sequence[str], count: int, seed: int, first: int
+) -> list[Plan]:
+    """Return plans in lockstep with `count` sizes of every kind that must be found from a certain
+    size."""
     rng = Random(f"{seed} sizes")
     sizes = [(kind, size) for kind in kinds for size in swept_sizes(kind, count)]
     rng.shuffle(sizes)
@@ -163,7 +191,12 @@ def swept_sizes(kind: str, count: int) -> list[float]:
 
 
 def _packed(
-    rack: RackUnderTest, first: int, lockstep: bool, purpose: Purpose, cards: Sequence[Card], rng: Random
+    rack: RackUnderTest,
+    first: int,
+    lockstep: bool,
+    purpose: Purpose,
+    cards: Sequence[Card],
+    rng: Random,
 ) -> list[Plan]:
     """Return plans with all of these faults, as many in each as fit into the task."""
     plans = list[Plan]()
@@ -172,7 +205,9 @@ def _packed(
         chosen = _chosen(rack, waiting)
         faults = list[dict[str, Any]]()
         kills = list[Kill]()
-        for card, start in zip(chosen, _starts(rack, [card.window for card in chosen], rng), strict=True):
+        for card, start in zip(
+            chosen, _starts(rack, [card.window for card in chosen], rng), strict=True
+        ):
             if card.target.kind == EXTERNAL:
                 kills.append(Kill(card.target.board, start, card.phase))
             else:
@@ -192,18 +227,27 @@ def _chosen(rack: RackUnderTest, waiting: list[Card]) -> list[Card]:
         target = card.target
         is_first = not chosen
         is_reported = target.mailbox is None or target.mailbox not in busy
-        fits = card.window <= free and is_reported and target.record.recoverable and len(chosen) < MOST_FAULTS
+        fits = (
+            card.window <= free
+            and is_reported
+            and target.record.recoverable
+            and len(chosen) < MOST_FAULTS
+        )
         if is_first or fits:
             chosen.append(card)
             waiting.remove(card)
             free -= card.window
-            if target.mailbox is not None and EPISODE * max(target.reader, target.cycle) > card.quiet:
+            if (
+                target.mailbox is not None
+                and EPISODE * max(target.reader, target.cycle) > card.quiet
+            ):
                 busy.add(target.mailbox)
     return chosen
 
 
 def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
-    """Return a tick for each window, in order: the rest of the run is shared out between them at random."""
+    """Return a tick for each window, in order: the rest of the run is shared out between them at
+    random."""
     free = max(0, rack.last() - rack.first() - sum(windows))
     cuts = sorted(rng.randint(0, free) for _ in windows)
     gaps = [later - earlier for earlier, later in pairwise([0, *cuts])]

@@ -1,7 +1,8 @@
-"""The surroundings of trials: a load on the machine, leftovers of racks, and a check of the violation counter.
+"""The surroundings of trials: a load on the machine, leftovers of racks, and a check of the
+violation counter.
 
-As a program, `python -m rack.tools.faults.campaigns.environment PARENT WHAT`: one process of the load, or stress-ng; it
-ends with its parent.
+As a program, `python -m rack.tools.faults.campaigns.environment PARENT WHAT`: one process of the
+load, or stress-ng; it ends with its parent.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def children() -> set[int]:
 
 
 def left_behind(rack: str, before: set[int]) -> list[str]:
-    """Return everything left of a rack, segments and semaphores by name, processes by pid, each as one readable text.
+    """Return everything left of a rack, segments and semaphores by name, processes by pid, each as
+    one readable text.
 
     `before`: descendants of this process that were there before the rack.
     """
@@ -78,7 +80,8 @@ def _await_end(pids: set[int]) -> None:
 def examine(config: RackConfig) -> None:
     """Check the violation counter: move every joint at twice its limit for one tick.
 
-    A campaign that says "no limit violated" must be able to see a violation. Raises `Failure` where it is not counted.
+    A campaign that says "no limit violated" must be able to see a violation. Raises `Failure` where
+    it is not counted.
     """
     # Only here: a process of the load needs none of them.
     import mujoco
@@ -106,7 +109,9 @@ def examine(config: RackConfig) -> None:
         if not arm.violations:
             name = config.robot.joints[joint]
             speed = f"{FACTOR * limit:g} rad/s"
-            raise Failure(f"violation counter: joint '{name}' at {speed}, twice its limit, is not counted")
+            raise Failure(
+                f"violation counter: joint '{name}' at {speed}, twice its limit, is not counted"
+            )
 
 
 @contextmanager
@@ -122,7 +127,9 @@ def load() -> Iterator[str]:
     command = [sys.executable, "-m", "rack.tools.faults.campaigns.environment", str(os.getpid())]
     parts = [stress] if has_stress else [*([str(core)] for core in cores), [DISKS]]
     busy = [
-        subprocess.Popen([*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        subprocess.Popen(
+            [*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         for part in parts
     ]
     try:

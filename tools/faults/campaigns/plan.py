@@ -23,7 +23,8 @@ Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
 
 @dataclass(frozen=True)
 class Kill:
-    """One SIGKILL from outside, of the process of `board`. `phase` is the part of the tick that has passed."""
+    """One SIGKILL from outside, of the process of `board`. `phase` is the part of the tick that has
+    passed."""
 
     board: str
     tick: int
@@ -32,7 +33,8 @@ class Kill:
 
 @dataclass(frozen=True)
 class Plan:
-    """One trial. `faults` are tables as in a config; `rack run CONFIG --faults FILE` repeats a plan."""
+    """One trial. `faults` are tables as in a config; `rack run CONFIG --faults FILE` repeats a
+    plan."""
 
     number: int
     purpose: Purpose
@@ -46,25 +48,35 @@ class Plan:
         clock = {"mode": "lockstep", "speed": 1.0} if self.lockstep else {"mode": "realtime"}
         faults = tuple(FaultConfig.model_validate(table) for table in self.faults)
         return config.model_copy(
-            update={"name": rack, "clock": config.clock.model_copy(update=clock), "fault": config.fault + faults}
+            update={
+                "name": rack,
+                "clock": config.clock.model_copy(update=clock),
+                "fault": config.fault + faults,
+            }
         )
 
     def toml(self, config: str) -> str:
-        """Return the faults as a file for `--faults`; kills from outside, which no file can hold, as comments."""
+        """Return the faults as a file for `--faults`; kills from outside, which no file can hold,
+        as comments."""
         mode = " --lockstep" if self.lockstep else ""
         lines = [f"# Trial {self.number}: rack run {config}{mode} --faults THIS_FILE"]
-        lines += [f"# {EXTERNAL}: {kill.board} at tick {kill.tick} + {kill.phase:g}" for kill in self.kills]
+        lines += [
+            f"# {EXTERNAL}: {kill.board} at tick {kill.tick} + {kill.phase:g}"
+            for kill in self.kills
+        ]
         return "\n".join([*lines, "", to_toml({"fault": [dict(table) for table in self.faults]})])
 
 
 def needs_real_time(kind: str) -> bool:
-    """Return whether a kind does not exist in lockstep, or means nothing there: no time passes while a process dies."""
+    """Return whether a kind does not exist in lockstep, or means nothing there: no time passes
+    while a process dies."""
     return kind == EXTERNAL or KINDS[kind].realtime
 
 
 @dataclass(frozen=True)
 class Target:
-    """A place for a fault. `cycle`, `reader`: periods in ticks of the task and of its mailbox's fastest reader."""
+    """A place for a fault. `cycle`, `reader`: periods in ticks of the task and of its mailbox's
+    fastest reader."""
 
     kind: str
     board: str
@@ -79,24 +91,34 @@ class Target:
 
 
 class Targets:
-    """The places in one rack where a fault of each kind can strike and be seen. `joints` is the number of the arm's."""
+    """The places in one rack where a fault of each kind can strike and be seen. `joints` is the
+    number of the arm's."""
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self.layout = layout
         self.joints = len(config.robot.joints) if config.robot is not None else 0
         self._roles = {task.name: task.role for task in layout.tasks}
-        self._driving = {name: kind.faults for name, kind in executors(config).items() if kind is not None}
+        self._driving = {
+            name: kind.faults for name, kind in executors(config).items() if kind is not None
+        }
         self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
         # The clock's process can be killed like any other.
-        self.by_kind[EXTERNAL] = [Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]]
+        self.by_kind[EXTERNAL] = [
+            Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]
+        ]
 
     def _of(self, kind: Kind) -> list[Target]:
         if not kind.takes_mailbox:
             return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
         seen = [box for box in self.layout.mailboxes if self._is_seen(kind, box)]
-        readers = [min(between_reads(self.layout, box, reader) for reader in box.readers) for box in seen]
+        readers = [
+            min(between_reads(self.layout, box, reader) for reader in box.readers) for box in seen
+        ]
         targets = zip(seen, readers, strict=True)
-        return [Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader) for box, reader in targets]
+        return [
+            Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader)
+            for box, reader in targets
+        ]
 
     def _tasks(self, kind: Kind) -> list[str]:
         if kind.where == "clock":
@@ -106,9 +128,14 @@ class Targets:
         return [task for task, role in self._roles.items() if role in kind.tasks]
 
     def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
-        """Return whether the mailbox has readers, and messages often enough: plans are not periodic."""
+        """Return whether the mailbox has readers, and messages often enough: plans are not
+        periodic."""
         # The clock writes only for an operator.
-        if not box.readers or box.writer == CLOCK or (kind.where == "lock" and box.protocol != "lock"):
+        if (
+            not box.readers
+            or box.writer == CLOCK
+            or (kind.where == "lock" and box.protocol != "lock")
+        ):
             return False
         # A queue is written on demand, and the position of its reader through no port.
         if kind.where == "writer" and (box.protocol == "queue" or is_position(box)):
@@ -126,13 +153,18 @@ def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]
     Raises `Failure` for an unknown kind, or one that the rack cannot have.
     """
     known = {kind.name: kind.realtime for kind in KINDS} | {EXTERNAL: False}
-    permitted = [name for name, needs in known.items() if (realtime or not needs) and targets.by_kind[name]]
+    permitted = [
+        name for name, needs in known.items() if (realtime or not needs) and targets.by_kind[name]
+    ]
     if wanted is None:
         return permitted
     named = [name.strip() for name in wanted.split(",") if name.strip()]
     for name in named:
         if name not in permitted:
-            raise Failure(f"--kinds {name}: {_why_not(name, known, realtime)}; kinds: {', '.join(permitted)}", 2)
+            raise Failure(
+                f"--kinds {name}: {_why_not(name, known, realtime)}; kinds: {', '.join(permitted)}",
+                2,
+            )
     if not named:
         raise Failure(f"--kinds: names no kind; kinds: {', '.join(permitted)}", 2)
     return list(dict.fromkeys(named))

@@ -28,32 +28,47 @@ WIDEST = 1.5
 
 
 def plot(report: Report, path: Path) -> None:
-    """Draw a campaign's document into a PNG file: delays against bounds, curves of size, recovery times."""
+    """Draw a campaign's document into a PNG file: delays against bounds, curves of size, recovery
+    times."""
     trials = f"{report['summary']['trials']} trials, {' and '.join(dict.fromkeys(report['modes']))}"
     with picture([path], *SIZE_IN) as figure:
         for place, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
             draw(figure.add_subplot(place), report)
-        figure.suptitle(f"Faults injected into {report['config']}: {trials}, seed {report['seed']}", fontsize=11)
+        figure.suptitle(
+            f"Faults injected into {report['config']}: {trials}, seed {report['seed']}", fontsize=11
+        )
 
 
 def _places(figure: Figure) -> Iterator[SubplotSpec]:
     """Yield the places of the three drawings: one on the left, two on the right."""
-    # Fixed: the numbers next to the left one and the names of kinds need their room whatever is drawn.
+    # Fixed: the numbers next to the left one and the names of kinds need their room whatever is
+    # drawn.
     grid = figure.add_gridspec(
-        2, 2, width_ratios=(1.15, 1.0), left=0.11, right=0.98, top=0.91, bottom=0.08, wspace=0.52, hspace=0.28
+        2,
+        2,
+        width_ratios=(1.15, 1.0),
+        left=0.11,
+        right=0.98,
+        top=0.91,
+        bottom=0.08,
+        wspace=0.52,
+        hspace=0.28,
     )
     yield from (grid[:, 0], grid[0, 1], grid[1, 1])
 
 
 def _delays(axes: Axes, report: Report) -> None:
-    """Draw each fault's time to detection as a part of its own bound; note median and longest in cycles."""
+    """Draw each fault's time to detection as a part of its own bound; note median and longest in
+    cycles."""
     kinds = list(report["by_kind"])[::-1]
     for row, kind in enumerate(kinds):
         found = [f for f in report["faults"] if f["kind"] == kind and f["seen"] == "detected"]
         parts = [part for fault in found if (part := _part(fault)) is not None]
         _row(axes, row, [part for part in parts if part <= WIDEST])
         late = [part for part in parts if part > WIDEST]
-        axes.scatter([WIDEST] * len(late), [row] * len(late), marker=">", s=40, color=BOUND, clip_on=False)
+        axes.scatter(
+            [WIDEST] * len(late), [row] * len(late), marker=">", s=40, color=BOUND, clip_on=False
+        )
         if parts:
             axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
         place = (1.02, row)
@@ -71,7 +86,9 @@ def _delays(axes: Axes, report: Report) -> None:
 
 
 def _row(axes: Axes, row: int, values: list[float]) -> None:
-    axes.scatter(values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False)
+    axes.scatter(
+        values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False
+    )
 
 
 def _name_rows(axes: Axes, names: list[str]) -> None:
@@ -80,7 +97,8 @@ def _name_rows(axes: Axes, names: list[str]) -> None:
 
 
 def _part(fault: Report) -> float | None:
-    """Return a fault's delay as a part of its bound; a bound of the same cycle is met exactly or not at all."""
+    """Return a fault's delay as a part of its bound; a bound of the same cycle is met exactly or
+    not at all."""
     if fault["bound"] == 0 and fault["bound_ms"] is None:
         return 0.0 if fault["delay"] == 0 else 2 * WIDEST
     return part_of_bound(fault["delay"], fault["bound"], fault["delay_ms"], fault["bound_ms"])
@@ -98,7 +116,9 @@ def _sizes(axes: Axes, report: Report) -> None:
         delays = [point["delay_ms"] for point in seen]
         longest = max([longest, *delays])
         (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
-        axes.plot(unseen, [1.0] * len(unseen), "x", color=line.get_color(), transform=edge, clip_on=False)
+        axes.plot(
+            unseen, [1.0] * len(unseen), "x", color=line.get_color(), transform=edge, clip_on=False
+        )
         axes.axvline(found["judged_from"], color=line.get_color(), linewidth=0.9, linestyle=":")
     if report["sizes"]:
         axes.set_xscale("log")
@@ -115,9 +135,16 @@ def _sizes(axes: Axes, report: Report) -> None:
 
 def _recoveries(axes: Axes, report: Report) -> None:
     """Draw the time from each strike until every reaction was undone."""
-    times = {kind: [f for f in report["faults"] if f["kind"] == kind] for kind in reversed(report["by_kind"])}
+    times = {
+        kind: [f for f in report["faults"] if f["kind"] == kind]
+        for kind in reversed(report["by_kind"])
+    }
     seconds = {
-        kind: [fault["recovery"] * report["clock_ms"] * 1e-3 for fault in faults if fault["recovery"] is not None]
+        kind: [
+            fault["recovery"] * report["clock_ms"] * 1e-3
+            for fault in faults
+            if fault["recovery"] is not None
+        ]
         for kind, faults in times.items()
     }
     rows = {kind: found for kind, found in seconds.items() if found}

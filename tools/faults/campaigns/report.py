@@ -1,4 +1,5 @@
-"""The report of a campaign: one document, campaign.json, and campaign.md for people, made from it."""
+"""The report of a campaign: one document, campaign.json, and campaign.md for people, made from
+it."""
 
 from __future__ import annotations
 
@@ -19,21 +20,41 @@ Report = dict[str, Any]
 SHOWN = 30
 """Shortfalls that the text shows; campaign.json has them all."""
 KINDS_HEAD = [
-    *("kind", "injected", "detected", "in bound", "recovered", "at least", "ticks median", "max", "bound, ticks"),
+    *(
+        "kind",
+        "injected",
+        "detected",
+        "in bound",
+        "recovered",
+        "at least",
+        "ticks median",
+        "max",
+        "bound, ticks",
+    ),
     *("ms median", "max", "recovery median, ms", "max", "reactions"),
 ]
 
-ENDS = {"tasks_done": "task done", "safely_stopped": "safely stopped", "not_armed": "not armed", "neither": "neither"}
+ENDS = {
+    "tasks_done": "task done",
+    "safely_stopped": "safely stopped",
+    "not_armed": "not armed",
+    "neither": "neither",
+}
 
 
 def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
-    """Return all results of a campaign as plain data; `shortfalls` is empty when nothing falls short."""
+    """Return all results of a campaign as plain data; `shortfalls` is empty when nothing falls
+    short."""
     order = campaign.order
     clock_ns = campaign.layout.clock_ns
     run = results.nominal
     kinds = by_kind(results.faults, clock_ns)
     for kind, figures in kinds.items():
-        with_it = [one for one in results.trials if any(f.kind == kind and f.struck >= 0 for f in one.faults)]
+        with_it = [
+            one
+            for one in results.trials
+            if any(f.kind == kind and f.struck >= 0 for f in one.faults)
+        ]
         figures["trials"] = len(with_it)
         figures["tasks_done"] = sum(one.ended == "task done" for one in with_it)
     summary = _figures(results, 1e9 / clock_ns)
@@ -46,7 +67,11 @@ def document(campaign: Campaign, results: Results, wall_s: float) -> Report:
         "wall_s": round(wall_s, 1),
         "machine": _machine(results),
         "clock_ms": clock_ns * 1e-6,
-        "nominal": {"ticks": run.ticks, "seconds": round(run.ticks * clock_ns * 1e-9, 3), "digest": run.digest},
+        "nominal": {
+            "ticks": run.ticks,
+            "seconds": round(run.ticks * clock_ns * 1e-9, 3),
+            "digest": run.digest,
+        },
         "summary": summary,
         "by_kind": kinds,
         "sizes": _curves(results, clock_ns),
@@ -89,15 +114,25 @@ def _figures(results: Results, second: float) -> Report:
 def _shortfalls(results: Results) -> list[str]:
     """Return the reasons why the campaign fails, a line each."""
     names = [
-        (run, f"trial {run.plan.number}" if run.plan.number else f"{run.plan.purpose} run") for run in results.runs
+        (run, f"trial {run.plan.number}" if run.plan.number else f"{run.plan.purpose} run")
+        for run in results.runs
     ]
-    return [*(f"{name}: {line}" for run, name in names for line in run.shortfalls), *results.lacking]
+    return [
+        *(f"{name}: {line}" for run, name in names for line in run.shortfalls),
+        *results.lacking,
+    ]
 
 
 def _curves(results: Results, clock_ns: int) -> Report:
     swept = [fault for run in results.sizes for fault in run.faults] + results.faults
-    curves = {kind: curve(swept, kind.name, clock_ns) for kind in KINDS if kind.visible_from is not None}
-    return {kind.name: {"judged_from": kind.visible_from, "curve": points} for kind, points in curves.items() if points}
+    curves = {
+        kind: curve(swept, kind.name, clock_ns) for kind in KINDS if kind.visible_from is not None
+    }
+    return {
+        kind.name: {"judged_from": kind.visible_from, "curve": points}
+        for kind, points in curves.items()
+        if points
+    }
 
 
 def _trial(run: TrialResult) -> Report:
@@ -134,7 +169,8 @@ def _lines(report: Report) -> Iterator[str]:
     yield f"# Campaign on {report['config']}, seed {report['seed']}: {verdict}"
     yield ""
     yield (
-        f"{summary['trials']} trials, {' and '.join(dict.fromkeys(report['modes']))}, in {report['wall_s']:.0f} s on "
+        f"{summary['trials']} trials, {' and '.join(dict.fromkeys(report['modes']))}, in"
+        f" {report['wall_s']:.0f} s on "
         f"{report['machine']['cores']} cores, Linux {report['machine']['kernel']}."
         f"{' Interrupted: results until then.' if report['interrupted'] else ''}"
     )
@@ -143,21 +179,38 @@ def _lines(report: Report) -> Iterator[str]:
     yield from markdown_table(["", ""], [[name, str(value)] for name, value in _summary(summary)])
     if report["by_kind"]:
         yield from ("", "## Faults by kind", "")
-        yield from markdown_table(KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()])
+        yield from markdown_table(
+            KINDS_HEAD, [_kind_row(kind, figures) for kind, figures in report["by_kind"].items()]
+        )
         yield ""
-        yield "At least: the smallest lower bound of Wilson's 95 % interval of detected, in bound and recovered."
+        yield (
+            "At least: the smallest lower bound of Wilson's 95 % interval of detected, in bound and"
+            " recovered."
+        )
     yield from _faultless(report["faultless"])
     yield from _sizes(report["sizes"])
     if shortfalls := report["shortfalls"]:
-        yield from ("", f"## Shortfalls: {len(shortfalls)}", "", *(f"- {line}" for line in shortfalls[:SHOWN]))
+        yield from (
+            "",
+            f"## Shortfalls: {len(shortfalls)}",
+            "",
+            *(f"- {line}" for line in shortfalls[:SHOWN]),
+        )
 
 
 def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
-    yield "injected", f"{summary['injected']}; {summary['not_struck']} more did not strike and were drawn again"
+    yield (
+        "injected",
+        f"{summary['injected']}; {summary['not_struck']} more did not strike and were drawn again",
+    )
     yield "detected", summary["detected"]
     yield "within the bound", summary["within_bound"]
     yield "reacted to", summary["reacted_to"]
-    latched = f", of which {summary['latched']} ended the task, as permitted" if summary["latched"] else ""
+    latched = (
+        f", of which {summary['latched']} ended the task, as permitted"
+        if summary["latched"]
+        else ""
+    )
     yield "recovered from", f"{summary['recovered']}{latched}"
     ends = [f"{summary[key]} {name}" for key, name in ENDS.items() if summary[key]]
     yield "trials ended", ", ".join(ends) or "none"
@@ -165,24 +218,42 @@ def _summary(summary: Report) -> Iterator[tuple[str, Any]]:
     yield "touches", summary["touches"]
     yield "left behind", f"{summary['left_behind']} (processes, segments)"
     hours = f"{summary['simulated_s'] / 3600.0:.2f} simulated hours"
-    yield "false detections", f"{summary['unexplained']} in {hours}: {_rate(summary['unexplained_per_hour'])}"
+    yield (
+        "false detections",
+        f"{summary['unexplained']} in {hours}: {_rate(summary['unexplained_per_hour'])}",
+    )
     if summary["faultless_s"]:
         trips = f"{summary['false_trips']} in {summary['faultless_s']:g} s"
-        yield "of these without faults, in real time", f"{trips}: {_rate(summary['false_trips_per_hour'])}"
+        yield (
+            "of these without faults, in real time",
+            f"{trips}: {_rate(summary['false_trips_per_hour'])}",
+        )
     yield "unexplained misses in real time", summary["stray_misses"]
 
 
 def _rate(found: Report | None) -> str:
-    return "-" if found is None else f"{found['an_hour']:.3g} an hour, below {found['below']:.3g} with 95 % confidence"
+    return (
+        "-"
+        if found is None
+        else f"{found['an_hour']:.3g} an hour, below {found['below']:.3g} with 95 % confidence"
+    )
 
 
 def _kind_row(kind: str, figures: Report) -> list[str]:
     bound = figures["bound_ticks"]
-    spans = "-" if bound is None else "-".join(dict.fromkeys(str(bound[key]) for key in ("least", "most")))
+    spans = (
+        "-"
+        if bound is None
+        else "-".join(dict.fromkeys(str(bound[key]) for key in ("least", "most")))
+    )
     return [
         kind,
         *(str(figures[key]) for key in ("injected", "detected", "within_bound", "recovered")),
-        "-" if None in (shares := list(figures["wilson"].values())) else f"{min(low for low, _ in shares):.1%}",
+        (
+            "-"
+            if None in (shares := list(figures["wilson"].values()))
+            else f"{min(low for low, _ in shares):.1%}"
+        ),
         *_median_max(figures["ticks"]),
         spans,
         *_median_max(figures["ms"]),
@@ -205,7 +276,8 @@ def _faultless(parts: list[Report]) -> Iterator[str]:
             f"{part['seconds']:.0f}",
             str(part["trips"]),
             _rate(part["trips_per_hour"]),
-            ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in part["misses"].items()) or "none",
+            ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in part["misses"].items())
+            or "none",
         ]
         for part in parts
     ]
@@ -218,6 +290,12 @@ def _sizes(sizes: Report) -> Iterator[str]:
         unit = size.unit if size is not None else ""
         yield from ("", f"## {kind}: size against delay", "")
         yield from (f"Must be found from {found['judged_from']:g} {unit}.", "")
-        points = [(f"{point['size']:.4g}", point["joint"] or "all", point["delay_ms"]) for point in found["curve"]]
-        rows = [[size, joint, "-" if after_ms is None else f"{after_ms:g}"] for size, joint, after_ms in points]
+        points = [
+            (f"{point['size']:.4g}", point["joint"] or "all", point["delay_ms"])
+            for point in found["curve"]
+        ]
+        rows = [
+            [size, joint, "-" if after_ms is None else f"{after_ms:g}"]
+            for size, joint, after_ms in points
+        ]
         yield from markdown_table([f"size, {unit}", "joint", "found after, ms"], rows)

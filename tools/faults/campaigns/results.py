@@ -1,4 +1,5 @@
-"""The results of a campaign: trials with their verdicts, each kept in a file, and faultless time."""
+"""The results of a campaign: trials with their verdicts, each kept in a file, and faultless
+time."""
 
 from __future__ import annotations
 
@@ -66,9 +67,16 @@ class Judged:
     def shortfalls(self) -> list[str]:
         """The shortfalls of the trial, a line each; empty for a good one."""
         trial = self.trial
-        lines = [line for fault in self.verdict.faults if fault.is_judged for line in _shortfalls(fault)]
-        lines += [f"{e.board}: {e.text}: no fault explains it (tick {e.tick})" for e in self.verdict.unexplained]
-        lines += [f"limits violated at {trial.arm.violations} substeps"] if trial.arm.violations else []
+        lines = [
+            line for fault in self.verdict.faults if fault.is_judged for line in _shortfalls(fault)
+        ]
+        lines += [
+            f"{e.board}: {e.text}: no fault explains it (tick {e.tick})"
+            for e in self.verdict.unexplained
+        ]
+        lines += (
+            [f"limits violated at {trial.arm.violations} substeps"] if trial.arm.violations else []
+        )
         lines += [f"left behind: {thing}" for thing in trial.left]
         if self.ended == "neither":
             lines.append(f"the task is neither done nor safely stopped: {self._why_neither()}")
@@ -78,9 +86,12 @@ class Judged:
 
     @property
     def _had_to_end(self) -> bool:
-        """Whether a fault had to end the task: it is latched, or reactions have taken the task's time."""
+        """Whether a fault had to end the task: it is latched, or reactions have taken the task's
+        time."""
         faults = self.verdict.faults
-        return any(f.is_latched for f in faults) or (self.trial.is_late and any(f.reactions for f in faults))
+        return any(f.is_latched for f in faults) or (
+            self.trial.is_late and any(f.reactions for f in faults)
+        )
 
     def _why_neither(self) -> str:
         trial = self.trial
@@ -127,7 +138,8 @@ class Judged:
 class TrialResult:
     """The part of a trial that is kept, for the report of its campaign.
 
-    `misses`: their number by code; `stray_misses`: those that no fault explains. `unexplained`: false detections.
+    `misses`: their number by code; `stray_misses`: those that no fault explains. `unexplained`:
+    false detections.
     """
 
     plan: Plan
@@ -167,7 +179,8 @@ def kept(path: Path) -> TrialResult | None:
 
 @dataclass(frozen=True)
 class Faultless:
-    """Runs without faults in real time, `seconds` of simulated time, under `load`: a command, or "" for alone."""
+    """Runs without faults in real time, `seconds` of simulated time, under `load`: a command, or ""
+    for alone."""
 
     load: str
     seconds: float
@@ -247,7 +260,9 @@ def _at_start(kind: str, board: str, trial: Trial) -> Judgement:
 
 
 def _shortfalls(fault: Judgement) -> Iterator[str]:
-    strike = f"{fault.kind} of {fault.mailbox or fault.board}{' ' + fault.joint if fault.joint else ''}"
+    strike = (
+        f"{fault.kind} of {fault.mailbox or fault.board}{' ' + fault.joint if fault.joint else ''}"
+    )
     strike += f", struck at tick {fault.struck}"
     if fault.seen == "missed":
         yield f"{strike}: not detected"
@@ -258,5 +273,10 @@ def _shortfalls(fault: Judgement) -> Iterator[str]:
         yield f"{strike}: {fault.found_as} by {fault.found_by} after {after}"
     yield from (f"{strike}: no {code.replace('_', ' ')} follows" for code in fault.lacking)
     if not fault.is_recovered:
-        undone = f"undone after {fault.recovery} ticks" if fault.recovery is not None else "never undone"
-        yield f"{strike}: {', '.join(fault.reactions) or 'loss of messages'} {undone}; bound {fault.recovery_bound}"
+        undone = (
+            f"undone after {fault.recovery} ticks" if fault.recovery is not None else "never undone"
+        )
+        yield (
+            f"{strike}: {', '.join(fault.reactions) or 'loss of messages'} {undone}; bound"
+            f" {fault.recovery_bound}"
+        )

@@ -25,7 +25,8 @@ from rack.tools.faults.ending import ArmEnd, Killed, Strike, arm_of, is_late, le
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
-"""A run with faults is stopped after this multiple of a faultless run's length, and this simulated time more."""
+"""A run with faults is stopped after this multiple of a faultless run's length, and this simulated
+time more."""
 NOMINAL_S = 1800.0
 """Simulated time of a run whose length is unknown."""
 STILL_S = 120.0
@@ -43,7 +44,8 @@ RETRY_S = 0.02
 
 
 class Killer:
-    """Kills boards of one rack by SIGKILL, at their instants, without the fault table. `done` are the kills so far."""
+    """Kills boards of one rack by SIGKILL, at their instants, without the fault table. `done` are
+    the kills so far."""
 
     def __init__(self, segment: Segment, kills: Sequence[Kill]) -> None:
         self._segment = segment
@@ -63,7 +65,11 @@ class Killer:
 
     def advance(self) -> None:
         """Kill the board whose instant has come; one that is not running, as soon as it is."""
-        if not self._waiting or self._words[System.TICK] < self._waiting[0].tick or time.monotonic() < self._retry_at:
+        if (
+            not self._waiting
+            or self._words[System.TICK] < self._waiting[0].tick
+            or time.monotonic() < self._retry_at
+        ):
             return
         self._await_phase()
         kill = self._waiting[0]
@@ -116,9 +122,10 @@ class Killer:
 class Trial:
     """A trial that was made. `refused` is the reason why the rack did not launch, else empty.
 
-    `again`: how a run without its faults ended, right after it was refused. `left` is everything that it left behind.
-    `levels` holds the last state of each level; `is_late`: one gave up because it could not meet a time. `moving` are
-    obstacles that move. `offset_ns` turns CLOCK_MONOTONIC into the events' CLOCK_REALTIME.
+    `again`: how a run without its faults ended, right after it was refused. `left` is everything
+    that it left behind. `levels` holds the last state of each level; `is_late`: one gave up because
+    it could not meet a time. `moving` are obstacles that move. `offset_ns` turns CLOCK_MONOTONIC
+    into the events' CLOCK_REALTIME.
     """
 
     plan: Plan
@@ -138,11 +145,13 @@ class Trial:
     again: Outcome | None = None
 
 
-def run_trial(config: RackConfig, plan: Plan, rack_name: str, ticks: int, seconds: float | None) -> Trial:
+def run_trial(
+    config: RackConfig, plan: Plan, rack_name: str, ticks: int, seconds: float | None
+) -> Trial:
     """Run a plan, and return its outcome, events and strikes.
 
-    `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task ends. Raises
-    `ConfigError` for a plan that does not fit the config.
+    `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task
+    ends. Raises `ConfigError` for a plan that does not fit the config.
     """
     before = children()
     started = time.monotonic()

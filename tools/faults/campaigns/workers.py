@@ -1,6 +1,8 @@
-"""Worker processes make the trials, as many at once as there are cores; each trial has its own rack and leaves a file.
+"""Worker processes make the trials, as many at once as there are cores; each trial has its own rack
+and leaves a file.
 
-As a program, `python -m rack.tools.faults.campaigns.workers FD PARENT`: one such process; it ends with its parent.
+As a program, `python -m rack.tools.faults.campaigns.workers FD PARENT`: one such process; it ends
+with its parent.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ LOOK_S = 0.2
 
 @dataclass(frozen=True)
 class TrialJob:
-    """A trial to be made: `ticks` of a faultless run, `seconds` of simulated time where no task ends the run."""
+    """A trial to be made: `ticks` of a faultless run, `seconds` of simulated time where no task
+    ends the run."""
 
     plan: Plan
     path: Path
@@ -38,7 +41,8 @@ class TrialJob:
 
 
 class Workers:
-    """Processes that make trials. Use it as a context; they end with it, and with the process that made it."""
+    """Processes that make trials. Use it as a context; they end with it, and with the process that
+    made it."""
 
     def __init__(self, config: RackConfig) -> None:
         self._config = config
@@ -57,10 +61,11 @@ class Workers:
             process.wait()
 
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
-        """Make trials and yield each that is done and has its file; a signal ends those in progress, which leave none.
+        """Make trials and yield each that is done and has its file; a signal ends those in
+        progress, which leave none.
 
-        Trials that are `alone` have the machine for themselves. Others get one core each: boards that share a core hand
-        messages to each other sooner.
+        Trials that are `alone` have the machine for themselves. Others get one core each: boards
+        that share a core hand messages to each other sooner.
         """
         waiting = list(jobs)
         busy = dict[Any, TrialJob]()
@@ -86,7 +91,8 @@ class Workers:
         return job
 
     def _stop(self) -> None:
-        """End the workers. What is left of a trial in progress is of no use: its rack is removed, not stopped."""
+        """End the workers. What is left of a trial in progress is of no use: its rack is removed,
+        not stopped."""
         for process in self._processes:
             process.terminate()
 
@@ -101,9 +107,12 @@ class Workers:
                 str(there.fileno()),
                 str(os.getpid()),
             ]
-            # In a process group of its own: Ctrl-C on the terminal reaches only the campaign, which stops its workers.
+            # In a process group of its own: Ctrl-C on the terminal reaches only the campaign, which
+            # stops its workers.
             self._processes.append(
-                subprocess.Popen(command, env=environment, pass_fds=[there.fileno()], process_group=0)
+                subprocess.Popen(
+                    command, env=environment, pass_fds=[there.fileno()], process_group=0
+                )
             )
             there.close()
             here.send(self._config)

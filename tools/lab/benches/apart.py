@@ -1,7 +1,7 @@
 """Work in a process of its own, in the environment of boards.
 
-That environment makes results equal on every processor. It takes effect only when a process starts, so the same
-computation done in the process of a command may differ from a board's in the last bit.
+That environment makes results equal on every processor. It takes effect only when a process starts,
+so the same computation done in the process of a command may differ from a board's in the last bit.
 """
 
 from __future__ import annotations
@@ -23,15 +23,24 @@ _R = TypeVar("_R")
 
 
 def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
-    """Return what `work` returns, called in such a process; it must be a function of a module, its values plain data.
+    """Return what `work` returns, called in such a process; it must be a function of a module, its
+    values plain data.
 
     Raises what it raises. Raises `Failure` if the process ends without an answer.
     """
     ours, theirs = Pipe()
-    command = [sys.executable, "-m", "rack.tools.lab.benches.apart", str(theirs.fileno()), str(os.getpid())]
+    command = [
+        sys.executable,
+        "-m",
+        "rack.tools.lab.benches.apart",
+        str(theirs.fileno()),
+        str(os.getpid()),
+    ]
     with (
         ours,
-        subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment(), stdin=subprocess.DEVNULL) as process,
+        subprocess.Popen(
+            command, pass_fds=[theirs.fileno()], env=environment(), stdin=subprocess.DEVNULL
+        ) as process,
     ):
         theirs.close()
         try:

@@ -1,8 +1,10 @@
-"""A rack's work without the rack: the same `process` and `plan` calls in one process, one after another.
+"""A rack's work without the rack: the same `process` and `plan` calls in one process, one after
+another.
 
-Levels, ports and delays are those of the resolved config; a message becomes visible by ticks alone, as under protocol
-time-slice, so every level reads what it reads in a rack in lockstep, and does the same. No clock, no shared memory, no
-checks and no trace: this is the limit that a rack can approach, but not pass on one processor.
+Levels, ports and delays are those of the resolved config; a message becomes visible by ticks alone,
+as under protocol time-slice, so every level reads what it reads in a rack in lockstep, and does the
+same. No clock, no shared memory, no checks and no trace: this is the limit that a rack can
+approach, but not pass on one processor.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ from rack.tools.console.answer import Failure
 class BareRun:
     """A finished run. `processor_s` is the time of its ticks.
 
-    `last` is the newest message of each mailbox that was visible before the end, `serials` its number; without one, a
-    mailbox is left out.
+    `last` is the newest message of each mailbox that was visible before the end, `serials` its
+    number; without one, a mailbox is left out.
     """
 
     ticks: int
@@ -40,7 +42,8 @@ class BareRun:
 
 
 class Post:
-    """One mailbox: `message` to fill, and the messages written so far that a reader may still need."""
+    """One mailbox: `message` to fill, and the messages written so far that a reader may still
+    need."""
 
     def __init__(self, spec: MailboxSpec) -> None:
         self.spec = spec
@@ -51,7 +54,8 @@ class Post:
         self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
 
     def write(self, tick: int, cycle: int) -> None:
-        """Write the message in the cycle of `cycle` ticks released at `tick`, if this is one that writes it."""
+        """Write the message in the cycle of `cycle` ticks released at `tick`, if this is one that
+        writes it."""
         if not (tick + cycle - self.spec.phase) % self.spec.every:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
@@ -89,11 +93,14 @@ class PostReader:
 class BareTask:
     """An executor or a planner with its ports."""
 
-    def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post], ticks: int) -> None:
+    def __init__(
+        self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post], ticks: int
+    ) -> None:
         self.spec = layout.task(wiring.task)
         self._ticks = ticks
         self._values = Ports()
-        # Where each reading goes: the ports themselves, or the dict of a port that reads many mailboxes.
+        # Where each reading goes: the ports themselves, or the dict of a port that reads many
+        # mailboxes.
         self._readers: list[tuple[dict[str, Reading], str, Callable[[int], Reading]]] = []
         for port, source in wiring.inputs.items():
             if isinstance(source, str):
@@ -104,7 +111,9 @@ class BareTask:
                 for board, mailbox in source.items():
                     self._add(by_board, board, posts[mailbox])
         self._posts = [posts[name] for name in wiring.outputs.values()]
-        self._messages = Ports(**{port: posts[name].message for port, name in wiring.outputs.items()})
+        self._messages = Ports(
+            **{port: posts[name].message for port, name in wiring.outputs.items()}
+        )
         self._busy_until = 0
         kind: type[Executor] | type[Planner] = find_class(
             wiring.target,
@@ -150,15 +159,21 @@ class BareTask:
 def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
     """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it.
 
-    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes there is none; and
-    for one with an exchange or with interrupts, which belong to the board.
+    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes
+    there is none; and for one with an exchange or with interrupts, which belong to the board.
     """
     if exchanged := [spec.name for spec in layout.mailboxes if spec.exchanges]:
-        raise Failure(f"{', '.join(exchanged)}: read at a rate of its own; only racks without any run without boards")
+        raise Failure(
+            f"{', '.join(exchanged)}: read at a rate of its own; only racks without any run without"
+            " boards"
+        )
     if queues := [spec.name for spec in layout.mailboxes if spec.capacity]:
         raise Failure(f"{', '.join(queues)}: a queue; only racks without any run without mailboxes")
     if served := [spec.name for spec in layout.mailboxes if spec.interrupt is not None]:
-        raise Failure(f"{', '.join(served)}: interrupts its readers; only racks without any run without boards")
+        raise Failure(
+            f"{', '.join(served)}: interrupts its readers; only racks without any run without"
+            " boards"
+        )
     posts = {spec.name: Post(spec) for spec in layout.mailboxes}
     tasks = [BareTask(layout, wiring, posts, ticks) for wiring in wirings]
     try:
@@ -172,7 +187,11 @@ def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareR
     finally:
         for task in tasks:
             task.level.close()
-    found = {name: newest for name, post in posts.items() if (newest := post.newest(ticks - 1)) is not None}
+    found = {
+        name: newest
+        for name, post in posts.items()
+        if (newest := post.newest(ticks - 1)) is not None
+    }
     return BareRun(
         ticks=ticks,
         processor_s=processor_s,

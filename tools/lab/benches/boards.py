@@ -1,8 +1,8 @@
 """What boards cost by their number: empty ones that pass a message down a chain.
 
-A message that is sent in one cycle is visible to the next board one cycle later, so n boards take exactly n cycles,
-however fast or slow they are. Cost is processor time, from the trace, in real time; in lockstep, where a tick takes as
-long as its boards do, it is the time of the run.
+A message that is sent in one cycle is visible to the next board one cycle later, so n boards take
+exactly n cycles, however fast or slow they are. Cost is processor time, from the trace, in real
+time; in lockstep, where a tick takes as long as its boards do, it is the time of the run.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ LAUNCH_S = 1.5
 BOUND_S = 120.0
 """Longest time that one run in lockstep may take."""
 STRETCH = 10
-"""A short chain runs longer in lockstep, at most so many times: else its start would be a part of its cost."""
+"""A short chain runs longer in lockstep, at most so many times: else its start would be a part of
+its cost."""
 LEVELS = "relay_levels"
 """Module of the levels in another checkout."""
 
@@ -50,7 +51,8 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-bench-")))
         racks = stack.enter_context(both_racks(against))
         chains = [
-            _ChainRuns(Chain(count, RATE_HZ), runs, peers, list(_configs(count, racks, folder))) for count in counts
+            _ChainRuns(Chain(count, RATE_HZ), runs, peers, list(_configs(count, racks, folder)))
+            for count in counts
         ]
         progress.total(sum(chain.lasts_s for chain in chains))
         for chain in chains:
@@ -58,12 +60,18 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
             chain.measure()
             progress.end(chain.lasts_s)
         return Boards(
-            tuple(chain.figures() for chain in chains), tuple(rack.name for rack in racks), len(cores), absent
+            tuple(chain.figures() for chain in chains),
+            tuple(rack.name for rack in racks),
+            len(cores),
+            absent,
         )
 
 
-def _configs(boards: int, racks: Sequence[RackCommand], folder: Path) -> Iterator[tuple[RackCommand, Path]]:
-    """Write the config of a chain in lockstep for every tree, with levels that import that tree's packages."""
+def _configs(
+    boards: int, racks: Sequence[RackCommand], folder: Path
+) -> Iterator[tuple[RackCommand, Path]]:
+    """Write the config of a chain in lockstep for every tree, with levels that import that tree's
+    packages."""
     source = Path(relay.__file__).read_text()
     for number, rack in enumerate(racks):
         own = folder / str(number)
@@ -75,14 +83,21 @@ def _configs(boards: int, racks: Sequence[RackCommand], folder: Path) -> Iterato
 
 
 class _ChainRuns:
-    """All runs of one chain; `peers` are the cores of `cyclictest`, `configs` those for lockstep, by tree."""
+    """All runs of one chain; `peers` are the cores of `cyclictest`, `configs` those for lockstep,
+    by tree."""
 
     def __init__(
-        self, chain: Chain, runs: Runs, peers: tuple[int, ...], configs: list[tuple[RackCommand, Path]]
+        self,
+        chain: Chain,
+        runs: Runs,
+        peers: tuple[int, ...],
+        configs: list[tuple[RackCommand, Path]],
     ) -> None:
         self.chain = chain
         self._settings = runs
-        self._grid = WakeGrid(peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY)
+        self._grid = WakeGrid(
+            peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY
+        )
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []
         self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack, _ in configs}
@@ -103,7 +118,9 @@ class _ChainRuns:
         self._runs.append(self._observe(self.chain))
 
     def _observe(self, chain: Chain) -> Observed:
-        return observe(loads(chain.text()), self._settings.seconds, self._settings.share, [self._last])
+        return observe(
+            loads(chain.text()), self._settings.seconds, self._settings.share, [self._last]
+        )
 
     def _peer(self) -> None:
         self._late.append(cyclictest(self._grid))
@@ -130,17 +147,23 @@ class _ChainRuns:
         return ChainFigures(
             boards=self.chain.boards,
             cycles=sum(count.due for count in counts),
-            processor_us=sum(float(np.median(trace["processor_ns"])) for trace in rows if len(trace)) * 1e-3,
+            processor_us=sum(
+                float(np.median(trace["processor_ns"])) for trace in rows if len(trace)
+            )
+            * 1e-3,
             missed=missed_share(counts),
             late=None if late is None else overdue(late, self._grid.period_ns),
             responses=responses_of([run.messages[self._last] for run in self._runs]),
             lockstep_responses=responses_of([lockstep.messages[self._last]]),
-            lockstep_us={name: float(np.median(costs)) for name, costs in self._lockstep_us.items()},
+            lockstep_us={
+                name: float(np.median(costs)) for name, costs in self._lockstep_us.items()
+            },
         )
 
 
 def responses_of(runs: Sequence[np.ndarray]) -> dict[int, int]:
-    """Return how many messages took how many cycles to the end of the chain; one that a miss repeats counts once."""
+    """Return how many messages took how many cycles to the end of the chain; one that a miss
+    repeats counts once."""
     counts: Counter[int] = Counter()
     for rows in runs:
         sent, first = np.unique(rows["message"]["sent"], return_index=True)

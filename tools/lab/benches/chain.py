@@ -1,4 +1,5 @@
-"""A rack of empty boards, on all cores in turn: the first sends a message in every cycle, each other passes it on."""
+"""A rack of empty boards, on all cores in turn: the first sends a message in every cycle, each
+other passes it on."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ MODULE = "rack.tools.lab.benches.relay"
 
 
 class Chain(NamedTuple):
-    """`boards` boards at the clock's `rate_hz`; the first is on the last core, the clock on the first."""
+    """`boards` boards at the clock's `rate_hz`; the first is on the last core, the clock on the
+    first."""
 
     boards: int
     rate_hz: int
@@ -54,5 +56,9 @@ class Chain(NamedTuple):
             if before is None:
                 yield name, board | {"executor": f"{module}:Sender"}
             else:
-                yield name, board | {"executor": f"{module}:Relay", "reads": {"message": f"{before}.status"}}
+                yield (
+                    name,
+                    board
+                    | {"executor": f"{module}:Relay", "reads": {"message": f"{before}.status"}},
+                )
             before = name

@@ -1,4 +1,5 @@
-"""The figures of chains of boards: what each costs, whether it holds, and the straight line through their costs."""
+"""The figures of chains of boards: what each costs, whether it holds, and the straight line through
+their costs."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ SPREAD = "#bbccdd"
 
 @dataclass(frozen=True)
 class Fit:
-    """A straight line through costs by number of boards: us a tick; `r2` is 1 where it explains all of them."""
+    """A straight line through costs by number of boards: us a tick; `r2` is 1 where it explains all
+    of them."""
 
     base_us: float
     board_us: float
@@ -47,7 +49,8 @@ class Fit:
 
 @dataclass(frozen=True)
 class ChainFigures(MissesBeyond):
-    """All runs of one chain. Costs are us a tick, of all boards; responses are counts of messages by cycles."""
+    """All runs of one chain. Costs are us a tick, of all boards; responses are counts of messages
+    by cycles."""
 
     boards: int
     cycles: int
@@ -60,15 +63,19 @@ class ChainFigures(MissesBeyond):
 
     @property
     def exact(self) -> bool:
-        """Whether every message took one cycle a board: in lockstep always, in real time if no cycle was missed."""
+        """Whether every message took one cycle a board: in lockstep always, in real time if no
+        cycle was missed."""
         took = {*self.responses}
         least = self.boards
-        return {*self.lockstep_responses} == {least} and (min(took) >= least if self.missed else took == {least})
+        return {*self.lockstep_responses} == {least} and (
+            min(took) >= least if self.missed else took == {least}
+        )
 
 
 @dataclass(frozen=True)
 class Boards:
-    """The figures of every chain, the shortest first; `trees` are those measured in lockstep, this one first."""
+    """The figures of every chain, the shortest first; `trees` are those measured in lockstep, this
+    one first."""
 
     figures: tuple[ChainFigures, ...]
     trees: tuple[str, ...]
@@ -106,7 +113,10 @@ class Boards:
         fits = {tree: self.lockstep_fit(tree) for tree in self.trees}
         return {
             **own,
-            "chains": [{**asdict(one), **{name: getattr(one, name) for name in extra}} for one in self.figures],
+            "chains": [
+                {**asdict(one), **{name: getattr(one, name) for name in extra}}
+                for one in self.figures
+            ],
             "fit": asdict(self.fit) if self.fit else None,
             "lockstep_fit": {tree: asdict(fit) if fit else None for tree, fit in fits.items()},
             "permitted_beyond": BEYOND,
@@ -116,10 +126,21 @@ class Boards:
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as a table for people, fitted to `width`, and the fits."""
         yield f"{self.title}; costs in us a tick, missed and late in %"
-        head = ["boards", "processor", "a board", "missed", "cyclictest late", "beyond", "", "response, cycles"]
+        head = [
+            "boards",
+            "processor",
+            "a board",
+            "missed",
+            "cyclictest late",
+            "beyond",
+            "",
+            "response, cycles",
+        ]
         head += [f"lockstep, {tree}" for tree in self.trees]
         head += ["ratio"] if len(self.trees) > 1 else []
-        yield from table(head, [self._row(one) for one in self.figures], width, ("a board", "beyond"))
+        yield from table(
+            head, [self._row(one) for one in self.figures], width, ("a board", "beyond")
+        )
         if self.absent is not None:
             yield f"{self.absent.line}; every miss counts against the rack"
         if fit := self.fit:
@@ -145,14 +166,27 @@ class Boards:
         ]
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write costs and misses by number of boards as PNG and SVG into `folder`; return their paths."""
+        """Write costs and misses by number of boards as PNG and SVG into `folder`; return their
+        paths."""
         paths = paths_of(folder / "boards")
         with picture(paths, 9.0, 4.0, layout="constrained") as drawn:
             costs, shares = drawn.subplots(1, 2)
-            series = {"real time: processor time": ([one.processor_us for one in self.figures], self.fit, RACK, "o")}
+            series = {
+                "real time: processor time": (
+                    [one.processor_us for one in self.figures],
+                    self.fit,
+                    RACK,
+                    "o",
+                )
+            }
             for tree, colour in zip(self.trees, (PEER, OTHER), strict=False):
                 found = [one.lockstep_us[tree] for one in self.figures]
-                series[f"lockstep: time of a tick, {tree}"] = (found, self.lockstep_fit(tree), colour, "s")
+                series[f"lockstep: time of a tick, {tree}"] = (
+                    found,
+                    self.lockstep_fit(tree),
+                    colour,
+                    "s",
+                )
             for label, (found, fit, colour, mark) in series.items():
                 label += f"\n{fit.board_us:.1f} us a board, R² {fit.r2:.4f}" if fit else ""
                 costs.plot(self.counts, found, mark, color=colour, label=label)
@@ -162,12 +196,20 @@ class Boards:
             costs.set_ylim(0, None)
             costs.set_ylabel("us a tick")
             shares.plot(
-                self.counts, [100 * one.missed for one in self.figures], "o-", color=RACK, label="boards: missed"
+                self.counts,
+                [100 * one.missed for one in self.figures],
+                "o-",
+                color=RACK,
+                label="boards: missed",
             )
             if self.absent is None:
                 late = [100 * (one.late or 0.0) for one in self.figures]
-                shares.plot(self.counts, late, "s-", color=PEER, label="cyclictest: late by a cycle")
-            shares.set_ylim(0, max(0.5, 130 * max(max(one.missed, one.late or 0.0) for one in self.figures)))
+                shares.plot(
+                    self.counts, late, "s-", color=PEER, label="cyclictest: late by a cycle"
+                )
+            shares.set_ylim(
+                0, max(0.5, 130 * max(max(one.missed, one.late or 0.0) for one in self.figures))
+            )
             shares.set_ylabel("% of the cycles")
             for axes in (costs, shares):
                 axes.set_xlim(0, self.counts[-1] + 1)

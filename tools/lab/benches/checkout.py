@@ -1,7 +1,9 @@
-"""The `rack` command line of this tree and of another checkout, so that a bench can run both by turns.
+"""The `rack` command line of this tree and of another checkout, so that a bench can run both by
+turns.
 
-A checkout runs in the environment of this process, whatever it was installed from: its own packages come first on the
-path of every process it starts. What it needs and this environment lacks, a user gives in PYTHONPATH.
+A checkout runs in the environment of this process, whatever it was installed from: its own packages
+come first on the path of every process it starts. What it needs and this environment lacks, a user
+gives in PYTHONPATH.
 """
 
 from __future__ import annotations
@@ -29,9 +31,11 @@ END_S = 1.2
 
 @dataclass(frozen=True)
 class RackCommand:
-    """A `rack` command line: `argv` goes before the arguments, `environment` is all of its environment.
+    """A `rack` command line: `argv` goes before the arguments, `environment` is all of its
+    environment.
 
-    `name` says which tree it is of; `package` is what its own imports begin with, "rack." or nothing.
+    `name` says which tree it is of; `package` is what its own imports begin with, "rack." or
+    nothing.
     """
 
     name: str
@@ -42,12 +46,14 @@ class RackCommand:
     def run(self, *arguments: object, bound_s: float) -> str:
         """Run a command to its end; return its stdout.
 
-        Raises `Failure` with the last line of its stderr if it fails, or if it takes longer than `bound_s`. Ends the
-        command, in order if it can, if this process is interrupted.
+        Raises `Failure` with the last line of its stderr if it fails, or if it takes longer than
+        `bound_s`. Ends the command, in order if it can, if this process is interrupted.
         """
         command = [*self.argv, *map(str, arguments)]
         pipe = subprocess.PIPE
-        process = subprocess.Popen(command, env=self.environment, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe)
+        process = subprocess.Popen(
+            command, env=self.environment, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe
+        )
         try:
             out, err = process.communicate(timeout=bound_s)
         except subprocess.TimeoutExpired:
@@ -56,7 +62,10 @@ class RackCommand:
             if process.poll() is None:
                 _end(process)
         if process.returncode:
-            raise Failure(f"{self._shown(arguments)}: {_reason(err.decode(errors='replace'), process.returncode)}")
+            raise Failure(
+                f"{self._shown(arguments)}:"
+                f" {_reason(err.decode(errors='replace'), process.returncode)}"
+            )
         return out.decode(errors="replace")
 
     def _shown(self, arguments: tuple[object, ...]) -> str:
@@ -88,7 +97,8 @@ def checkout(tree: Path) -> Iterator[RackCommand]:
 
 @contextmanager
 def both_racks(against: Path | None) -> Iterator[list[RackCommand]]:
-    """Give the command line of this tree, and after it that of the checkout `against`, if there is one."""
+    """Give the command line of this tree, and after it that of the checkout `against`, if there is
+    one."""
     with ExitStack() as stack:
         others = [] if against is None else [stack.enter_context(checkout(against))]
         yield [this_rack(), *others]
@@ -111,7 +121,8 @@ def _project(tree: Path) -> dict[str, Any]:
 
 
 def _sources(tree: Path, project: Mapping[str, Any], links: Path) -> Iterator[str]:
-    """Yield what must be on the path of modules: the tree, and links for packages whose folders have other names."""
+    """Yield what must be on the path of modules: the tree, and links for packages whose folders
+    have other names."""
     folders = project.get("tool", {}).get("setuptools", {}).get("package-dir", {})
     for package, folder in folders.items():
         if not (tree / folder).is_dir():
@@ -132,6 +143,13 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _reason(stderr: str, status: int) -> str:
-    """Return the last line of an error message; for a package that is lacking, also where to give it."""
-    last = next((line for line in reversed(stderr.splitlines()) if line.strip()), f"exit status {status}")
-    return f"{last}; give the folder that has it in PYTHONPATH" if last.startswith("ModuleNotFoundError") else last
+    """Return the last line of an error message; for a package that is lacking, also where to give
+    it."""
+    last = next(
+        (line for line in reversed(stderr.splitlines()) if line.strip()), f"exit status {status}"
+    )
+    return (
+        f"{last}; give the folder that has it in PYTHONPATH"
+        if last.startswith("ModuleNotFoundError")
+        else last
+    )

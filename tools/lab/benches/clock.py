@@ -1,7 +1,9 @@
-"""How late a board's cycle starts after its grid point, next to other programs that sleep to a grid on that core.
+"""How late a board's cycle starts after its grid point, next to other programs that sleep to a grid
+on that core.
 
-A board that sleeps and `cyclictest` are measured both ways: idle cores may sleep, and are held awake. The bench itself
-holds them awake, which is the same for both: the request is one to the system.
+A board that sleeps and `cyclictest` are measured both ways: idle cores may sleep, and are held
+awake. The bench itself holds them awake, which is the same for both: the request is one to the
+system.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.chain import PRIORITY, Chain
 from rack.tools.lab.benches.comparison import Absent, Comparison, Sample, interleaved, shown
-from rack.tools.lab.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictest, cyclictest, permits_fifo
+from rack.tools.lab.benches.cyclictest import (
+    CYCLICTEST,
+    WakeGrid,
+    absent_cyclictest,
+    cyclictest,
+    permits_fifo,
+)
 from rack.tools.lab.benches.linuxcnc import LINUXCNC, absent_linuxcnc, linuxcnc
 from rack.tools.lab.benches.observed import SETTLE_NS, Runs, observe
 from rack.tools.lab.benches.sleeper import sleep_loop
@@ -57,7 +65,12 @@ def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Compar
             if len(late_us):
                 samples.append(Sample(f"{rate_hz:g} Hz", who, tuple(late_us.tolist()), "us"))
             if reasons:
-                absent.append(Absent(f"{who} at {rate_hz:g} Hz, {len(reasons)} of {runs.rounds} rounds", reasons[0]))
+                absent.append(
+                    Absent(
+                        f"{who} at {rate_hz:g} Hz, {len(reasons)} of {runs.rounds} rounds",
+                        reasons[0],
+                    )
+                )
         progress.end(cost_s)
     refused = "" if is_fifo else "; SCHED_FIFO is refused, so all run under ordinary scheduling"
     own_grid = f"; {LINUXCNC}: after its earliest run" if LINUXCNC in contestants else ""
@@ -67,7 +80,8 @@ def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Compar
 
 
 class IdleCores(NamedTuple):
-    """What one setting of `clock.idle_cores` gave: wake-ups `lost`, late by a period, and all lateness, us."""
+    """What one setting of `clock.idle_cores` gave: wake-ups `lost`, late by a period, and all
+    lateness, us."""
 
     setting: str
     lost: int
@@ -75,14 +89,19 @@ class IdleCores(NamedTuple):
 
     def __str__(self) -> str:
         late = f"worst {shown(self.late_us.max())} us, median {shown(np.median(self.late_us))} us"
-        return f'"{self.setting}", {self.lost} of {len(self.late_us)} wake-ups late by a period, {late}'
+        return (
+            f'"{self.setting}", {self.lost} of {len(self.late_us)} wake-ups late by a period,'
+            f" {late}"
+        )
 
 
 def suiting(samples: Sequence[Sample]) -> str:
-    """Return which `clock.idle_cores` suits this machine, with the figures that say so; empty without both ways.
+    """Return which `clock.idle_cores` suits this machine, with the figures that say so; empty
+    without both ways.
 
-    Lost wake-ups decide if the counts are apart by more than chance, two standard deviations of it; if not, the worst
-    wake-up: a core that its host takes away shows there first. The median is only the price.
+    Lost wake-ups decide if the counts are apart by more than chance, two standard deviations of it;
+    if not, the worst wake-up: a core that its host takes away shows there first. The median is only
+    the price.
     """
     found = []
     for setting, ending in (("sleep", ""), ("awake", AWAKE)):
@@ -97,7 +116,9 @@ def suiting(samples: Sequence[Sample]) -> str:
     return f"clock.idle_cores that suits this machine: {best}; with {other}"
 
 
-def _attempt(who: str, contestant: Callable[[WakeGrid], np.ndarray], grid: WakeGrid) -> np.ndarray | str:
+def _attempt(
+    who: str, contestant: Callable[[WakeGrid], np.ndarray], grid: WakeGrid
+) -> np.ndarray | str:
     """Return a contestant's lateness, or why it did not run."""
     try:
         with cores_kept_awake() if who.endswith(AWAKE) else nullcontext("") as refusal:
@@ -112,9 +133,17 @@ def _contestants(share: bool) -> tuple[Contestants, list[Absent]]:
     absent = []
     if len(os.sched_getaffinity(0)) < 2:
         del found["board, poll"]
-        absent.append(Absent("board, poll", "a board that polls needs a core of its own, and this machine has one"))
+        absent.append(
+            Absent(
+                "board, poll",
+                "a board that polls needs a core of its own, and this machine has one",
+            )
+        )
     found[BARE] = sleep_loop
-    for who, missing, peer in ((CYCLICTEST, absent_cyclictest(), cyclictest), (LINUXCNC, absent_linuxcnc(), linuxcnc)):
+    for who, missing, peer in (
+        (CYCLICTEST, absent_cyclictest(), cyclictest),
+        (LINUXCNC, absent_linuxcnc(), linuxcnc),
+    ):
         if missing is None:
             found[who] = peer
         else:
@@ -126,7 +155,8 @@ def _contestants(share: bool) -> tuple[Contestants, list[Absent]]:
 def board(wake: Wake, share: bool, grid: WakeGrid) -> np.ndarray:
     """Return the lateness of an empty board's cycles, us, shape (n,): from its trace.
 
-    After skipped releases it counts from the first of them, as that of any program that has overslept grid points.
+    After skipped releases it counts from the first of them, as that of any program that has
+    overslept grid points.
     """
     chain = Chain(1, round(1e9 / grid.period_ns), wake=wake)
     seconds = (grid.wakes * grid.period_ns + SETTLE_NS) * 1e-9

@@ -1,7 +1,9 @@
-"""What a bench finds: contestants in the same cases, measured by turns, as figures, ratios and pictures.
+"""What a bench finds: contestants in the same cases, measured by turns, as figures, ratios and
+pictures.
 
-A machine's speed drifts by a factor of two within a day, so no time means much alone: every contestant is measured in
-the same minutes as the baseline of its case, and judged by the ratio of medians.
+A machine's speed drifts by a factor of two within a day, so no time means much alone: every
+contestant is measured in the same minutes as the baseline of its case, and judged by the ratio of
+medians.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Sample:
-    """The raw measurements of one contestant in one case, such as "time-slice" at "200 B"; smaller is better."""
+    """The raw measurements of one contestant in one case, such as "time-slice" at "200 B"; smaller
+    is better."""
 
     case: str
     who: str
@@ -92,7 +95,10 @@ class Absent:
     @property
     def line(self) -> str:
         """All of it as one line."""
-        return f"absent: {self.who}: {self.reason}{'; to install: ' if self.install else ''}{self.install}"
+        return (
+            f"absent: {self.who}:"
+            f" {self.reason}{'; to install: ' if self.install else ''}{self.install}"
+        )
 
 
 def absent_package(who: str, module: str) -> Absent | None:
@@ -106,15 +112,20 @@ def absent_package(who: str, module: str) -> Absent | None:
 
 def absent_program(who: str, program: str, debian: str) -> Absent | None:
     """Return what a program of a Debian package lacks; None if it is on the path."""
-    return None if shutil.which(program) else Absent(who, f"no program '{program}'", f"apt-get install {debian}")
+    return (
+        None
+        if shutil.which(program)
+        else Absent(who, f"no program '{program}'", f"apt-get install {debian}")
+    )
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All samples of a bench. `baselines` names the contestant of each case that the others are compared with.
+    """All samples of a bench. `baselines` names the contestant of each case that the others are
+    compared with.
 
-    `name` is one word, as in the command; `title` says what is measured. A case without a baseline has no ratios.
-    `conclusion` is what follows from the figures, in one line; empty: nothing.
+    `name` is one word, as in the command; `title` says what is measured. A case without a baseline
+    has no ratios. `conclusion` is what follows from the figures, in one line; empty: nothing.
     """
 
     name: str
@@ -139,7 +150,8 @@ class Comparison:
         return self._samples.get((case, who))
 
     def ratio(self, sample: Sample, figure: str = "median") -> float | None:
-        """Return a figure of a sample divided by that of its baseline; None without one, or where that is 0."""
+        """Return a figure of a sample divided by that of its baseline; None without one, or where
+        that is 0."""
         baseline = self._samples.get((sample.case, self.baselines.get(sample.case, "")))
         if baseline is None or not getattr(baseline, figure):
             return None
@@ -166,9 +178,21 @@ class Comparison:
         return {name: getattr(sample, name) for name in names} | ratios
 
     def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the figures as a table for people, fitted to `width`, and the absent contestants."""
+        """Yield the figures as a table for people, fitted to `width`, and the absent
+        contestants."""
         yield self.title
-        head = ["case", "who", "count", "median", "p99", "best", "worst", "unit", "ratio", "p99 ratio"]
+        head = [
+            "case",
+            "who",
+            "count",
+            "median",
+            "p99",
+            "best",
+            "worst",
+            "unit",
+            "ratio",
+            "p99 ratio",
+        ]
         rows = [self._row(sample) for sample in self.samples]
         yield from table(head, rows, width, ("count", "worst", "p99 ratio", "best"))
         for one in self.absent:
@@ -182,7 +206,8 @@ class Comparison:
         return [sample.case, sample.who, str(sample.count), *figures, sample.unit, *ratios]
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write the comparison as PNG and SVG, a panel a case, into `folder`; return their paths."""
+        """Write the comparison as PNG and SVG, a panel a case, into `folder`; return their
+        paths."""
         cases = self.cases
         who = self.contestants
         columns = min(COLUMNS, len(cases))
@@ -201,7 +226,8 @@ class Comparison:
         return paths
 
     def _draw(self, axes: Axes, case: str) -> None:
-        """Draw one case: a dot at each median, a line from best to p99, and a rule at the baseline's median."""
+        """Draw one case: a dot at each median, a line from best to p99, and a rule at the
+        baseline's median."""
         from matplotlib.ticker import StrMethodFormatter
 
         own = [sample for sample in self.samples if sample.case == case]
@@ -213,10 +239,18 @@ class Comparison:
             row = self.contestants.index(sample.who)
             is_baseline = self.baselines.get(case) == sample.who
             axes.hlines(row, sample.best, sample.p99, color=SPREAD, linewidth=3)
-            axes.plot(sample.median, row, "o", color=BASELINE if is_baseline else MEDIAN, markersize=5)
+            axes.plot(
+                sample.median, row, "o", color=BASELINE if is_baseline else MEDIAN, markersize=5
+            )
             if is_baseline:
                 axes.axvline(sample.median, color=BASELINE, linewidth=0.8, linestyle=":")
-            axes.annotate(self._words(sample), (sample.median, row), (0, 5), textcoords="offset points", **LABEL)
+            axes.annotate(
+                self._words(sample),
+                (sample.median, row),
+                (0, 5),
+                textcoords="offset points",
+                **LABEL,
+            )
         is_wide = low > 0 and high > WIDE * low
         axes.set_xscale("log" if is_wide else "linear")
         axes.set_xlim(*((low / 1.6, high * 1.6) if is_wide else (0.0, 1.15 * high)))
@@ -238,15 +272,19 @@ def shown(value: float) -> str:
 
 
 def turns(names: Sequence[_Name], rounds: int) -> Iterator[tuple[int, _Name]]:
-    """Yield round and contestant; every round has another order, the same in every run of the bench."""
+    """Yield round and contestant; every round has another order, the same in every run of the
+    bench."""
     random = Random(rounds)
     for turn in range(rounds):
         for name in random.sample(list(names), len(names)):
             yield turn, name
 
 
-def interleaved(contestants: Mapping[_Name, Callable[[], _Result]], rounds: int) -> dict[_Name, list[_Result]]:
-    """Call every contestant once a round, in changing order; return the results of each, oldest first."""
+def interleaved(
+    contestants: Mapping[_Name, Callable[[], _Result]], rounds: int
+) -> dict[_Name, list[_Result]]:
+    """Call every contestant once a round, in changing order; return the results of each, oldest
+    first."""
     found: dict[_Name, list[_Result]] = {name: [] for name in contestants}
     for _, name in turns(list(contestants), rounds):
         found[name].append(contestants[name]())

@@ -1,8 +1,10 @@
-"""The processor time of a board's cycle, by part: racks that run in real time and in lockstep, and their traces.
+"""The processor time of a board's cycle, by part: racks that run in real time and in lockstep, and
+their traces.
 
-Reading, processing and writing lie between stamps of the trace; what the processor time of a cycle exceeds them by is
-waking up before it, and the bookkeeping after it. An empty board shows the rack's own cost; the physics that are in a
-servo cycle are replayed alone. Another checkout of rack runs the same racks by turns.
+Reading, processing and writing lie between stamps of the trace; what the processor time of a cycle
+exceeds them by is waking up before it, and the bookkeeping after it. An empty board shows the
+rack's own cost; the physics that are in a servo cycle are replayed alone. Another checkout of rack
+runs the same racks by turns.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PARTS = ("wake", "read", "process", "write", "bookkeeping")
-"""Parts of a cycle, in the order of time; where a trace does not separate the last one, it is in the first."""
+"""Parts of a cycle, in the order of time; where a trace does not separate the last one, it is in
+the first."""
 COLOURS = ("#bbbbbb", "#88ccee", "#ddcc77", "#44aa99", "#aa4499")
 PHYSICS = "#882255"
 HATCH = "////"
@@ -53,7 +56,8 @@ SHARE = f"{EMPTY}, lockstep, wall-clock time of a tick, a board"
 
 
 class Trace(NamedTuple):
-    """Cycles of one task: records of the trace, shape (n,), and processor times of C, R, X, W, ns, shape (n, 4)."""
+    """Cycles of one task: records of the trace, shape (n,), and processor times of C, R, X, W, ns,
+    shape (n, 4)."""
 
     rows: np.ndarray
     units: np.ndarray
@@ -71,12 +75,15 @@ class RackKind(NamedTuple):
         return "lockstep" if self.lockstep else "real time"
 
 
-KINDS = tuple(RackKind(config, lockstep) for config in ("nasrem", EMPTY) for lockstep in (False, True))
+KINDS = tuple(
+    RackKind(config, lockstep) for config in ("nasrem", EMPTY) for lockstep in (False, True)
+)
 
 
 @dataclass(frozen=True)
 class BoardParts:
-    """The median of each part of one board's cycles, us; a part that a trace does not separate is 0."""
+    """The median of each part of one board's cycles, us; a part that a trace does not separate is
+    0."""
 
     case: str
     who: str
@@ -98,7 +105,9 @@ class CycleCosts:
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield both tables for people, fitted to `width`."""
         yield "Parts of a board's cycle, processor time, us, median"
-        rows = [[one.case, one.who, *(shown(one.parts[part]) for part in PARTS)] for one in self.parts]
+        rows = [
+            [one.case, one.who, *(shown(one.parts[part]) for part in PARTS)] for one in self.parts
+        ]
         yield from table(["board", "who", *PARTS], rows, width)
         if not all(one.parts["bookkeeping"] for one in self.parts):
             yield "bookkeeping 0: the trace does not separate it; it is in wake"
@@ -117,14 +126,21 @@ class CycleCosts:
             axes = figure.subplots(2, columns, squeeze=False, sharey=True).flatten()
             for panel, case in zip(axes, cases, strict=True):
                 self._draw(panel, case)
-            bars = [Patch(color=colour, label=part) for part, colour in zip(PARTS, COLOURS, strict=True)]
-            bars.append(Patch(facecolor="white", edgecolor=PHYSICS, hatch=HATCH, label="bare mj_step in it"))
+            bars = [
+                Patch(color=colour, label=part) for part, colour in zip(PARTS, COLOURS, strict=True)
+            ]
+            bars.append(
+                Patch(facecolor="white", edgecolor=PHYSICS, hatch=HATCH, label="bare mj_step in it")
+            )
             figure.legend(handles=bars, loc="outside upper center", ncols=len(bars), frameon=False)
-            figure.supxlabel(f"{self.comparison.title}, us: medians of its parts; (ratio)", fontsize="medium")
+            figure.supxlabel(
+                f"{self.comparison.title}, us: medians of its parts; (ratio)", fontsize="medium"
+            )
         return paths
 
     def _draw(self, axes: Axes, case: str) -> None:
-        """Draw a bar a contestant, made of the parts of its cycle; of the servo's also the physics in it."""
+        """Draw a bar a contestant, made of the parts of its cycle; of the servo's also the physics
+        in it."""
         own = [one for one in self.parts if one.case == case]
         physics = self.comparison.sample(_with_physics(case), _bare(case))
         ends = [sum(one.parts.values()) for one in own]
@@ -144,7 +160,14 @@ class CycleCosts:
                         linewidth=0.0,
                     )
                 left += one.parts[part]
-            axes.annotate(self._words(one), (end, row), (3, 0), textcoords="offset points", va="center", fontsize=7)
+            axes.annotate(
+                self._words(one),
+                (end, row),
+                (3, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=7,
+            )
         axes.set_yticks(range(len(own)), [one.who for one in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.set_xlim(0.0, 1.35 * max(ends))
@@ -170,7 +193,8 @@ def _bare(case: str) -> str:
 
 
 class Found(NamedTuple):
-    """Everything measured, by contestant: traces also by case, times in us, arrays of shape (n,)."""
+    """Everything measured, by contestant: traces also by case, times in us, arrays of shape
+    (n,)."""
 
     traces: defaultdict[tuple[str, str], list[Trace]]
     shares_us: defaultdict[str, list[np.ndarray]]
@@ -179,17 +203,25 @@ class Found(NamedTuple):
     """Processor time of a tick's bare physics, by the way of their replay."""
 
 
-def measure(against: Path | None, seconds: float, rounds: int, progress: Progress, share: bool = False) -> CycleCosts:
-    """Run every rack of this tree, and of another checkout, by turns, each for `seconds` of simulated time.
+def measure(
+    against: Path | None, seconds: float, rounds: int, progress: Progress, share: bool = False
+) -> CycleCosts:
+    """Run every rack of this tree, and of another checkout, by turns, each for `seconds` of
+    simulated time.
 
-    `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run fails.
+    `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run
+    fails.
     """
     with ExitStack() as stack:
         commands = stack.enter_context(both_racks(against))
         runs = CycleRuns(seconds, Path(stack.enter_context(TemporaryDirectory())), share)
         progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
-        for turn, (kind, command) in turns([(kind, command) for kind in KINDS for command in commands], rounds):
-            progress.begin(f"{kind.config}, {kind.mode}, {command.name}: round {turn + 1} of {rounds}")
+        for turn, (kind, command) in turns(
+            [(kind, command) for kind in KINDS for command in commands], rounds
+        ):
+            progress.begin(
+                f"{kind.config}, {kind.mode}, {command.name}: round {turn + 1} of {rounds}"
+            )
             runs.run(kind, command)
             progress.end(seconds + LAUNCH_S)
         return costs(runs.found, commands[-1].name if len(commands) > 1 else None)
@@ -209,13 +241,25 @@ class CycleRuns:
         self._pace = ReplayPace(config.clock_ns * servo.every, servo.core, servo.priority)
 
     def run(self, kind: RackKind, command: RackCommand) -> None:
-        """Run one rack and take its traces; of this tree's arm in lockstep, replay the physics at once."""
+        """Run one rack and take its traces; of this tree's arm in lockstep, replay the physics at
+        once."""
         self._runs += 1
         folder = self._folder / str(self._runs)
         folder.mkdir()
-        config: str | Path = kind.config if kind.config != EMPTY else write_empty_rack(folder, command.package)
-        options = ["--set", f"name=bench-{os.getpid()}", "--out", folder / "run", "--seconds", self._seconds]
-        options += ["--lockstep"] * kind.lockstep + ["--share"] * (self._share and bool(command.package))
+        config: str | Path = (
+            kind.config if kind.config != EMPTY else write_empty_rack(folder, command.package)
+        )
+        options = [
+            "--set",
+            f"name=bench-{os.getpid()}",
+            "--out",
+            folder / "run",
+            "--seconds",
+            self._seconds,
+        ]
+        options += ["--lockstep"] * kind.lockstep + ["--share"] * (
+            self._share and bool(command.package)
+        )
         command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
         traces = traces_of(Recording(folder / "run"))
         for board, trace in traces.items():
@@ -223,7 +267,9 @@ class CycleRuns:
             self.found.traces[case, command.name].append(trace)
         if kind.lockstep and kind.config == EMPTY:
             first = next(iter(traces.values()))
-            self.found.shares_us[command.name].append(np.diff(first.rows["start_ns"]) * 1e-3 / len(traces))
+            self.found.shares_us[command.name].append(
+                np.diff(first.rows["start_ns"]) * 1e-3 / len(traces)
+            )
         if kind.lockstep and kind.config != EMPTY and command.name == THIS:
             for who, pace in ((ROW, ReplayPace()), (PACED, self._pace)):
                 times_us = apart(replay, folder / "run", pace, REPLAYED_TICKS)
@@ -239,7 +285,11 @@ def traces_of(recording: Recording) -> dict[str, Trace]:
     spans = {task: Occupation.of(recording.trace(task.name)) for task in tasks}
     found: dict[str, Trace] = {}
     for task in tasks:
-        above = [span for other, span in spans.items() if other.core == task.core and other.priority > task.priority]
+        above = [
+            span
+            for other, span in spans.items()
+            if other.core == task.core and other.priority > task.priority
+        ]
         rows = recording.trace(task.name)
         times = unit_times(rows, Occupation.union(above))
         steady = rows["tick"] >= STEADY_TICKS
@@ -249,28 +299,46 @@ def traces_of(recording: Recording) -> dict[str, Trace]:
 
 
 def costs(found: Found, baseline: str | None) -> CycleCosts:
-    """Return the costs of everything measured; `baseline` is the contestant that the others are compared with."""
+    """Return the costs of everything measured; `baseline` is the contestant that the others are
+    compared with."""
     order = _ordered(found.traces)
-    samples = [_sample(*one, (trace.rows["processor_ns"] * 1e-3 for trace in found.traces[one])) for one in order]
+    samples = [
+        _sample(*one, (trace.rows["processor_ns"] * 1e-3 for trace in found.traces[one]))
+        for one in order
+    ]
     parts = [BoardParts(*one, _medians(found.traces[one])) for one in order]
-    shares = [_sample(SHARE, who, found.shares_us[who]) for who in sorted(found.shares_us, key=_is_other)]
+    shares = [
+        _sample(SHARE, who, found.shares_us[who]) for who in sorted(found.shares_us, key=_is_other)
+    ]
     baselines = {sample.case: baseline for sample in (*samples, *shares) if baseline is not None}
     physics: list[Sample] = []
     for case in dict.fromkeys(case for case, _ in order if case.startswith(f"{SERVO},")):
-        physics += [replace(sample, case=_with_physics(case)) for sample in samples if sample.case == case]
-        physics += [_sample(_with_physics(case), who, times) for who, times in found.physics_us.items()]
+        physics += [
+            replace(sample, case=_with_physics(case)) for sample in samples if sample.case == case
+        ]
+        physics += [
+            _sample(_with_physics(case), who, times) for who, times in found.physics_us.items()
+        ]
         baselines[_with_physics(case)] = _bare(case)
     title = "Processor time of a board's cycle"
-    return CycleCosts(Comparison("cycle", title, (*samples, *shares, *physics), baselines), tuple(parts))
+    return CycleCosts(
+        Comparison("cycle", title, (*samples, *shares, *physics), baselines), tuple(parts)
+    )
 
 
 def _ordered(found: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return cases and contestants: real time first, in it the empty boards; in each case this tree first."""
+    """Return cases and contestants: real time first, in it the empty boards; in each case this tree
+    first."""
     cases = list(dict.fromkeys(case for case, _ in found))
 
     def place(one: tuple[str, str]) -> tuple[bool, bool, int, bool]:
         case, who = one
-        return case.endswith("lockstep"), not case.startswith(EMPTY), cases.index(case), _is_other(who)
+        return (
+            case.endswith("lockstep"),
+            not case.startswith(EMPTY),
+            cases.index(case),
+            _is_other(who),
+        )
 
     return sorted(found, key=place)
 
@@ -294,10 +362,12 @@ def parts_of(trace: Trace) -> dict[str, np.ndarray]:
     units = trace.units[1:]
     exchange, read, process, write = units.T
     beyond = rows["processor_ns"][1:] - units.sum(axis=1)
-    # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it is written.
+    # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it
+    # is written.
     closing = rows["closed_ns"][1:] - rows["end_ns"][:-1]
     gap = rows["start_ns"][1:] - rows["closed_ns"][1:]
-    # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the next start is known.
+    # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the
+    # next start is known.
     closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
     closing[rows["closed_ns"][1:] == 0] = 0
     times = beyond - closing, exchange + read, process, write, closing

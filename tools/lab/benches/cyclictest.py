@@ -1,7 +1,9 @@
-"""`cyclictest` of rt-tests: how late this machine wakes a C program that sleeps to the points of a grid.
+"""`cyclictest` of rt-tests: how late this machine wakes a C program that sleeps to the points of a
+grid.
 
-No board can wake earlier than that, so it is the measure of every board's lateness, and of the deadlines that the
-machine itself breaks: under a hypervisor a core is away for milliseconds at a time.
+No board can wake earlier than that, so it is the measure of every board's lateness, and of the
+deadlines that the machine itself breaks: under a hypervisor a core is away for milliseconds at a
+time.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from rack.tools.lab.benches.comparison import Absent, absent_program
 
 CYCLICTEST = "cyclictest"
 LONGEST_US = 100_000
-"""Largest lateness that has a place of its own in the histogram; one beyond it counts as the maximum."""
+"""Largest lateness that has a place of its own in the histogram; one beyond it counts as the
+maximum."""
 PATIENCE_S = 30.0
 """Time that a peer may take in addition to its wakes."""
 
@@ -59,13 +62,18 @@ def permits_fifo() -> bool:
 def cyclictest(grid: WakeGrid) -> np.ndarray:
     """Return the lateness of every wake, us, shape (n,): smallest first, a thread at a time.
 
-    It leaves idle cores as they are, as a rack does by default (`--laptop`). Raises `Failure` if it cannot run.
+    It leaves idle cores as they are, as a rack does by default (`--laptop`). Raises `Failure` if it
+    cannot run.
     """
     with TemporaryDirectory(prefix="rack-bench-") as folder:
         path = Path(folder) / "found.json"
         command = [CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop"]
         command += [f"--affinity={','.join(map(str, grid.cores))}", f"--threads={len(grid.cores)}"]
-        command += [f"--priority={grid.priority}", f"--interval={grid.period_ns // 1000}", "--distance=0"]
+        command += [
+            f"--priority={grid.priority}",
+            f"--interval={grid.period_ns // 1000}",
+            "--distance=0",
+        ]
         command += [f"--loops={grid.wakes}", f"--histogram={LONGEST_US}", f"--json={path}"]
         errors = _run(command, grid.patience_s)
         if errors or not path.is_file():
@@ -76,7 +84,9 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
 
 def _run(command: Sequence[str], patience_s: float) -> str:
     """Run it to its end; return why it failed, empty if it did not."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     try:
         _, errors = process.communicate(timeout=patience_s)
     except subprocess.TimeoutExpired:
@@ -86,7 +96,11 @@ def _run(command: Sequence[str], patience_s: float) -> str:
             # In order: killed, it would leave its shared memory.
             process.terminate()
             process.communicate()
-    return (" ".join(errors.split()) or f"exit status {process.returncode}") if process.returncode else ""
+    return (
+        (" ".join(errors.split()) or f"exit status {process.returncode}")
+        if process.returncode
+        else ""
+    )
 
 
 def _lateness_us(thread: dict[str, object]) -> Iterator[float]:
@@ -103,7 +117,8 @@ BEYOND = 0.001
 
 
 class MissesBeyond:
-    """Base of figures whose misses are judged by those of `cyclictest` in the same minutes; all are shares."""
+    """Base of figures whose misses are judged by those of `cyclictest` in the same minutes; all are
+    shares."""
 
     missed: float
     late: float | None  # of cyclictest's wakes, by a cycle or more; None: it is absent
@@ -120,6 +135,11 @@ class MissesBeyond:
 
 
 def overdue(late_us: np.ndarray, period_ns: int) -> float:
-    """Return the share of grid points at which the sleeper was late by a cycle or more, those it skipped included."""
+    """Return the share of grid points at which the sleeper was late by a cycle or more, those it
+    skipped included."""
     passed = np.floor(late_us * 1e3 / period_ns)
-    return float(passed.sum() / (len(late_us) + np.clip(passed - 1, 0, None).sum())) if len(late_us) else 0.0
+    return (
+        float(passed.sum() / (len(late_us) + np.clip(passed - 1, 0, None).sum()))
+        if len(late_us)
+        else 0.0
+    )

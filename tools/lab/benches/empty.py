@@ -1,4 +1,5 @@
-"""Boards that compute nothing: each reads a message of 8 bytes and writes one. What is left is the rack's own cost."""
+"""Boards that compute nothing: each reads a message of 8 bytes and writes one. What is left is the
+rack's own cost."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ reads = {{ read = "b{before}.written" }}
 
 
 def write_empty_rack(folder: Path, package: str, boards: int = BOARDS) -> Path:
-    """Write a rack of so many boards in a ring, on two cores by turns, and its level into a folder; return its config.
+    """Write a rack of so many boards in a ring, on two cores by turns, and its level into a folder;
+    return its config.
 
     `package` is what imports of rack begin with, "rack." or nothing.
     """

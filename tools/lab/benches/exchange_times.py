@@ -1,6 +1,8 @@
-"""How the messages of a run reached their readers: how evenly, how old they were when read, and how many never did.
+"""How the messages of a run reached their readers: how evenly, how old they were when read, and how
+many never did.
 
-For every mailbox and reader alike, whatever its protocol, so that exchange by tables and by interrupts can be compared.
+For every mailbox and reader alike, whatever its protocol, so that exchange by tables and by
+interrupts can be compared.
 """
 
 from __future__ import annotations
@@ -25,9 +27,10 @@ MS = 1e-6
 class ExchangeTimes:
     """The messages of one mailbox at one reader.
 
-    `jitter_ms`: by how much the time between two arrivals at the reader's board differs from that between the releases
-    that wrote them. `age_ms`: in each of its cycles, the time since the release that wrote what it has. `sent` messages
-    were written; `lost` never arrived, and `overtaken` arrived, but a newer one did before the next read.
+    `jitter_ms`: by how much the time between two arrivals at the reader's board differs from that
+    between the releases that wrote them. `age_ms`: in each of its cycles, the time since the
+    release that wrote what it has. `sent` messages were written; `lost` never arrived, and
+    `overtaken` arrived, but a newer one did before the next read.
     """
 
     mailbox: str
@@ -42,7 +45,8 @@ class ExchangeTimes:
 
 
 class _Arrivals(NamedTuple):
-    """The messages that arrived, in order, shape (n,): when, and the instant from which a reader can have each.
+    """The messages that arrived, in order, shape (n,): when, and the instant from which a reader
+    can have each.
 
     `at_ns` is on the scale of the jitter, `seen_from` on that of the reader's instants, `reads`.
     """
@@ -56,7 +60,8 @@ class _Arrivals(NamedTuple):
 def exchange_times(recording: Recording) -> list[ExchangeTimes]:
     """Return the times of every sampled mailbox at each of its readers, in the order of the layout.
 
-    Queues, and mailboxes that operators or host boards write, are left out, as are readers that left no trace.
+    Queues, and mailboxes that operators or host boards write, are left out, as are readers that
+    left no trace.
     """
     return list(_all_times(recording))
 
@@ -77,7 +82,9 @@ def _all_times(recording: Recording) -> Iterator[ExchangeTimes]:
             yield _times(recording, box, reader, boards.get(slot))
 
 
-def _times(recording: Recording, box: MailboxSpec, reader: str, board: BoardInterrupts | None) -> ExchangeTimes:
+def _times(
+    recording: Recording, box: MailboxSpec, reader: str, board: BoardInterrupts | None
+) -> ExchangeTimes:
     clock_ns = recording.layout.clock_ns
     serials = recording.signal(box.name, "serial")
     found = _arrivals(recording, box, reader, board)
@@ -87,7 +94,9 @@ def _times(recording: Recording, box: MailboxSpec, reader: str, board: BoardInte
     known = newest >= 0
     read = np.unique(newest[known])
     uneven = np.diff(found.at_ns) - np.diff(found.released) * clock_ns
-    sent = int(serials[-1] - serials[0] + 1) - recording.lost.get(box.name, 0) if len(serials) else 0
+    sent = (
+        int(serials[-1] - serials[0] + 1) - recording.lost.get(box.name, 0) if len(serials) else 0
+    )
     return ExchangeTimes(
         mailbox=box.name,
         writer=box.writer,
@@ -101,11 +110,15 @@ def _times(recording: Recording, box: MailboxSpec, reader: str, board: BoardInte
     )
 
 
-def _arrivals(recording: Recording, box: MailboxSpec, reader: str, board: BoardInterrupts | None) -> _Arrivals:
+def _arrivals(
+    recording: Recording, box: MailboxSpec, reader: str, board: BoardInterrupts | None
+) -> _Arrivals:
     """Return the arrivals of a mailbox at a reader, and when that reads, by its protocol."""
     layout = recording.layout
     rows = recording.trace(reader)
-    released, visible_at = (recording.signal(box.name, name).astype(np.int64) for name in ("tick", "visible_at"))
+    released, visible_at = (
+        recording.signal(box.name, name).astype(np.int64) for name in ("tick", "visible_at")
+    )
     grid = layout.read_grid(box, reader)
     # Between two reads the message of the last one stays.
     reads = rows["tick"] - (rows["tick"] - grid.phase) % grid.every
@@ -117,10 +130,15 @@ def _arrivals(recording: Recording, box: MailboxSpec, reader: str, board: BoardI
     is_early = any(exchange.task == reader and exchange.asynchronous for exchange in box.exchanges)
     if box.is_by_ticks and not is_early:
         return _Arrivals(released, visible_at * layout.clock_ns, visible_at, reads)
-    # Visible as soon as they are whole: by the wall clock, which in lockstep orders them but says nothing of evenness.
+    # Visible as soon as they are whole: by the wall clock, which in lockstep orders them but says
+    # nothing of evenness.
     stamps = recording.signal(box.name, "stamp_ns")
     is_lockstep = recording.rack_config.clock.mode == "lockstep"
-    at_ns = released * layout.clock_ns if is_lockstep else np.rint(stamps * recording.rack_config.clock.speed)
+    at_ns = (
+        released * layout.clock_ns
+        if is_lockstep
+        else np.rint(stamps * recording.rack_config.clock.speed)
+    )
     own = f"{recording.layout.task(reader).board}.plan" == box.name
     cycles = np.maximum(np.searchsorted(rows["tick"], reads, side="right") - 1, 0)
     return _Arrivals(released, at_ns, stamps, rows["start_ns" if own else "plan_ns"][cycles])

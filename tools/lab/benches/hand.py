@@ -1,4 +1,5 @@
-"""Table-driven buffers next to interrupt-driven messages: the racks hic and condor, with the same hand and task."""
+"""Table-driven buffers next to interrupt-driven messages: the racks hic and condor, with the same
+hand and task."""
 
 from __future__ import annotations
 
@@ -31,10 +32,14 @@ SETTLED_S = 0.3
 """Simulated time after the end of a pull in which the object comes back."""
 
 
-def measure(rounds: int, share: bool, progress: Progress, racks: Sequence[str] = RACKS) -> HandBench:
+def measure(
+    rounds: int, share: bool, progress: Progress, racks: Sequence[str] = RACKS
+) -> HandBench:
     """Run both racks by turns, in real time, then in lockstep; return their figures."""
     progress.total(2 * len(racks) * rounds * (ABOUT_S + LAUNCH_S))
-    found: dict[tuple[str, str], list[Recorded]] = {(rack, mode): [] for rack in racks for mode in MODES}
+    found: dict[tuple[str, str], list[Recorded]] = {
+        (rack, mode): [] for rack in racks for mode in MODES
+    }
     with TemporaryDirectory(prefix="rack-bench-") as scratch:
         for turn in range(rounds):
             for rack in racks if turn % 2 == 0 else reversed(racks):
@@ -42,7 +47,9 @@ def measure(rounds: int, share: bool, progress: Progress, racks: Sequence[str] =
                     progress.begin(f"{rack}: {mode}, run {turn + 1} of {rounds}")
                     ran = _run(rack, mode, Path(scratch) / f"{rack}-{turn}.{mode}", share)
                     found[rack, mode].append(ran)
-                    progress.end(ABOUT_S + LAUNCH_S, "done" if ran.result.worked else ran.result.failure())
+                    progress.end(
+                        ABOUT_S + LAUNCH_S, "done" if ran.result.worked else ran.result.failure()
+                    )
         return HandBench(tuple(_figures(rack, mode, ran) for (rack, mode), ran in found.items()))
 
 
@@ -73,7 +80,8 @@ def _figures(rack: str, mode: str, runs: Sequence[Recorded]) -> HandFigures:
 
 
 def shift_mm(recording: Recording) -> tuple[float, float] | None:
-    """Return how far the pulls move the object, and how far it is from its place after the last one, mm.
+    """Return how far the pulls move the object, and how far it is from its place after the last
+    one, mm.
 
     None if it is not held in all that time.
     """
@@ -97,7 +105,8 @@ def shift_mm(recording: Recording) -> tuple[float, float] | None:
 
 
 def _costs_ms(recording: Recording) -> tuple[float, float, float]:
-    """Return the processor times of all boards for messages, for the rest, and of interrupts by their cost model.
+    """Return the processor times of all boards for messages, for the rest, and of interrupts by
+    their cost model.
 
     They are ms in a second of simulated time.
     """
@@ -105,7 +114,9 @@ def _costs_ms(recording: Recording) -> tuple[float, float, float]:
     layout = recording.layout
     exchanged = sum(float(cycles.communication_ns.sum()) for cycles in found.values())
     processed = sum(float(cycles.process_ns.sum()) for cycles in found.values())
-    service_ns = {box.name: box.interrupt.service_ns for box in layout.mailboxes if box.interrupt is not None}
+    service_ns = {
+        box.name: box.interrupt.service_ns for box in layout.mailboxes if box.interrupt is not None
+    }
     served = (one for board in interrupts(recording) for one in board["mailboxes"])
     handled = sum(one["served"] * service_ns[one["mailbox"]] for one in served)
     ticks = max(int(cycles.rows["tick"][-1]) for cycles in found.values())
@@ -114,7 +125,8 @@ def _costs_ms(recording: Recording) -> tuple[float, float, float]:
 
 
 def _links(runs: Sequence[Recording]) -> Iterator[LinkFigures]:
-    """Yield the links of a rack; mailboxes of one message type from or to several boards that do the same are one."""
+    """Yield the links of a rack; mailboxes of one message type from or to several boards that do
+    the same are one."""
     groups: dict[tuple[str, str, str], list[ExchangeTimes]] = {}
     periods = {box.name: box.every for run in runs for box in run.layout.mailboxes}
     for run in runs:

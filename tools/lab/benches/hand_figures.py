@@ -23,10 +23,12 @@ NARROW = ("overtaken", "sent", "age p50", "jitter p50", "protocol")
 
 @dataclass(frozen=True)
 class LinkFigures:
-    """All mailboxes of one type of message that go the same way: the largest figure of any, counts of all; times in ms.
+    """All mailboxes of one type of message that go the same way: the largest figure of any, counts
+    of all; times in ms.
 
-    Jitter is that of arrival, ages are those when they are read. Lost messages never arrived; of an overtaken one a
-    newer one arrived before it was read: see `rack.tools.lab.benches.exchange_times`.
+    Jitter is that of arrival, ages are those when they are read. Lost messages never arrived; of an
+    overtaken one a newer one arrived before it was read: see
+    `rack.tools.lab.benches.exchange_times`.
     """
 
     message: str
@@ -47,9 +49,10 @@ class LinkFigures:
 class HandFigures:
     """One rack in one mode, over its rounds; the largest figure of any.
 
-    `shift_mm` is how far the pulls move the object, `left_mm` how far it is afterwards from where it was before them;
-    None: it was not held then. `exchange_ms` and `process_ms` are processor times of all boards in a second, for
-    messages and for the rest, `handler_ms` that of interrupts by their cost model: in real time a part of the first.
+    `shift_mm` is how far the pulls move the object, `left_mm` how far it is afterwards from where
+    it was before them; None: it was not held then. `exchange_ms` and `process_ms` are processor
+    times of all boards in a second, for messages and for the rest, `handler_ms` that of interrupts
+    by their cost model: in real time a part of the first.
     """
 
     rack: str
@@ -85,17 +88,48 @@ class HandBench:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return {"bench": "hand", "racks": [asdict(one) for one in self.figures], "worked": self.worked}
+        return {
+            "bench": "hand",
+            "racks": [asdict(one) for one in self.figures],
+            "worked": self.worked,
+        }
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield both tables for people, fitted to `width`."""
-        yield "the object under the pulls, mm; processor time a second of all boards, ms; cycles missed or skipped"
-        head = ["rack", "shift", "left", "messages", "the rest", "handlers", "missed", "of cycles", "task"]
-        yield from table(head, [_rack_row(one) for one in self.figures], width, ("the rest", "handlers"))
+        yield (
+            "the object under the pulls, mm; processor time a second of all boards, ms; cycles"
+            " missed or skipped"
+        )
+        head = [
+            "rack",
+            "shift",
+            "left",
+            "messages",
+            "the rest",
+            "handlers",
+            "missed",
+            "of cycles",
+            "task",
+        ]
+        yield from table(
+            head, [_rack_row(one) for one in self.figures], width, ("the rest", "handlers")
+        )
         yield ""
         yield "messages on every link, ms: jitter of arrival, age when they are read"
-        head = ["message", "rack", "from > to", "protocol", "period", "jitter p50", "jitter max", "age p50", "age max"]
-        yield from table([*head, "sent", "lost", "overtaken"], list(self._link_rows()), width, NARROW)
+        head = [
+            "message",
+            "rack",
+            "from > to",
+            "protocol",
+            "period",
+            "jitter p50",
+            "jitter max",
+            "age p50",
+            "age max",
+        ]
+        yield from table(
+            [*head, "sent", "lost", "overtaken"], list(self._link_rows()), width, NARROW
+        )
         for one in self.figures:
             if one.failure:
                 yield f"{one.name}: {one.failure}"
@@ -136,7 +170,12 @@ class HandBench:
             for each in axes:
                 each.grid(axis="x", color=GRID, linewidth=0.4)
                 each.spines[["top", "right"]].set_visible(False)
-            drawn.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+            drawn.legend(
+                *axes[0].get_legend_handles_labels(),
+                loc="outside lower center",
+                ncols=4,
+                frameon=False,
+            )
         return paths
 
     def _draw(self, axes: Axes, what: str, label: str) -> None:

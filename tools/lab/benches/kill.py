@@ -30,9 +30,11 @@ LOOK_S = 0.02
 
 
 class Killing:
-    """Kills of the boards that matter most to an arm: the one that drives it, and the one that commands that one.
+    """Kills of the boards that matter most to an arm: the one that drives it, and the one that
+    commands that one.
 
-    The second is killed under `on_loss = "brake"`: the level below then brakes at once, instead of holding.
+    The second is killed under `on_loss = "brake"`: the level below then brakes at once, instead of
+    holding.
     """
 
     def __init__(self, name: str, kills: int, progress: Progress) -> None:
@@ -50,7 +52,8 @@ class Killing:
         self._random = Random(kills)
 
     def samples(self, board: str, expected_s: float) -> Iterator[Sample]:
-        """Kill a board again and again; yield the times to its detection and to safe torque, in ms and in cycles."""
+        """Kill a board again and again; yield the times to its detection and to safe torque, in ms
+        and in cycles."""
         self._progress.begin(f"kills of {board}")
         found: dict[str, list[float]] = {DETECTED: [], SAFE: []}
         config = self._braking(board)
@@ -60,7 +63,8 @@ class Killing:
             while len(found[SAFE]) < self._kills:
                 _watch(rack, SETTLE_S + self._random.uniform(0.0, PHASES_S), lambda: False)
                 reaction = self._kill(rack, board, seen)
-                # On a busy machine the brakes may have engaged for another reason, just before the kill.
+                # On a busy machine the brakes may have engaged for another reason, just before the
+                # kill.
                 if reaction[SAFE] > 0.0:
                     for what, seconds in reaction.items():
                         found[what].append(seconds)
@@ -72,11 +76,19 @@ class Killing:
         for what, times in found.items():
             yield Sample(f"{board} killed", what, tuple(1e3 * seconds for seconds in times), "ms")
         for what, times in found.items():
-            yield Sample(f"{board} killed, in cycles", what, tuple(seconds / cycle_s for seconds in times), "cycles")
+            yield Sample(
+                f"{board} killed, in cycles",
+                what,
+                tuple(seconds / cycle_s for seconds in times),
+                "cycles",
+            )
 
     def _braking(self, board: str) -> RackConfig:
         """Return the config without an end, in which the loss of this board engages the brakes."""
-        boards = {name: table.model_copy(update={"ends_run": False}) for name, table in self._config.board.items()}
+        boards = {
+            name: table.model_copy(update={"ends_run": False})
+            for name, table in self._config.board.items()
+        }
         boards[board] = boards[board].model_copy(update={"on_loss": "brake"})
         return self._config.model_copy(update={"board": boards})
 
@@ -90,10 +102,15 @@ class Killing:
         os.kill(block[Block.PID], signal.SIGKILL)
 
         def first(code: str) -> Event | None:
-            return next((event for event in seen if event.code == code and event.tick >= tick), None)
+            return next(
+                (event for event in seen if event.code == code and event.tick >= tick), None
+            )
 
         def is_over() -> bool:
-            return bool(first("died") and first("brakes_closed")) and block[Block.STATE] == TaskState.RUNNING
+            return (
+                bool(first("died") and first("brakes_closed"))
+                and block[Block.STATE] == TaskState.RUNNING
+            )
 
         _watch(rack, REACT_S, is_over)
         died = first("died")
@@ -108,7 +125,8 @@ class Killing:
     def _braked_ns(self, rack: Rack, braked: Event, offset_ns: int) -> int:
         """Return when the brakes engaged, CLOCK_MONOTONIC, ns.
 
-        A servo level that was away reports them late: the arm itself engaged them once it had waited long enough.
+        A servo level that was away reports them late: the arm itself engaged them once it had
+        waited long enough.
         """
         if not braked.value:
             return braked.time_ns - offset_ns

@@ -1,8 +1,10 @@
-"""Racks on a network: round trips, ages, bytes on the wire, and the time to see a death, by their number and rate.
+"""Racks on a network: round trips, ages, bytes on the wire, and the time to see a death, by their
+number and rate.
 
-Machines are network namespaces of this one, so all of them share its cores. A coordinator exchanges with all others, as
-in a cell. Each "rack" is one process: the network link, envelopes and seals of a rack's adapter, with its priority, and
-cycles on a grid of its own; the boards of a rack are left out.
+Machines are network namespaces of this one, so all of them share its cores. A coordinator exchanges
+with all others, as in a cell. Each "rack" is one process: the network link, envelopes and seals of
+a rack's adapter, with its priority, and cycles on a grid of its own; the boards of a rack are left
+out.
 """
 
 from __future__ import annotations
@@ -15,7 +17,13 @@ from dataclasses import dataclass
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.comparison import Absent, absent_package, turns
-from rack.tools.lab.benches.cyclictest import CYCLICTEST, WakeGrid, absent_cyclictest, cyclictest, permits_fifo
+from rack.tools.lab.benches.cyclictest import (
+    CYCLICTEST,
+    WakeGrid,
+    absent_cyclictest,
+    cyclictest,
+    permits_fifo,
+)
 from rack.tools.lab.benches.lan_ends import COORDINATOR
 from rack.tools.lab.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.lab.benches.lan_group import HEAD_START_NS, Group
@@ -40,7 +48,8 @@ PACKAGES = ((TLS, "cryptography"), (TLS, "zenoh"), (TCP, "zenoh"), ("cyclonedds"
 
 @dataclass(frozen=True)
 class LanRuns:
-    """What to measure: numbers of racks, rates, the time at each, rounds, and the share of packets that get lost."""
+    """What to measure: numbers of racks, rates, the time at each, rounds, and the share of packets
+    that get lost."""
 
     counts: Sequence[int] = COUNTS
     rates_hz: Sequence[float] = RATES_HZ
@@ -56,7 +65,9 @@ def measure(runs: LanRuns, progress: Progress) -> LanFigures:
     if lacks := absent_cyclictest():
         absent.append(lacks)
     bench = LanBench(runs)
-    progress.total(sum(bench.cost_s(count) for count in runs.counts) * len(contestants) * runs.rounds)
+    progress.total(
+        sum(bench.cost_s(count) for count in runs.counts) * len(contestants) * runs.rounds
+    )
     for count in runs.counts:
         with Lab(count + 1) as lab:
             for machine in range(1, count + 1):
@@ -98,7 +109,9 @@ class LanBench:
         with Group(lab, who, echoes=True, priority=self._priority) as group:
             for rate_hz in self._runs.rates_hz:
                 found = group.run(rate_hz, self._cycles(rate_hz))
-                self._note(Point("round trip", group.racks, rate_hz, who, "us"), found[COORDINATOR].us)
+                self._note(
+                    Point("round trip", group.racks, rate_hz, who, "us"), found[COORDINATOR].us
+                )
         with Group(lab, who, echoes=False, priority=self._priority) as group:
             self._exchange(group)
             if who not in WITHOUT_LIVELINESS:
@@ -120,7 +133,10 @@ class LanBench:
             # A window is idle before its first cycle and after its last one.
             sent = _wire_bytes(group.lab) - before - idle * (time.monotonic() - before_s)
             kilobytes = (idle + sent * rate_hz / cycles) * 1e-3
-            self._note(Point("age", group.racks, rate_hz, group.who, "ms"), [us * 1e-3 for m in found for us in m.us])
+            self._note(
+                Point("age", group.racks, rate_hz, group.who, "ms"),
+                [us * 1e-3 for m in found for us in m.us],
+            )
             self._note(Point("on the wire", group.racks, rate_hz, group.who, "kB/s"), [kilobytes])
             each_us = found[COORDINATOR].processor_us / (cycles * group.racks)
             self._note(Point("processor", group.racks, rate_hz, group.who, "us"), [each_us])
@@ -146,7 +162,12 @@ class LanBench:
     def wake(self, count: int) -> None:
         """Measure how late this machine wakes `cyclictest` at the highest rate, on all cores."""
         rate_hz = max(self._runs.rates_hz)
-        grid = WakeGrid(tuple(sorted(os.sched_getaffinity(0))), round(1e9 / rate_hz), self._cycles(rate_hz), PRIORITY)
+        grid = WakeGrid(
+            tuple(sorted(os.sched_getaffinity(0))),
+            round(1e9 / rate_hz),
+            self._cycles(rate_hz),
+            PRIORITY,
+        )
         self._note(Point("wake", count, rate_hz, CYCLICTEST, "us"), cyclictest(grid).tolist())
 
     def _note(self, point: Point, values: Sequence[float]) -> None:

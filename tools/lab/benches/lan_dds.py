@@ -1,4 +1,5 @@
-"""An end on cyclonedds, a DDS: reliable topics, one for each pair of machines, and its own liveliness."""
+"""An end on cyclonedds, a DDS: reliable topics, one for each pair of machines, and its own
+liveliness."""
 
 # Annotations are not postponed: cyclonedds evaluates them.
 from collections.abc import Iterator
@@ -44,7 +45,8 @@ SETTINGS = """
   </Discovery>
 </Domain></CycloneDDS>
 """
-"""As with a rack, nobody looks for others: their addresses are given. A participant shows itself every 5 s, not 30."""
+"""As with a rack, nobody looks for others: their addresses are given. A participant shows itself
+every 5 s, not 30."""
 
 
 @dataclass
@@ -103,7 +105,9 @@ class DdsEnd:
         peers = "".join(f'<Peer address="{place.addresses[other]}"/>' for other in place.others)
         self._domain = Domain(0, SETTINGS.format(own=place.addresses[place.machine], peers=peers))
         participant = DomainParticipant(0)
-        own, theirs = (DdsOrder, DdsStatus) if place.machine == COORDINATOR else (DdsStatus, DdsOrder)
+        own, theirs = (
+            (DdsOrder, DdsStatus) if place.machine == COORDINATOR else (DdsStatus, DdsOrder)
+        )
         self._kind = own
         self._writers: dict[int, DataWriter[Any]] = {}
         self._readers: dict[int, DataReader[Any]] = {}

@@ -1,7 +1,8 @@
-"""The ends of what `rack bench lan` compares: how a process of one machine exchanges messages with those of others.
+"""The ends of what `rack bench lan` compares: how a process of one machine exchanges messages with
+those of others.
 
-Machine 0 is the coordinator, as in a cell: it sends an order to every other machine, and each of these sends it a
-status. Among themselves they exchange nothing.
+Machine 0 is the coordinator, as in a cell: it sends an order to every other machine, and each of
+these sends it a status. Among themselves they exchange nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ Notice = Callable[[int, bool], None]
 
 @dataclass(frozen=True)
 class LanPlace:
-    """Where an end is: on which machine, and the addresses of all. `certificates`: a folder; empty: without TLS."""
+    """Where an end is: on which machine, and the addresses of all. `certificates`: a folder; empty:
+    without TLS."""
 
     machine: int
     addresses: tuple[str, ...]
@@ -38,7 +40,9 @@ class LanPlace:
     @property
     def others(self) -> tuple[int, ...]:
         """The machines that this one exchanges messages with."""
-        return tuple(range(1, len(self.addresses))) if self.machine == COORDINATOR else (COORDINATOR,)
+        return (
+            tuple(range(1, len(self.addresses))) if self.machine == COORDINATOR else (COORDINATOR,)
+        )
 
 
 def rack_name(machine: int) -> str:
@@ -47,7 +51,8 @@ def rack_name(machine: int) -> str:
 
 
 class End(Protocol):
-    """One end, open. Given `take`, it passes every message on at once, in a thread of its own; else a cycle takes them.
+    """One end, open. Given `take`, it passes every message on at once, in a thread of its own; else
+    a cycle takes them.
 
     `notice` is called in a thread, too.
     """

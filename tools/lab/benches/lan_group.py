@@ -26,7 +26,8 @@ REACT_S = 15.0
 
 
 class Group:
-    """The processes of one contestant, one on each machine of a lab. Raises `Failure` if one does not do its part.
+    """The processes of one contestant, one on each machine of a lab. Raises `Failure` if one does
+    not do its part.
 
     `false_deaths`: machines that the coordinator saw lost while nobody disturbed them.
     """
@@ -98,7 +99,8 @@ class Group:
         self._coordinator.notices.clear()
 
     def pull_cable(self, machine: int) -> tuple[float, float]:
-        """Pull a machine's cable until it is lost, then plug it in; return the times to see either, ms."""
+        """Pull a machine's cable until it is lost, then plug it in; return the times to see either,
+        ms."""
         lost_ms = self._seen(machine, False, lambda: self.lab.unplug(machine))
         return lost_ms, self._seen(machine, True, lambda: self.lab.plug(machine))
 
@@ -114,7 +116,10 @@ class Group:
         )
         if notice is None:
             what = "back" if is_there else "lost"
-            raise Failure(f"{self.who}: machine {machine} of {self.racks} is not seen {what} within {REACT_S:g} s")
+            raise Failure(
+                f"{self.who}: machine {machine} of {self.racks} is not seen {what} within"
+                f" {REACT_S:g} s"
+            )
         return float(notice["ns"] - start_ns) * 1e-6
 
 
@@ -124,8 +129,15 @@ class _Member:
     def __init__(self, lab: Lab, task: LanTask) -> None:
         self._name = f"{task.who}, machine {task.place.machine}"
         self._errors = TemporaryFile()  # noqa: SIM115  # closed when the process ends
-        argv = [sys.executable, "-m", "rack.tools.lab.benches.lan_machine", json.dumps(asdict(task))]
-        self.process = lab.popen(task.place.machine, argv, stdin=PIPE, stdout=PIPE, stderr=self._errors)
+        argv = [
+            sys.executable,
+            "-m",
+            "rack.tools.lab.benches.lan_machine",
+            json.dumps(asdict(task)),
+        ]
+        self.process = lab.popen(
+            task.place.machine, argv, stdin=PIPE, stdout=PIPE, stderr=self._errors
+        )
         self._unread = b""
         self.notices: list[dict[str, Any]] = []
 
@@ -143,7 +155,9 @@ class _Member:
             self.notices.append(document)
         raise Failure(f"{self._name}: no answer within {bound_s:g} s")
 
-    def await_notice(self, is_it: Callable[[dict[str, Any]], bool], bound_s: float) -> dict[str, Any] | None:
+    def await_notice(
+        self, is_it: Callable[[dict[str, Any]], bool], bound_s: float
+    ) -> dict[str, Any] | None:
         """Return the first notice that fits; None if there is none in time. Others are kept."""
         for document in self._documents(bound_s):
             if is_it(document):
@@ -166,7 +180,9 @@ class _Member:
                 self._unread += more
             else:
                 self._errors.seek(0)
-                said = self._errors.read().decode(errors="replace").strip().splitlines() or ["it says nothing"]
+                said = self._errors.read().decode(errors="replace").strip().splitlines() or [
+                    "it says nothing"
+                ]
                 raise Failure(f"{self._name}: ended: {said[-1]}")
 
     def end(self) -> None:

@@ -1,4 +1,5 @@
-"""An end on the link of a rack's network adapter, with its envelopes, its seals and its access control."""
+"""An end on the link of a rack's network adapter, with its envelopes, its seals and its access
+control."""
 
 from __future__ import annotations
 
@@ -10,7 +11,16 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, out_key
 from rack.boards.lan.link import Arrived, LanLink
-from rack.tools.lab.benches.lan_ends import COORDINATOR, LEASE_MS, PORT, UNREAD, LanPlace, Notice, Take, rack_name
+from rack.tools.lab.benches.lan_ends import (
+    COORDINATOR,
+    LEASE_MS,
+    PORT,
+    UNREAD,
+    LanPlace,
+    Notice,
+    Take,
+    rack_name,
+)
 
 
 class RackEnd:
@@ -46,7 +56,12 @@ class RackEnd:
         """Seal and send a message to a machine."""
         self._number += 1
         key, put = self._puts[to]
-        put(content, self._link.sealer.seal(key, Envelope(0, 0, self._number, self._number, 0, 0, 0), content))
+        put(
+            content,
+            self._link.sealer.seal(
+                key, Envelope(0, 0, self._number, self._number, 0, 0, 0), content
+            ),
+        )
 
     def taken(self) -> Iterator[tuple[int, bytes]]:
         """Yield what has come since the last call."""
@@ -66,7 +81,8 @@ def _table(place: LanPlace) -> LanTable:
     """Return what would stand in the config of this rack."""
     others = {rack_name(other): other for other in place.others}
     imported = {
-        name: {"from": f"{name}/{_mailbox(place.machine)}", "type": "none:NONE", "max_age_ms": 1000} for name in others
+        name: {"from": f"{name}/{_mailbox(place.machine)}", "type": "none:NONE", "max_age_ms": 1000}
+        for name in others
     }
     endpoint = f"{'tls' if place.certificates else 'tcp'}/{place.addresses[COORDINATOR]}:{PORT}"
     table = {

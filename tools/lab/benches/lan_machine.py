@@ -1,7 +1,9 @@
-"""What runs on each machine of `rack bench lan`: one end, which exchanges messages at a rate and measures.
+"""What runs on each machine of `rack bench lan`: one end, which exchanges messages at a rate and
+measures.
 
-It is started with one line of JSON, a `LanTask`, says when it sees those that it exchanges messages with, and then
-takes a `LanWindow` a line, until it is killed. In a window each machine has a grid of its own phase, as racks have.
+It is started with one line of JSON, a `LanTask`, says when it sees those that it exchanges messages
+with, and then takes a `LanWindow` a line, until it is killed. In a window each machine has a grid
+of its own phase, as racks have.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ _HEAD = Struct("<qq")
 
 @dataclass(frozen=True)
 class LanTask:
-    """What one process is to do. `echoes`: answer, or count answers, at once; else take messages in cycles."""
+    """What one process is to do. `echoes`: answer, or count answers, at once; else take messages in
+    cycles."""
 
     who: str
     place: LanPlace
@@ -64,7 +67,8 @@ class LanWindow:
 
 @dataclass
 class LanFound:
-    """What one machine has found in a window: ages or round trips, us; messages that never came; its processor time."""
+    """What one machine has found in a window: ages or round trips, us; messages that never came;
+    its processor time."""
 
     us: list[float] = field(default_factory=list)
     missing: int = 0
@@ -85,7 +89,11 @@ class Machine:
         self._sent = 0
         module, _, name = ENDS[task.who].partition(":")
         kind: type[End] = getattr(import_module(module), name)
-        take = (self._count if task.place.machine == COORDINATOR else self._answer) if task.echoes else None
+        take = (
+            (self._count if task.place.machine == COORDINATOR else self._answer)
+            if task.echoes
+            else None
+        )
         self._size = ORDER_BYTES if task.place.machine == COORDINATOR else STATUS_BYTES
         self._end = kind(task.place, self._notice, take)
 
@@ -93,7 +101,9 @@ class Machine:
         """Wait until all others are there. Raises `TimeoutError`."""
         if not self._all_there.wait(FIND_S):
             missing = sorted(set(self._place.others) - self._seen)
-            raise TimeoutError(f"machine {self._place.machine}: {missing} not found within {FIND_S:g} s")
+            raise TimeoutError(
+                f"machine {self._place.machine}: {missing} not found within {FIND_S:g} s"
+            )
 
     def _notice(self, machine: int, is_there: bool) -> None:
         """Note that another machine has come or gone; the coordinator says so."""
@@ -116,7 +126,8 @@ class Machine:
         return found
 
     def _cycle(self, window: LanWindow) -> LanFound:
-        """Take in each cycle what has come, and send: ages are those of messages when a cycle takes them."""
+        """Take in each cycle what has come, and send: ages are those of messages when a cycle takes
+        them."""
         found = LanFound()
         # The coordinator at 0, the others spread over its period.
         shift = self._place.machine * window.period_ns // len(self._place.addresses)
@@ -141,7 +152,9 @@ class Machine:
         self._answered.clear()
         for cycle in _grid(window, 0):
             for machine in self._place.others:
-                self._end.send(machine, _HEAD.pack(cycle, time.monotonic_ns()).ljust(self._size, b"\0"))
+                self._end.send(
+                    machine, _HEAD.pack(cycle, time.monotonic_ns()).ljust(self._size, b"\0")
+                )
         self._answered.wait(ANSWER_S)
         return LanFound(list(self._round_trips), self._awaited - len(self._round_trips))
 
@@ -175,7 +188,8 @@ def main() -> None:
     """Run the task of the command line."""
     die_with_parent(os.getppid())
     task = LanTask.read(sys.argv[1])
-    # Before the end starts its threads, which have core and priority of this one: as on a rack's adapter board.
+    # Before the end starts its threads, which have core and priority of this one: as on a rack's
+    # adapter board.
     cores = sorted(os.sched_getaffinity(0))
     pin(cores[task.place.machine % len(cores)])
     set_priority(task.priority)

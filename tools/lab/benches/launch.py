@@ -1,4 +1,5 @@
-"""Measures what a user waits for: a launch, short commands, and a rack's reaction to a board that is killed."""
+"""Measures what a user waits for: a launch, short commands, and a rack's reaction to a board that
+is killed."""
 
 from __future__ import annotations
 
@@ -43,11 +44,14 @@ class LaunchCounts(NamedTuple):
     kills: int
 
 
-def measure(name: str, counts: LaunchCounts, against: Path | None, share: bool, progress: Progress) -> Comparison:
-    """Return how long launches, commands and reactions to kills take; `against` is another checkout, launched by turns.
+def measure(
+    name: str, counts: LaunchCounts, against: Path | None, share: bool, progress: Progress
+) -> Comparison:
+    """Return how long launches, commands and reactions to kills take; `against` is another
+    checkout, launched by turns.
 
-    With `share`, racks run even on cores that another one holds. Raises `Failure` if a command fails, or a kill has no
-    reaction.
+    With `share`, racks run even on cores that another one holds. Raises `Failure` if a command
+    fails, or a kill has no reaction.
     """
     rounds, kills = counts
     progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
@@ -61,11 +65,14 @@ def measure(name: str, counts: LaunchCounts, against: Path | None, share: bool, 
     baselines = dict.fromkeys(cases, INTERPRETER)
     if against is not None:
         baselines[LAUNCH] = trees[-1].name
-    return Comparison("launch", "launches, short commands, and reactions to a kill", tuple(samples), baselines)
+    return Comparison(
+        "launch", "launches, short commands, and reactions to a kill", tuple(samples), baselines
+    )
 
 
 class ShortRuns(NamedTuple):
-    """Runs of a config of which only the beginning counts: in subfolders of `folder`; on the cores of others if so."""
+    """Runs of a config of which only the beginning counts: in subfolders of `folder`; on the cores
+    of others if so."""
 
     folder: Path
     share: bool = False
@@ -82,7 +89,18 @@ class ShortRuns(NamedTuple):
         # A checkout of before the namespace does not know the option, and never refuses.
         options = ["--share"] if self.share and rack.package else []
         name = ("--set", f"name=bench-run-{os.getpid()}")
-        rack.run("run", config, *name, *options, "--seconds", RUN_S, "--out", out, "--json", bound_s=BOUND_S)
+        rack.run(
+            "run",
+            config,
+            *name,
+            *options,
+            "--seconds",
+            RUN_S,
+            "--out",
+            out,
+            "--json",
+            bound_s=BOUND_S,
+        )
         return out
 
 
@@ -104,7 +122,8 @@ def _samples(name: str, trees: list[RackCommand], runs: ShortRuns, rounds: int) 
     for case, arguments in commands.items():
         contestants[case, own.name] = partial(_command_s, own, arguments)
         contestants[case, INTERPRETER] = partial(_command_s, python, ())
-    # Its boards are up and wait for the clock: `list` and `status` have a rack to show, which takes no core.
+    # Its boards are up and wait for the clock: `list` and `status` have a rack to show, which takes
+    # no core.
     with Rack(idle):
         times = interleaved(contestants, rounds)
     for (case, who), found in times.items():
@@ -118,7 +137,8 @@ def fastest(config: RackConfig) -> str:
 
 
 def first_cycle_ns(run: Path, task: str) -> int:
-    """Return when the first recorded cycle of a task started, CLOCK_MONOTONIC, ns. Raises `Failure` without any.
+    """Return when the first recorded cycle of a task started, CLOCK_MONOTONIC, ns. Raises `Failure`
+    without any.
 
     It reads the file itself: that of another checkout may have other columns.
     """

@@ -1,9 +1,10 @@
-"""A realtime thread of LinuxCNC on the same grid: its HAL component `timedelta` measures the time from run to run, and
-`sampler` hands every value to us.
+"""A realtime thread of LinuxCNC on the same grid: its HAL component `timedelta` measures the time
+from run to run, and `sampler` hands every value to us.
 
-An interval has no grid point, so the grid is taken from the thread's earliest run: its lateness is too low by that of
-its best wake. On a kernel without PREEMPT_RT, or without `iopl`, LinuxCNC leaves its threads under ordinary scheduling;
-the bench then gives this one the priority of the others, and its core in any case.
+An interval has no grid point, so the grid is taken from the thread's earliest run: its lateness is
+too low by that of its best wake. On a kernel without PREEMPT_RT, or without `iopl`, LinuxCNC leaves
+its threads under ordinary scheduling; the bench then gives this one the priority of the others, and
+its core in any case.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ def absent_linuxcnc() -> Absent | None:
 
 
 def linuxcnc(grid: WakeGrid) -> np.ndarray:
-    """Return the lateness of every run of the thread, us, shape (n,). Raises `Failure` if LinuxCNC does not run it."""
+    """Return the lateness of every run of the thread, us, shape (n,). Raises `Failure` if LinuxCNC
+    does not run it."""
     others = _threads()
     with TemporaryDirectory(prefix="rack-bench-") as folder, _hal(Path(folder)) as hal:
         assert hal.stdin is not None
@@ -73,18 +75,27 @@ def linuxcnc(grid: WakeGrid) -> np.ndarray:
 
 
 def lateness_us(intervals_ns: np.ndarray, period_ns: int) -> np.ndarray:
-    """Return how late each run came after the earliest one's grid, us, shape (n,), from the time since the last run."""
+    """Return how late each run came after the earliest one's grid, us, shape (n,), from the time
+    since the last run."""
     late_ns = np.cumsum(intervals_ns - period_ns)
     return np.asarray((late_ns - late_ns.min()) * 1e-3)
 
 
 @contextmanager
 def _hal(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Give a LinuxCNC that takes HAL commands on stdin; nothing of it is left when the context ends."""
+    """Give a LinuxCNC that takes HAL commands on stdin; nothing of it is left when the context
+    ends."""
     pipe = subprocess.PIPE
     environment = _environment(folder)
     hal = subprocess.Popen(
-        [PROGRAM], cwd=folder, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        [PROGRAM],
+        cwd=folder,
+        env=environment,
+        stdin=pipe,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        start_new_session=True,
     )
     try:
         yield hal
@@ -92,10 +103,19 @@ def _hal(folder: Path) -> Iterator[subprocess.Popen[str]]:
         if hal.poll() is None:
             os.killpg(hal.pid, signal.SIGKILL)
             hal.wait()
-            # Its realtime process is a daemon: it outlives its command line, and keeps the pipes open.
+            # Its realtime process is a daemon: it outlives its command line, and keeps the pipes
+            # open.
             end = [PROGRAM, "-U"]
             none = subprocess.DEVNULL
-            subprocess.run(end, cwd=folder, env=environment, stdout=none, stderr=none, timeout=END_S, check=False)
+            subprocess.run(
+                end,
+                cwd=folder,
+                env=environment,
+                stdout=none,
+                stderr=none,
+                timeout=END_S,
+                check=False,
+            )
         for stream in (hal.stdin, hal.stdout, hal.stderr):
             if stream is not None:
                 with suppress(BrokenPipeError):
@@ -103,10 +123,15 @@ def _hal(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return an environment in which LinuxCNC runs in a folder of its own, and as root as another user."""
+    """Return an environment in which LinuxCNC runs in a folder of its own, and as root as another
+    user."""
     folder.chmod(0o777)
     nobody = {} if os.getuid() else {"RTAPI_UID": str(pwd.getpwnam("nobody").pw_uid)}
-    own = {"HOME": str(folder), "RTAPI_FIFO_PATH": str(folder / "fifo"), "LINUXCNC_FORCE_REALTIME": "1"}
+    own = {
+        "HOME": str(folder),
+        "RTAPI_FIFO_PATH": str(folder / "fifo"),
+        "LINUXCNC_FORCE_REALTIME": "1",
+    }
     return {**os.environ, **own, **nobody}
 
 

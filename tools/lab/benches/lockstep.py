@@ -1,7 +1,9 @@
-"""How fast racks run in lockstep: next to the same levels in one process without a rack, and to another checkout.
+"""How fast racks run in lockstep: next to the same levels in one process without a rack, and to
+another checkout.
 
-The limit is honest only if it is the same work: once, its last messages and their numbers are compared with those of a
-recorded run. It counts processor time, which nothing else on the machine prolongs.
+The limit is honest only if it is the same work: once, its last messages and their numbers are
+compared with those of a recorded run. It counts processor time, which nothing else on the machine
+prolongs.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ class LockstepSpeeds:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        speeds = [{"rack": rack, "who": who, "value": value} for (rack, who), value in self.speeds.items()]
+        speeds = [
+            {"rack": rack, "who": who, "value": value} for (rack, who), value in self.speeds.items()
+        ]
         return {**self.comparison.document(), "simulated_seconds_a_second": speeds}
 
     def lines(self, width: int | None = None) -> Iterator[str]:
@@ -56,7 +60,13 @@ class LockstepSpeeds:
         who = list(dict.fromkeys(who for _, who in self.speeds))
         racks = list(dict.fromkeys(rack for rack, _ in self.speeds))
         rows = [
-            [rack, *(shown(self.speeds[rack, one]) if (rack, one) in self.speeds else "-" for one in who)]
+            [
+                rack,
+                *(
+                    shown(self.speeds[rack, one]) if (rack, one) in self.speeds else "-"
+                    for one in who
+                ),
+            ]
             for rack in racks
         ]
         yield "Simulated seconds a second in lockstep"
@@ -69,8 +79,11 @@ class LockstepSpeeds:
         return self.comparison.plot(folder)
 
 
-def measure(against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress) -> LockstepSpeeds:
-    """Run every rack, its levels without a rack, and another checkout's, by turns; times in ms a simulated second.
+def measure(
+    against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress
+) -> LockstepSpeeds:
+    """Run every rack, its levels without a rack, and another checkout's, by turns; times in ms a
+    simulated second.
 
     Raises `Failure` if a run fails, or if the levels without a rack did other work.
     """
@@ -93,7 +106,8 @@ def measure(against: Path | None, racks: Mapping[str, float | None], rounds: int
 
 
 def speeds(found: Mapping[tuple[str, str], list[float]], names: list[str]) -> LockstepSpeeds:
-    """Return the speeds from the times of runs, ms a simulated second; the last of two `names` is compared with."""
+    """Return the speeds from the times of runs, ms a simulated second; the last of two `names` is
+    compared with."""
     samples: list[Sample] = []
     baselines: dict[str, str] = {}
     for rack in dict.fromkeys(rack for rack, _ in found):
@@ -117,7 +131,9 @@ def _rack(case: str) -> str:
 
 
 def _run(command: RackCommand, rack: str, seconds: float | None) -> float:
-    document = json.loads(command.run(*_arguments(rack, seconds), "--no-record", "--json", bound_s=BOUND_S))
+    document = json.loads(
+        command.run(*_arguments(rack, seconds), "--no-record", "--json", bound_s=BOUND_S)
+    )
     return _ms_a_second(rack, document["outcome"]["ticks"], document["wall_s"])
 
 
@@ -140,20 +156,25 @@ def _bare(rack: str, ticks: int) -> BareRun:
 
 
 def _check(rack: str, seconds: float | None, folder: Path) -> int:
-    """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran for."""
+    """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
+    for."""
     this_rack().run(*_arguments(rack, seconds), "--out", str(folder), bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])
     differing = list(differences(recording, _bare(rack, ticks)))
     if differing:
-        raise Failure(f"{rack}: its levels without a rack did other work, first seen in {differing[0]}")
+        raise Failure(
+            f"{rack}: its levels without a rack did other work, first seen in {differing[0]}"
+        )
     return ticks
 
 
 def differences(recording: Recording, bare: BareRun) -> Iterator[str]:
-    """Yield every mailbox, or field of a message, in which a recorded run and its levels alone differ.
+    """Yield every mailbox, or field of a message, in which a recorded run and its levels alone
+    differ.
 
-    The message of each mailbox is the newest that was visible before the end. A later one need not be recorded.
+    The message of each mailbox is the newest that was visible before the end. A later one need not
+    be recorded.
     """
     for name in sorted({*recording.mailboxes, *bare.serials}):
         seen = np.flatnonzero(recording.signal(name, "visible_at") < bare.ticks)
@@ -163,7 +184,9 @@ def differences(recording: Recording, bare: BareRun) -> Iterator[str]:
         elif serial is not None:
             last = bare.last[name]
             for field in sorted(recording.fields(name) & set(last.dtype.names or ())):
-                if not np.array_equal(_plain(recording.signal(name, field)[seen[-1]]), _plain(last[field])):
+                if not np.array_equal(
+                    _plain(recording.signal(name, field)[seen[-1]]), _plain(last[field])
+                ):
                     yield f"{name}, field {field}"
 
 

@@ -1,8 +1,8 @@
 """A message, written and read: every protocol of ours next to other ways of the same machine.
 
-Each turn numbers a message, sends it, and lets every reader receive it into fields of its own. Filling and taking the
-fields costs every contestant the same, and is left out. All happens in one process: what is compared is the work, not
-the wake-up of another process.
+Each turn numbers a message, sends it, and lets every reader receive it into fields of its own.
+Filling and taking the fields costs every contestant the same, and is left out. All happens in one
+process: what is compared is the work, not the wake-up of another process.
 """
 
 from __future__ import annotations
@@ -26,14 +26,21 @@ from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.comparison import Absent, Comparison, Sample, absent_package, interleaved
+from rack.tools.lab.benches.comparison import (
+    Absent,
+    Comparison,
+    Sample,
+    absent_package,
+    interleaved,
+)
 from rack.tools.lab.benches.transports import PEERS, REFERENCES, Peer, Transport
 
 SIZES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
 """Bytes of a message: a serial, and three arrays of numbers."""
 READERS = (1, 4)
 BATCH_S = 0.001
-"""About how long one measurement takes: many exchanges, and their mean. Short: most end without an interruption."""
+"""About how long one measurement takes: many exchanges, and their mean. Short: most end without an
+interruption."""
 CASE_S = 5.0
 """About how long a case takes."""
 MESSAGE = command(
@@ -67,7 +74,8 @@ CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
 
 
 def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
-    """Measure every contestant that is installed in every case; the baseline of a case is its best peer."""
+    """Measure every contestant that is installed in every case; the baseline of a case is its best
+    peer."""
     missing = {peer.name: absent_package(peer.name, peer.module) for peer in (*REFERENCES, *PEERS)}
     present = [peer for peer in (*REFERENCES, *PEERS) if missing[peer.name] is None]
     progress.total(CASE_S * len(cases))
@@ -85,7 +93,9 @@ def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison
     peers = {peer.name for peer in PEERS}
     best: dict[str, Sample] = {}
     for sample in samples:
-        if sample.who in peers and (sample.case not in best or sample.median < best[sample.case].median):
+        if sample.who in peers and (
+            sample.case not in best or sample.median < best[sample.case].median
+        ):
             best[sample.case] = sample
     baselines = {case: sample.who for case, sample in best.items()}
     title = "A message written and read; ratio to the best peer of the case"
@@ -95,15 +105,23 @@ def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison
 def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:
     dtype = MESSAGE.dtype(case.lengths)
     with ExitStack() as stack:
-        transports: dict[str, Transport] = {p: stack.enter_context(_mailbox(p, case)) for p in PROTOCOLS}
-        transports |= {peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers}
-        turns = {name: Exchange(name, transport, case.lengths).batch() for name, transport in transports.items()}
+        transports: dict[str, Transport] = {
+            p: stack.enter_context(_mailbox(p, case)) for p in PROTOCOLS
+        }
+        transports |= {
+            peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers
+        }
+        turns = {
+            name: Exchange(name, transport, case.lengths).batch()
+            for name, transport in transports.items()
+        }
         found = interleaved(turns, rounds)
     return [Sample(case.name, name, tuple(values), "us") for name, values in found.items()]
 
 
 class Exchange:
-    """One message after another through a transport. Raises `Failure` if a reader receives another message."""
+    """One message after another through a transport. Raises `Failure` if a reader receives another
+    message."""
 
     def __init__(self, name: str, transport: Transport, lengths: dict[str, int]) -> None:
         self._name = name
@@ -157,7 +175,10 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
         semaphores.create(layout)
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
-        readers = [_reading(open_reader(segment, box.name, inbox=open_inbox(segment, task))) for task in box.readers]
+        readers = [
+            _reading(open_reader(segment, box.name, inbox=open_inbox(segment, task)))
+            for task in box.readers
+        ]
     # Open, it needs no name: nothing is left even if this process is killed.
     yield Transport(writer.message, writer.write, readers)
 
@@ -174,9 +195,13 @@ def _reading(reader: Reader) -> Callable[[int], Message]:
 
 def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
     readers = tuple(f"reader{number}" for number in range(case.readers))
-    tasks = tuple(TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers)))
+    tasks = tuple(
+        TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers))
+    )
     # Each reader is alone with its inbox: every message is served before the next one is sent.
-    interrupt = InterruptSpec(1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:]))
+    interrupt = InterruptSpec(
+        1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:])
+    )
     box = MailboxSpec(
         name="writer.command",
         writer="writer",

@@ -1,8 +1,10 @@
-"""A lab of machines on one network: namespaces joined by a bridge, whose cables can be pulled and lose packets.
+"""A lab of machines on one network: namespaces joined by a bridge, whose cables can be pulled and
+lose packets.
 
-The bridge has a namespace of its own, so nothing of this machine's network changes, and no address can clash with its
-addresses. Packets get lost on the bridge, as on a wire: a machine's kernel would notice that it drops its own.
-Names carry the process that made the lab. What a killed one has left, the next lab removes.
+The bridge has a namespace of its own, so nothing of this machine's network changes, and no address
+can clash with its addresses. Packets get lost on the bridge, as on a wire: a machine's kernel would
+notice that it drops its own. Names carry the process that made the lab. What a killed one has left,
+the next lab removes.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ class Traffic(NamedTuple):
 
 
 class Lab:
-    """Machines 0 to `machines` - 1, each a network namespace. Raises `Failure` where a command for one fails."""
+    """Machines 0 to `machines` - 1, each a network namespace. Raises `Failure` where a command for
+    one fails."""
 
     def __init__(self, machines: int) -> None:
         if not 1 <= machines <= MOST_MACHINES:
@@ -65,7 +68,11 @@ class Lab:
             return "network namespaces need root"
         packages = {"ip": "iproute2", "nft": "nftables"}
         missing = next((program for program in packages if shutil.which(program) is None), None)
-        return f"no program '{missing}'; to install: apt-get install {packages[missing]}" if missing else ""
+        return (
+            f"no program '{missing}'; to install: apt-get install {packages[missing]}"
+            if missing
+            else ""
+        )
 
     def __enter__(self) -> Self:
         if why_not := self.is_possible():
@@ -83,14 +90,18 @@ class Lab:
 
     def _build(self) -> None:
         _ip([f"netns add {name}" for name in (self._hub, *self._names)])
-        # Neither asks who is there, nor takes an IPv6 address: all packets are those of the machines.
+        # Neither asks who is there, nor takes an IPv6 address: all packets are those of the
+        # machines.
         links = ["link add hub type bridge mcast_snooping 0", "link set hub addrgenmode none up"]
         for number, name in enumerate(self._names):
             links.append(f"link add {_cable(number)} type veth peer name {LINK} netns {name}")
             links.append(f"link set {_cable(number)} master hub addrgenmode none up")
         _ip(links, self._hub)
         for number, name in enumerate(self._names):
-            own = [f"address add {self.address(number)}/24 dev {LINK}", f"link set {LINK} addrgenmode none up"]
+            own = [
+                f"address add {self.address(number)}/24 dev {LINK}",
+                f"link set {LINK} addrgenmode none up",
+            ]
             _ip(["link set lo up", *own], name)
 
     def _close(self) -> None:
@@ -106,7 +117,8 @@ class Lab:
         return f"{NET}.{machine + 1}"
 
     def popen(self, machine: int, argv: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-        """Start a process on a machine; `options` are those of `Popen`. Should it be left at the end, it is ended."""
+        """Start a process on a machine; `options` are those of `Popen`. Should it be left at the
+        end, it is ended."""
         process = subprocess.Popen(["ip", "netns", "exec", self._names[machine], *argv], **options)
         self._started.append(process)
         return process
@@ -124,7 +136,13 @@ class Lab:
         ]
         chain = ["chain wire {", "type filter hook forward priority 0", *rules, "}"]
         # All at once: the rules before this are gone, these are in force.
-        script = ["table bridge loss", "delete table bridge loss", "table bridge loss {", *chain, "}"]
+        script = [
+            "table bridge loss",
+            "delete table bridge loss",
+            "table bridge loss {",
+            *chain,
+            "}",
+        ]
         _call(["ip", "netns", "exec", self._hub, "nft", "--file", "-"], script)
 
     def unplug(self, machine: int) -> None:
@@ -137,10 +155,18 @@ class Lab:
 
     def traffic(self) -> list[Traffic]:
         """Return what each machine has sent and received."""
-        links = {link["ifname"]: link["stats64"] for link in json.loads(_call(_SHOW.format(self._hub).split()))}
+        links = {
+            link["ifname"]: link["stats64"]
+            for link in json.loads(_call(_SHOW.format(self._hub).split()))
+        }
         # The bridge receives what the machine sends.
-        ways = [(stats["rx"], stats["tx"]) for stats in (links[_cable(number)] for number in range(len(self)))]
-        return [Traffic(out["bytes"], to["bytes"], out["packets"], to["packets"]) for out, to in ways]
+        ways = [
+            (stats["rx"], stats["tx"])
+            for stats in (links[_cable(number)] for number in range(len(self)))
+        ]
+        return [
+            Traffic(out["bytes"], to["bytes"], out["packets"], to["packets"]) for out, to in ways
+        ]
 
 
 _SHOW = "ip -netns {} -json -stats link show"
@@ -161,7 +187,9 @@ def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
     try:
         done = subprocess.run(argv, input=text, capture_output=True, text=True, timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
-        raise Failure(f"network lab: still running after {PATIENCE_S:g} s: {' '.join(argv)}") from None
+        raise Failure(
+            f"network lab: still running after {PATIENCE_S:g} s: {' '.join(argv)}"
+        ) from None
     if done.returncode:
         why = " ".join(done.stderr.split()) or f"exit status {done.returncode}"
         raise Failure(f"network lab: {' '.join(argv)}: {why}")
@@ -184,16 +212,23 @@ def _remove(names: Sequence[str]) -> None:
     _end(there)
     for name in there:
         # Another lab may have removed a stale one meanwhile.
-        subprocess.run(["ip", "netns", "delete", name], stderr=subprocess.DEVNULL, timeout=PATIENCE_S)
+        subprocess.run(
+            ["ip", "netns", "delete", name], stderr=subprocess.DEVNULL, timeout=PATIENCE_S
+        )
 
 
 def _end(names: Sequence[str]) -> None:
-    """End the processes in namespaces: those that started others first, which end these in order."""
+    """End the processes in namespaces: those that started others first, which end these in
+    order."""
     for how, patience_s in ENDING:
         deadline = time.monotonic() + patience_s
         struck = set[int]()
         while (inside := _inside(names)) and time.monotonic() < deadline:
-            roots = {pid for pid, parent in inside.items() if how is signal.SIGKILL or parent not in inside}
+            roots = {
+                pid
+                for pid, parent in inside.items()
+                if how is signal.SIGKILL or parent not in inside
+            }
             for pid in roots - struck:
                 with suppress(ProcessLookupError):
                     os.kill(pid, how)
@@ -213,7 +248,9 @@ def _inside(names: Sequence[str]) -> dict[int, int]:
     for path in Path("/proc").glob("[0-9]*") if spaces else ():
         try:
             if (path / "ns/net").stat().st_ino in spaces:
-                found[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+                found[int(path.name)] = int(
+                    (path / "stat").read_text().rpartition(")")[2].split()[1]
+                )
         except OSError:
             # It has ended, or is none of ours: not even root may look at every process.
             continue

@@ -1,4 +1,5 @@
-"""A rack run by a bench: recorded, or for its trace alone, when no recorder takes processor time."""
+"""A rack run by a bench: recorded, or for its trace alone, when no recorder takes processor
+time."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ SETTLE_NS = 250_000_000
 
 
 class Runs(NamedTuple):
-    """How a bench runs its contestants: how long, in how many turns, and whether on cores that another rack holds."""
+    """How a bench runs its contestants: how long, in how many turns, and whether on cores that
+    another rack holds."""
 
     seconds: float
     rounds: int
@@ -88,7 +90,8 @@ class Observed:
         return rows[rows["release_ns"] >= rows["release_ns"][0] + SETTLE_NS] if len(rows) else rows
 
     def cycles(self, task: str) -> CycleCount:
-        """Count the cycles of a task by the clock's grid: skipped ones leave no record. The last tick does not count.
+        """Count the cycles of a task by the clock's grid: skipped ones leave no record. The last
+        tick does not count.
 
         Its record may be written after the last reading.
         """
@@ -107,9 +110,11 @@ def observe(
     mailboxes: Sequence[str] = (),
     deeds: Sequence[Deed] = (),
 ) -> Observed:
-    """Run a rack for `seconds` of simulated time, or until its task ends, and read its rings on the host side.
+    """Run a rack for `seconds` of simulated time, or until its task ends, and read its rings on the
+    host side.
 
-    `deeds` are in the order of their ticks. `share` is as in `Rack`, which raises if another rack holds a core.
+    `deeds` are in the order of their ticks. `share` is as in `Rack`, which raises if another rack
+    holds a core.
     """
     with Rack(config, share=share) as rack:
         segment = rack.segment
@@ -129,7 +134,10 @@ def observe(
             for name, ring in rings.items():
                 drained[name].append(ring.drain())
         assert rack.outcome is not None, "the run is over"
-        rows = {name: np.concatenate([block.rows for block in blocks]) for name, blocks in drained.items()}
+        rows = {
+            name: np.concatenate([block.rows for block in blocks])
+            for name, blocks in drained.items()
+        }
         lost = {name: sum(block.lost for block in drained[name]) for name in tasks}
         layout = segment.layout
     traces = {name: rows[name] for name in tasks}

@@ -1,4 +1,5 @@
-"""Compares partitions of levels over processors: the same rack, run in real time in each, rounds interleaved."""
+"""Compares partitions of levels over processors: the same rack, run in real time in each, rounds
+interleaved."""
 
 from __future__ import annotations
 
@@ -14,7 +15,14 @@ from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.levels.timing.response_time import response_times
-from rack.levels.timing.trace_times import Distribution, counts, distribution, plan_ages, plans, residual_ns
+from rack.levels.timing.trace_times import (
+    Distribution,
+    counts,
+    distribution,
+    plan_ages,
+    plans,
+    residual_ns,
+)
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import figure, table
@@ -40,14 +48,17 @@ class Partition:
         return f"{self.coupling}, {self.cores} core{'s' if self.cores > 1 else ''}"
 
     def of(self, config: RackConfig) -> RackConfig:
-        """Return the rack in this partition, in real time. Raises `ConfigError` if the rack does not permit it.
+        """Return the rack in this partition, in real time. Raises `ConfigError` if the rack does
+        not permit it.
 
         A loose planner gets its own board on the next core; with only one core, on the same one.
         """
         taken = {board.slot for board in config.board.values()}
         free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
         boards = {name: self._board(board, free) for name, board in config.board.items()}
-        clock = config.clock.model_copy(update={"mode": "realtime", "core": config.clock.core % self.cores})
+        clock = config.clock.model_copy(
+            update={"mode": "realtime", "core": config.clock.core % self.cores}
+        )
         changed = config.model_copy(update={"board": boards, "clock": clock})
         # A copy is not validated: load and check it like a user's config.
         return resolve(loads(changed.text())).config
@@ -60,20 +71,25 @@ class Partition:
         if board.planner is not None and self.coupling == "loose":
             slot = next(free, None)
             if slot is None:
-                raise Failure(f"the crate has no slot left for every planner: slots go up to {LAST_SLOT}")
+                raise Failure(
+                    f"the crate has no slot left for every planner: slots go up to {LAST_SLOT}"
+                )
             changes |= {"planner_slot": slot, "planner_core": (core + 1) % self.cores}
         return board.model_copy(update=changes)
 
 
-PARTITIONS: tuple[Partition, ...] = tuple(Partition(c, n) for n in (1, 2) for c in ("tight", "loose"))
+PARTITIONS: tuple[Partition, ...] = tuple(
+    Partition(c, n) for n in (1, 2) for c in ("tight", "loose")
+)
 
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """One task over all runs of a partition: cycles (a planner's plans), misses, and the rest of its time slice.
+    """One task over all runs of a partition: cycles (a planner's plans), misses, and the rest of
+    its time slice.
 
-    `predicted_ms` is the worst-case response time by the config's budgets, None without a bound. `fits` says whether it
-    is within the time slice, None without a budget.
+    `predicted_ms` is the worst-case response time by the config's budgets, None without a bound.
+    `fits` says whether it is within the time slice, None without a budget.
     """
 
     slice_ms: float
@@ -87,7 +103,8 @@ class TaskFigures:
 
 @dataclass(frozen=True)
 class LevelFigures:
-    """One level in one partition. `plan_age_ms` is the age of the plans that its executor could read."""
+    """One level in one partition. `plan_age_ms` is the age of the plans that its executor could
+    read."""
 
     level: str
     executor: TaskFigures
@@ -104,7 +121,8 @@ class PartitionFigures:
 
 
 def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[PartitionFigures]:
-    """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return the figures."""
+    """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return the
+    figures."""
     config = load(name, [f"name=bench-{os.getpid()}"])
     racks = {partition: partition.of(config) for partition in PARTITIONS}
     progress.total(len(racks) * rounds * (seconds + LAUNCH_S))
@@ -113,19 +131,27 @@ def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[
         for turn in range(rounds):
             for number, (partition, rack) in enumerate(racks.items()):
                 progress.begin(f"{partition.name}, run {turn + 1} of {rounds}")
-                runs[partition].append(record(rack, seconds, Path(folder) / f"{number}-{turn}").recording)
+                runs[partition].append(
+                    record(rack, seconds, Path(folder) / f"{number}-{turn}").recording
+                )
                 progress.end(seconds + LAUNCH_S)
         return [_figures(partition, racks[partition], found) for partition, found in runs.items()]
 
 
-def _figures(partition: Partition, config: RackConfig, runs: Sequence[Recording]) -> PartitionFigures:
+def _figures(
+    partition: Partition, config: RackConfig, runs: Sequence[Recording]
+) -> PartitionFigures:
     layout = wire(config)
     rack = rack_timing(config, layout)
     responses = response_times(rack.tasks, rack.context_switch_ns)
-    return PartitionFigures(partition.name, tuple(_level(name, layout, responses, runs) for name in config.board))
+    return PartitionFigures(
+        partition.name, tuple(_level(name, layout, responses, runs) for name in config.board)
+    )
 
 
-def _level(board: str, layout: Layout, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> LevelFigures:
+def _level(
+    board: str, layout: Layout, responses: Mapping[str, int | None], runs: Sequence[Recording]
+) -> LevelFigures:
     tasks = {task.name: task for task in layout.tasks}
     planner = tasks.get(f"{board}.planner")
     plan = f"{board}.plan"
@@ -144,9 +170,12 @@ def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarra
     return plan_ages(run.cycles[board]["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
 
 
-def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]) -> TaskFigures:
+def _task(
+    task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]
+) -> TaskFigures:
     cycles = np.concatenate([run.trace(task.name) for run in runs])
-    # Releases without a plan are traced only if they were late; of them only the skipped releases count.
+    # Releases without a plan are traced only if they were late; of them only the skipped releases
+    # count.
     _, skipped = counts(cycles)
     cycles = plans(cycles) if task.role == "planner" else cycles
     missed, _ = counts(cycles)
@@ -159,34 +188,68 @@ def _task(task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], run
         skipped=skipped,
         residual_ms=distribution(residual_ns(cycles, slice_ns) * 1e-6),
         predicted_ms=None if predicted_ns is None else predicted_ns * 1e-6,
-        fits=predicted_ns is not None and predicted_ns <= slice_ns if task.name in responses else None,
+        fits=predicted_ns is not None and predicted_ns <= slice_ns
+        if task.name in responses
+        else None,
     )
 
 
 def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Iterator[str]:
-    """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages; times in ms."""
+    """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages;
+    times in ms."""
     levels = [(one.partition, level) for one in found for level in one.levels]
     planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
     yield "executors: predicted worst-case response, and residual, ms"
-    head = ["partition", "level", "cycle", "predicted", "cycles", "missed", "skipped", "residual p50", "residual min"]
-    yield from table(head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50"))
+    head = [
+        "partition",
+        "level",
+        "cycle",
+        "predicted",
+        "cycles",
+        "missed",
+        "skipped",
+        "residual p50",
+        "residual min",
+    ]
+    yield from table(
+        head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50")
+    )
     yield ""
     yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
-    head = ["partition", "level", "slice", "predicted", "plans", "late", "residual p50", "residual min"]
+    head = [
+        "partition",
+        "level",
+        "slice",
+        "predicted",
+        "plans",
+        "late",
+        "residual p50",
+        "residual min",
+    ]
     yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
 
 
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:
     executor = level.executor
     counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
-    return [partition, level.level, *_prediction(executor), *counts, *_cells(executor.residual_ms, "p50", "min")]
+    return [
+        partition,
+        level.level,
+        *_prediction(executor),
+        *counts,
+        *_cells(executor.residual_ms, "p50", "min"),
+    ]
 
 
 def _planner_row(partition: str, level: LevelFigures) -> list[str]:
     planner = level.planner
     assert planner is not None, "levels without a planner have no such row"
     row = [partition, level.level, *_prediction(planner), str(planner.cycles), str(planner.missed)]
-    return [*row, *_cells(planner.residual_ms, "p50", "min"), *_cells(level.plan_age_ms, "p50", "max")]
+    return [
+        *row,
+        *_cells(planner.residual_ms, "p50", "min"),
+        *_cells(level.plan_age_ms, "p50", "max"),
+    ]
 
 
 def _prediction(task: TaskFigures) -> list[str]:

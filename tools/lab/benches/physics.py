@@ -1,7 +1,8 @@
-"""The physics of a recorded run alone: bare `mj_step` calls with the torques that the servo level gave.
+"""The physics of a recorded run alone: bare `mj_step` calls with the torques that the servo level
+gave.
 
-They are the part of a servo cycle that no controller can leave out, so the cycle is compared with them. The replay must
-end in the recorded state, bit for bit: otherwise it was other work.
+They are the part of a servo cycle that no controller can leave out, so the cycle is compared with
+them. The replay must end in the recorded state, bit for bit: otherwise it was other work.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ SERVO = "servo"
 
 
 class ReplayPace(NamedTuple):
-    """How a replay runs: a tick every `period_ns` on `core` at a real-time `priority`; all 0: tick after tick."""
+    """How a replay runs: a tick every `period_ns` on `core` at a real-time `priority`; all 0: tick
+    after tick."""
 
     period_ns: int = 0
     core: int = 0
@@ -37,8 +39,8 @@ class ReplayPace(NamedTuple):
 class Replay:
     """The longest stretch of a recorded run in which motors, not brakes, moved the arm.
 
-    `start` and `end` are MuJoCo's states before and after it; `controls` are the actuators' inputs by tick, shape
-    (ticks, nu).
+    `start` and `end` are MuJoCo's states before and after it; `controls` are the actuators' inputs
+    by tick, shape (ticks, nu).
     """
 
     cell: Cell
@@ -51,7 +53,8 @@ class Replay:
 
     @classmethod
     def of(cls, recording: Recording) -> Replay:
-        """Take it from a recording without missed cycles. Raises `Failure` if the arm never moved in it."""
+        """Take it from a recording without missed cycles. Raises `Failure` if the arm never moved
+        in it."""
         config = recording.rack_config
         assert config.robot is not None, "the rack has an arm"
         cell = build_cell(config.robot, config.scene, config.clock_ns)
@@ -64,7 +67,13 @@ class Replay:
         controls[:, cell.actuators] = recording.signal(status, "torque")[given]
         if cell.gripper_actuator is not None:
             controls[:, cell.gripper_actuator] = recording.signal(status, "grip_force")[given]
-        states = dict(zip(recording.signal(state, "tick").tolist(), recording.signal(state, "state"), strict=True))
+        states = dict(
+            zip(
+                recording.signal(state, "tick").tolist(),
+                recording.signal(state, "state"),
+                strict=True,
+            )
+        )
         substeps = round(config.clock_ns * 1e-9 / cell.model.opt.timestep)
         return cls(cell, substeps, config.clock_ns, first, states[first], states[last], controls)
 
@@ -96,20 +105,27 @@ class Replay:
     def _check(self, data: mujoco.MjData) -> None:
         recorded = mujoco.MjData(self.cell.model)
         mujoco.mj_setState(self.cell.model, recorded, self.end, STATE)
-        if not (np.array_equal(data.qpos, recorded.qpos) and np.array_equal(data.qvel, recorded.qvel)):
-            raise Failure("the replayed physics do not end in the recorded state: they are not what the servo ran")
+        if not (
+            np.array_equal(data.qpos, recorded.qpos) and np.array_equal(data.qvel, recorded.qvel)
+        ):
+            raise Failure(
+                "the replayed physics do not end in the recorded state: they are not what the"
+                " servo ran"
+            )
 
 
 def replay(folder: Path, pace: ReplayPace, ticks: int) -> list[float]:
     """Replay at most so many ticks of a recorded run; return the processor time of each, us.
 
-    To be called by `apart`: only in the environment of boards are the physics theirs. Raises `Failure` as `Replay`.
+    To be called by `apart`: only in the environment of boards are the physics theirs. Raises
+    `Failure` as `Replay`.
     """
     return Replay.of(Recording(folder)).run(pace, ticks)
 
 
 def _stretch(recording: Recording) -> tuple[int, int]:
-    """Return first and last tick of the longest stretch without brakes; states are recorded at both."""
+    """Return first and last tick of the longest stretch without brakes; states are recorded at
+    both."""
     status = f"{SERVO}.status"
     ticks = recording.signal(status, "tick")
     braked = recording.signal(status, "braked")
@@ -128,7 +144,9 @@ def _stretch(recording: Recording) -> tuple[int, int]:
         if begun >= 0 and tick in known and tick - begun > best[1] - best[0]:
             best = begun, tick
     if best[0] == best[1]:
-        raise Failure("the arm did not move in the recorded run: no physics to replay; run it for longer")
+        raise Failure(
+            "the arm did not move in the recorded run: no physics to replay; run it for longer"
+        )
     return best
 
 

@@ -1,8 +1,10 @@
-"""The highest servo rate that a rack holds on this machine, by the deadlines that `cyclictest` keeps there.
+"""The highest servo rate that a rack holds on this machine, by the deadlines that `cyclictest`
+keeps there.
 
-Only the servo level changes: the clock follows its rate, and every other board gets the cycle that is closest to its
-own. A machine that takes the core away for a cycle breaks deadlines that no program could keep: what `cyclictest` shows
-late by a cycle, at that rate on that core in the same minutes, does not count against the rack.
+Only the servo level changes: the clock follows its rate, and every other board gets the cycle that
+is closest to its own. A machine that takes the core away for a cycle breaks deadlines that no
+program could keep: what `cyclictest` shows late by a cycle, at that rate on that core in the same
+minutes, does not count against the rack.
 """
 
 from __future__ import annotations
@@ -45,32 +47,47 @@ Late = np.ndarray | None
 
 
 def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
-    """Return a rack whose fastest board cycles at `rate_hz`, at every tick; the others keep their cycles, in ms.
+    """Return a rack whose fastest board cycles at `rate_hz`, at every tick; the others keep their
+    cycles, in ms.
 
-    A plan of that board still takes as long. Raises `Failure` for a rack that has no board at every tick.
+    A plan of that board still takes as long. Raises `Failure` for a rack that has no board at every
+    tick.
     """
     fastest = [name for name in config.board if config.every(name) == 1]
     if not fastest:
-        raise Failure(f"rack '{config.name}': no board cycles at every tick of its clock, so none has a rate to raise")
+        raise Failure(
+            f"rack '{config.name}': no board cycles at every tick of its clock, so none has a rate"
+            " to raise"
+        )
     period_ms = 1e3 / rate_hz
     scale = config.clock.period_ms / period_ms
     boards = {}
     for name, board in config.board.items():
-        changes: dict[str, Any] = {"rate_hz": None, "every": max(1, round(config.every(name) * scale))}
+        changes: dict[str, Any] = {
+            "rate_hz": None,
+            "every": max(1, round(config.every(name) * scale)),
+        }
         if name in fastest:
-            changes = {"rate_hz": None, "every": 1, "within_cycles": max(1, round(board.within_cycles * scale))}
+            changes = {
+                "rate_hz": None,
+                "every": 1,
+                "within_cycles": max(1, round(board.within_cycles * scale)),
+            }
         boards[name] = board.model_copy(update={**changes, "ends_run": False})
     robot = config.robot
     if robot is not None:
         # Rounded: 2.5 ms / 0.5 ms must be 5, whatever the last bit says.
         robot = robot.model_copy(update={"substeps": math.ceil(round(period_ms / STEP_MS, 6))})
-    clock = config.clock.model_copy(update={"period_ms": period_ms, "mode": "realtime", "speed": 1.0})
+    clock = config.clock.model_copy(
+        update={"period_ms": period_ms, "mode": "realtime", "speed": 1.0}
+    )
     return config.model_copy(update={"clock": clock, "board": boards, "robot": robot})
 
 
 @dataclass(frozen=True)
 class RateFigures(MissesBeyond):
-    """All runs at one rate. Shares are of the fastest board's cycles; `late` is that of `cyclictest`'s wakes."""
+    """All runs at one rate. Shares are of the fastest board's cycles; `late` is that of
+    `cyclictest`'s wakes."""
 
     rate_hz: float
     cycles: int
@@ -114,7 +131,13 @@ class Rates:
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
         rates = [{**asdict(one), "beyond": one.beyond, "held": one.held} for one in self.figures]
-        found = {"bench": "rate", "config": self.config, "board": self.board, "core": self.core, "rates": rates}
+        found = {
+            "bench": "rate",
+            "config": self.config,
+            "board": self.board,
+            "core": self.core,
+            "rates": rates,
+        }
         return {
             **found,
             "permitted_beyond": BEYOND,
@@ -125,20 +148,42 @@ class Rates:
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as a table for people, fitted to `width`, and the highest rate held."""
         yield f"{self.title}; missed and late in % of its cycles"
-        head = ["rate, Hz", "cycles", "missed", "cyclictest late", "beyond", "late p50, us", "p99", "processor, us", ""]
-        yield from table(head, [self._row(one) for one in self.figures], width, ("cycles", "p99", "late p50, us"))
+        head = [
+            "rate, Hz",
+            "cycles",
+            "missed",
+            "cyclictest late",
+            "beyond",
+            "late p50, us",
+            "p99",
+            "processor, us",
+            "",
+        ]
+        yield from table(
+            head, [self._row(one) for one in self.figures], width, ("cycles", "p99", "late p50, us")
+        )
         if self.absent is not None:
             yield f"{self.absent.line}; every miss counts against the rack"
         highest = self.highest_held_hz
         bound = f"missed at most {BEYOND:.1%} beyond cyclictest"
-        yield f"highest rate held: {'none of these' if highest is None else f'{highest:g} Hz'} ({bound})"
+        yield (
+            f"highest rate held: {'none of these' if highest is None else f'{highest:g} Hz'}"
+            f" ({bound})"
+        )
 
     @staticmethod
     def _row(one: RateFigures) -> list[str]:
         late = None if one.late is None else 100 * one.late
         shares = [decimal(100 * one.missed), decimal(late), decimal(100 * one.beyond)]
         late_us = [figure(one.lateness_us, name, 0) for name in ("p50", "p99")]
-        return [f"{one.rate_hz:g}", str(one.cycles), *shares, *late_us, decimal(one.processor_us, 0), one.verdict]
+        return [
+            f"{one.rate_hz:g}",
+            str(one.cycles),
+            *shares,
+            *late_us,
+            decimal(one.processor_us, 0),
+            one.verdict,
+        ]
 
     def plot(self, folder: Path) -> list[Path]:
         """Write missed cycles and load by rate as PNG and SVG into `folder`; return their paths."""
@@ -148,12 +193,25 @@ class Rates:
         paths = paths_of(folder / "rate")
         with picture(paths, 6.4, 5.2, layout="constrained") as drawn:
             shares, load = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-            shares.plot(rates, [100 * one.missed for one in self.figures], "o-", color=RACK, label="rack: missed")
+            shares.plot(
+                rates,
+                [100 * one.missed for one in self.figures],
+                "o-",
+                color=RACK,
+                label="rack: missed",
+            )
             if self.absent is None:
                 late = [100 * (one.late or 0.0) for one in self.figures]
                 shares.plot(rates, late, "s-", color=PEER, label="cyclictest: late by a cycle")
                 permitted = [share + 100 * BEYOND for share in late]
-                shares.plot(rates, permitted, ":", color=PEER, linewidth=0.8, label=f"{BEYOND:.1%} beyond it")
+                shares.plot(
+                    rates,
+                    permitted,
+                    ":",
+                    color=PEER,
+                    linewidth=0.8,
+                    label=f"{BEYOND:.1%} beyond it",
+                )
             # Linear below the bound: 0 has its place.
             shares.set_yscale("symlog", linthresh=100 * BEYOND)
             shares.set_ylim(0, max(1.0, *(200 * one.missed for one in self.figures)))
@@ -187,7 +245,9 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     for rate_hz, rack in racks.items():
         progress.begin(f"{rate_hz:g} Hz")
         priority = config.board[board].priority or 1
-        grid = WakeGrid((core,), round(1e9 / rate_hz), max(1, round(runs.seconds * rate_hz)), priority)
+        grid = WakeGrid(
+            (core,), round(1e9 / rate_hz), max(1, round(runs.seconds * rate_hz)), priority
+        )
         ran: list[Observed] = []
         late: list[np.ndarray] = []
         for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), runs.rounds):
@@ -195,12 +255,16 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
                 late.append(cyclictest(grid))
             else:
                 ran.append(observe(rack, runs.seconds, runs.share))
-        figures.append(_figures(rate_hz, board, ran, np.concatenate(late) if late else None, grid.period_ns))
+        figures.append(
+            _figures(rate_hz, board, ran, np.concatenate(late) if late else None, grid.period_ns)
+        )
         progress.end(each_s, figures[-1].verdict)
     return Rates(name, board, core, tuple(figures), absent)
 
 
-def _figures(rate_hz: float, board: str, runs: Sequence[Observed], late_us: Late, period_ns: int) -> RateFigures:
+def _figures(
+    rate_hz: float, board: str, runs: Sequence[Observed], late_us: Late, period_ns: int
+) -> RateFigures:
     settled = np.concatenate([run.settled(board) for run in runs])
     ended = [run.outcome for run in runs if not run.outcome.worked]
     return RateFigures(
@@ -210,5 +274,7 @@ def _figures(rate_hz: float, board: str, runs: Sequence[Observed], late_us: Late
         late=None if late_us is None else overdue(late_us, period_ns),
         lateness_us=distribution(lateness_ns(settled) * 1e-3),
         processor_us=float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0,
-        failure=f"{ended[0].cause}: {'; '.join(ended[0].faults) or ended[0].reason}" if ended else "",
+        failure=(
+            f"{ended[0].cause}: {'; '.join(ended[0].faults) or ended[0].reason}" if ended else ""
+        ),
     )

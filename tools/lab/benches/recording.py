@@ -1,4 +1,5 @@
-"""Measures what recording costs the boards: misses and lateness without a recorder, with it, and with a live viewer."""
+"""Measures what recording costs the boards: misses and lateness without a recorder, with it, and
+with a live viewer."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class RecordingCost:
-    """All rounds of one phase: cycles, missed and skipped ones, of all tasks; lateness of the fastest task in ms.
+    """All rounds of one phase: cycles, missed and skipped ones, of all tasks; lateness of the
+    fastest task in ms.
 
     `recorder_percent` is the recorder's share of one core; 0 without one.
     """
@@ -54,12 +56,15 @@ class _Sample(NamedTuple):
 
 
 def measure(name: str) -> list[RecordingCost]:
-    """Return the cost on the rack of a config; phases are interleaved, as the machine's speed drifts.
+    """Return the cost on the rack of a config; phases are interleaved, as the machine's speed
+    drifts.
 
     Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
     config = load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"])
-    endless = {name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()}
+    endless = {
+        name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
+    }
     config = config.model_copy(update={"board": endless})
     found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
     with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
@@ -76,7 +81,9 @@ def measure(name: str) -> list[RecordingCost]:
                     used_ns = _processor_ns(pid)
                     began_ns = time.monotonic_ns()
                     readings = [_reading(rack, rings) for _ in range(round(PHASE_S))]
-                    share = 100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
+                    share = (
+                        100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
+                    )
                     found[phase].append(_Sample(readings, share))
         rack.stop("measured")
         while rack.watch(0.5):
@@ -97,7 +104,8 @@ def _drained(rings: Sequence[Ring]) -> list[np.ndarray]:
 
 @contextmanager
 def _recorder(rack: Rack, phase: str, folder: Path) -> Iterator[int | None]:
-    """Record while the context lasts, unless the phase is without; yield the recorder's process id."""
+    """Record while the context lasts, unless the phase is without; yield the recorder's process
+    id."""
     if phase == PHASES[0]:
         yield None
         return
@@ -136,14 +144,26 @@ def _cost(phase: str, samples: Sequence[_Sample]) -> RecordingCost:
         cycles=len(cycles),
         missed=missed,
         skipped=skipped,
-        lateness_ms=distribution(lateness_ns(np.concatenate([reading[0] for reading in readings])) * 1e-6),
+        lateness_ms=distribution(
+            lateness_ns(np.concatenate([reading[0] for reading in readings])) * 1e-6
+        ),
         recorder_percent=round(float(np.mean([sample.recorder_percent for sample in samples])), 2),
     )
 
 
 def lines_of(costs: Sequence[RecordingCost], width: int | None = None) -> Iterator[str]:
     """Yield a table for people, fitted to `width`."""
-    head = ["phase", "cycles", "missed", "skipped", "late p50, ms", "p99", "p99.9", "max", "recorder, % of a core"]
+    head = [
+        "phase",
+        "cycles",
+        "missed",
+        "skipped",
+        "late p50, ms",
+        "p99",
+        "p99.9",
+        "max",
+        "recorder, % of a core",
+    ]
     rows = [
         [
             cost.phase,

@@ -1,6 +1,7 @@
 """The emptiest boards: one sends a message in every cycle, each of the others passes it on.
 
-The same file runs in another checkout, whose packages may have other names: it imports nothing but what a level needs.
+The same file runs in another checkout, whose packages may have other names: it imports nothing but
+what a level needs.
 """
 
 from __future__ import annotations
@@ -8,7 +9,9 @@ from __future__ import annotations
 from rack.backplane.message import Field, State, status
 from rack.levels.level import Executor, Input, Ports
 
-RELAYED = status("relayed", 1, Field("sent", "i8", "tick", "cycle in which the first board sent this message"))
+RELAYED = status(
+    "relayed", 1, Field("sent", "i8", "tick", "cycle in which the first board sent this message")
+)
 
 
 class Sender(Executor):

@@ -1,8 +1,9 @@
-"""Measures the response of a rack to its operator: racks with commands at random ticks, one after another.
+"""Measures the response of a rack to its operator: racks with commands at random ticks, one after
+another.
 
-It also checks the serials that the measurement rests on, with twins of a run in which one command is left out. Until
-the tick at which the torque first rests on that command both runs are equal bit for bit. If the command was a hold
-given to a moving arm, they differ from exactly that tick on.
+It also checks the serials that the measurement rests on, with twins of a run in which one command
+is left out. Until the tick at which the torque first rests on that command both runs are equal bit
+for bit. If the command was a hold given to a moving arm, they differ from exactly that tick on.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ RUN_S = 24.0
 LEAD_S = 2.0
 """Simulated time before the first command; by then the arm of a task is about to move."""
 PAUSE_S = 1.2
-"""Simulated time from the response to a command until the next one, at most, so that the arm moves again."""
+"""Simulated time from the response to a command until the next one, at most, so that the arm moves
+again."""
 LOCKSTEP_RUN_S = 20.0
 """About how long a run in lockstep takes."""
 FRUITLESS = 3
@@ -51,7 +53,8 @@ class CommandedRun(NamedTuple):
 
 @dataclass(frozen=True)
 class Twin:
-    """One command, and the first tick at which the torque differs in any bit without it; None: it never does."""
+    """One command, and the first tick at which the torque differs in any bit without it; None: it
+    never does."""
 
     serial: int
     level: str
@@ -83,13 +86,25 @@ class ResponseBench:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        head = {"config": self.config, "mode": self.mode, "seed": self.seed, "runs": self.runs, "held": self.held}
-        return {**head, **self.response.document(), "twins": [asdict(t) | {"agrees": t.agrees} for t in self.twins]}
+        head = {
+            "config": self.config,
+            "mode": self.mode,
+            "seed": self.seed,
+            "runs": self.runs,
+            "held": self.held,
+        }
+        return {
+            **head,
+            **self.response.document(),
+            "twins": [asdict(t) | {"agrees": t.agrees} for t in self.twins],
+        }
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as text for people, the table fitted to `width`."""
         yield self.response.text(width)
-        beyond, off, measured = (len(getattr(self.response, name)) for name in ("beyond", "off", "measured"))
+        beyond, off, measured = (
+            len(getattr(self.response, name)) for name in ("beyond", "off", "measured")
+        )
         yield f"{beyond} of {measured} beyond a bound, {off} not at the predicted tick"
         for twin in self.twins:
             where = "nowhere" if twin.differs is None else f"first at tick {twin.differs}"
@@ -102,7 +117,8 @@ class ResponseBench:
 
 
 class ResponseRuns:
-    """Runs racks of one config until enough responses are measured. Raises `Failure` if none can be."""
+    """Runs racks of one config until enough responses are measured. Raises `Failure` if none can
+    be."""
 
     def __init__(self, name: str, mode: str, seed: int, progress: Progress) -> None:
         self._name = name
@@ -118,7 +134,8 @@ class ResponseRuns:
         self._runs = 0
 
     def measure(self, commands: int, twins: int) -> ResponseBench:
-        """Measure at least `commands` responses; compare the runs of `twins` holds with their twins."""
+        """Measure at least `commands` responses; compare the runs of `twins` holds with their
+        twins."""
         per_run = len(self._draw(commands))
         self._progress.total(LOCKSTEP_RUN_S * (commands / max(1, per_run) + 0.7 * twins))
         found: list[OperatorResponse] = []
@@ -132,11 +149,15 @@ class ResponseRuns:
                 self._progress.end(LOCKSTEP_RUN_S, f"{measured} responses")
                 fruitless = 0 if measured else fruitless + 1
                 if fruitless == FRUITLESS:
-                    raise Failure(f"{self._name}: {FRUITLESS} runs without a response to any command")
+                    raise Failure(
+                        f"{self._name}: {FRUITLESS} runs without a response to any command"
+                    )
                 if response is not None:
                     found.append(response)
                     compared += self._twins(run, response, twins - len(compared), Path(scratch))
-        return ResponseBench(self._name, self._mode, self._seed, self._runs, _together(found), tuple(compared))
+        return ResponseBench(
+            self._name, self._mode, self._seed, self._runs, _together(found), tuple(compared)
+        )
 
     def _draw(self, most: int) -> list[CommandConfig]:
         return draw(self._paths, self._config.clock_ns, self._random, most)
@@ -144,37 +165,54 @@ class ResponseRuns:
     def _run(self, commands: Sequence[CommandConfig], folder: Path) -> CommandedRun:
         self._runs += 1
         self._progress.begin(f"run {self._runs}: {len(commands)} commands")
-        return CommandedRun(commands, run_commands(self._config, commands, folder, self._seconds(commands)))
+        return CommandedRun(
+            commands, run_commands(self._config, commands, folder, self._seconds(commands))
+        )
 
     def _seconds(self, commands: Sequence[CommandConfig]) -> float:
-        """Return the simulated time that the response to the last command needs, and a little more."""
+        """Return the simulated time that the response to the last command needs, and a little
+        more."""
         longest = max(path.longest for path in self._paths.values())
         last = max((command.tick or 0 for command in commands), default=0)
         return min(RUN_S, (last + longest) * self._config.clock_ns * 1e-9 + PAUSE_S)
 
-    def _twins(self, run: CommandedRun, response: OperatorResponse, most: int, scratch: Path) -> Iterator[Twin]:
-        """Yield the twins of holds given to a moving arm: one of every level before a second of any."""
+    def _twins(
+        self, run: CommandedRun, response: OperatorResponse, most: int, scratch: Path
+    ) -> Iterator[Twin]:
+        """Yield the twins of holds given to a moving arm: one of every level before a second of
+        any."""
         found = holds_of_moving_arm(run.recording, response) if most > 0 else []
-        chosen = sorted(found, key=lambda c: [o.serial for o in found if o.level == c.level].index(c.serial))
+        chosen = sorted(
+            found, key=lambda c: [o.serial for o in found if o.level == c.level].index(c.serial)
+        )
         for command in chosen[: max(0, most)]:
             self._progress.begin(f"twin without command {command.serial} to {command.level}")
             status = _status(response, command.level)
-            yield compare(self._config, run, command, status, scratch / f"{self._runs}-{command.serial}")
+            yield compare(
+                self._config, run, command, status, scratch / f"{self._runs}-{command.serial}"
+            )
             self._progress.end(0.7 * LOCKSTEP_RUN_S, "compared")
 
 
 def _together(found: Sequence[OperatorResponse]) -> OperatorResponse:
     """Return all runs as one; serials are unique within a run only."""
     paths = {level: path for response in found for level, path in response.paths.items()}
-    ordered = {level: paths[level] for level in sorted(paths, key=lambda name: -len(paths[name].levels))}
-    return replace(found[0], paths=ordered, commands=tuple(c for response in found for c in response.commands))
+    ordered = {
+        level: paths[level] for level in sorted(paths, key=lambda name: -len(paths[name].levels))
+    }
+    return replace(
+        found[0], paths=ordered, commands=tuple(c for response in found for c in response.commands)
+    )
 
 
-def draw(paths: Mapping[str, CommandPath], clock_ns: int, random: Random, most: int) -> list[CommandConfig]:
-    """Return holds and resumes for one run, an even number, at most `most`, to all levels in turn, shuffled.
+def draw(
+    paths: Mapping[str, CommandPath], clock_ns: int, random: Random, most: int
+) -> list[CommandConfig]:
+    """Return holds and resumes for one run, an even number, at most `most`, to all levels in turn,
+    shuffled.
 
-    Each is given after the response to the one before, and a random pause. Pauses are longer than the longest cycle, or
-    many of them, so that every phase of the grid is equally likely.
+    Each is given after the response to the one before, and a random pause. Pauses are longer than
+    the longest cycle, or many of them, so that every phase of the grid is equally likely.
     """
     drawn: list[CommandConfig] = []
     tick, end, pause = (round(seconds * 1e9 / clock_ns) for seconds in (LEAD_S, RUN_S, PAUSE_S))
@@ -190,8 +228,11 @@ def draw(paths: Mapping[str, CommandPath], clock_ns: int, random: Random, most: 
             tick = again + longest
 
 
-def run_commands(config: RackConfig, commands: Sequence[CommandConfig], folder: Path, seconds: float) -> Recording:
-    """Run a rack with these commands for simulated `seconds`, or until its task ends; return its recording."""
+def run_commands(
+    config: RackConfig, commands: Sequence[CommandConfig], folder: Path, seconds: float
+) -> Recording:
+    """Run a rack with these commands for simulated `seconds`, or until its task ends; return its
+    recording."""
     folder.mkdir(parents=True)
     wanted = config.model_copy(update={"command": (*config.command, *commands)})
     (folder / "config.toml").write_text(wanted.text())
@@ -211,12 +252,14 @@ def holds_of_moving_arm(recording: Recording, response: OperatorResponse) -> lis
 
 
 def _status(response: OperatorResponse, level: str) -> str:
-    """Return the mailbox that shows the response to commands to a level: the status of the lowest on its path."""
+    """Return the mailbox that shows the response to commands to a level: the status of the lowest
+    on its path."""
     return f"{response.paths[level].levels[-1]}.status"
 
 
 def _is_moving(recording: Recording, status: str, tick: int) -> bool:
-    """Return whether the arm was commanded to move around a tick; a status without an arm never shows it."""
+    """Return whether the arm was commanded to move around a tick; a status without an arm never
+    shows it."""
     if not {"target_velocity", "torque"} <= recording.fields(status):
         return False
     ticks, velocities = (recording.signal(status, name) for name in ("tick", "target_velocity"))
@@ -224,9 +267,14 @@ def _is_moving(recording: Recording, status: str, tick: int) -> bool:
     return all(speed.get(tick + k, 0.0) > MOVING_RAD_S for k in range(-8, 24, 8))
 
 
-def compare(config: RackConfig, run: CommandedRun, command: AnsweredCommand, status: str, folder: Path) -> Twin:
-    """Run the twin of a run without one of its commands, and compare the torques in the mailbox `status`."""
-    before = [other for other in run.commands if other.tick is not None and other.tick < command.given]
+def compare(
+    config: RackConfig, run: CommandedRun, command: AnsweredCommand, status: str, folder: Path
+) -> Twin:
+    """Run the twin of a run without one of its commands, and compare the torques in the mailbox
+    `status`."""
+    before = [
+        other for other in run.commands if other.tick is not None and other.tick < command.given
+    ]
     seconds = (command.predicted + TWIN_EXTRA_TICKS) * config.clock_ns * 1e-9
     twin = run_commands(config, before, folder, seconds)
     differs = first_difference(run.recording, twin, status)
@@ -234,10 +282,13 @@ def compare(config: RackConfig, run: CommandedRun, command: AnsweredCommand, sta
 
 
 def first_difference(first: Recording, second: Recording, status: str) -> int | None:
-    """Return the first tick at which the torques in `status` differ in any bit, over the ticks that both runs have."""
+    """Return the first tick at which the torques in `status` differ in any bit, over the ticks that
+    both runs have."""
     torques = []
     for recording in (first, second):
         ticks, values = (recording.signal(status, name) for name in ("tick", "torque"))
-        torques.append({int(tick): value.tobytes() for tick, value in zip(ticks, values, strict=True)})
+        torques.append(
+            {int(tick): value.tobytes() for tick, value in zip(ticks, values, strict=True)}
+        )
     common = sorted(torques[0].keys() & torques[1].keys())
     return next((tick for tick in common if torques[0][tick] != torques[1][tick]), None)

@@ -18,10 +18,11 @@ HEAD_START_NS = 50_000_000
 
 
 def sleep_loop(grid: WakeGrid) -> np.ndarray:
-    """Return the lateness of every wake, us, shape (n,). Raises `Failure` if the process does not finish.
+    """Return the lateness of every wake, us, shape (n,). Raises `Failure` if the process does not
+    finish.
 
-    `time.sleep` is `clock_nanosleep` until a point of CLOCK_MONOTONIC. Like a board that is late, it skips the points
-    that have passed.
+    `time.sleep` is `clock_nanosleep` until a point of CLOCK_MONOTONIC. Like a board that is late,
+    it skips the points that have passed.
     """
     spawn = multiprocessing.get_context("spawn")
     late_ns = spawn.RawArray("q", [-1] * grid.wakes)

@@ -1,7 +1,8 @@
-"""The context switch t_cs of eqs 3.8 and 3.9: an executor wakes up while its planner computes on the same core.
+"""The context switch t_cs of eqs 3.8 and 3.9: an executor wakes up while its planner computes on
+the same core.
 
-The planner reads the clock in a loop until it sees a gap; the executor notes when it was awake. The gap without the
-executor's time is the two switches.
+The planner reads the clock in a loop until it sees a gap; the executor notes when it was awake. The
+gap without the executor's time is the two switches.
 """
 
 from __future__ import annotations
@@ -54,16 +55,27 @@ class SwitchCost:
 
     def lines(self) -> Iterator[str]:
         """Yield the figures as text for people."""
-        yield f"context switch on core {self.core}, us; an executor preempted its planner {self.wakes} times"
-        rows = {"planner to executor": self.in_us, "executor to planner": self.out_us, "t_cs": self.switch_us}
+        yield (
+            f"context switch on core {self.core}, us; an executor preempted its planner"
+            f" {self.wakes} times"
+        )
+        rows = {
+            "planner to executor": self.in_us,
+            "executor to planner": self.out_us,
+            "t_cs": self.switch_us,
+        }
         for name, found in rows.items():
-            yield f"  {name:20} p50 {found['p50']:6.1f}   p99 {found['p99']:6.1f}   max {found['max']:8.1f}"
+            yield (
+                f"  {name:20} p50 {found['p50']:6.1f}   p99 {found['p99']:6.1f}   max"
+                f" {found['max']:8.1f}"
+            )
         yield f"  the paper's boards   {self.paper_us:g}"
         yield f"for a config: timing.context_switch_ms = {ceil(self.switch_us['p99']) * 1e-3:.3f}"
 
 
 def measure() -> SwitchCost:
-    """Measure on the last core of this machine, woken from another. Raises `Failure` if the machine has one core."""
+    """Measure on the last core of this machine, woken from another. Raises `Failure` if the machine
+    has one core."""
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         raise Failure("measuring a context switch needs two cores: this machine has one")
@@ -71,7 +83,8 @@ def measure() -> SwitchCost:
 
 
 class _Shared(NamedTuple):
-    """Shared by both processes. `gaps` and `awake` hold two times per wake-up, ns; `ready` 1 or -1 for each process."""
+    """Shared by both processes. `gaps` and `awake` hold two times per wake-up, ns; `ready` 1 or -1
+    for each process."""
 
     parent: int
     core: int
@@ -82,7 +95,8 @@ class _Shared(NamedTuple):
 
 
 def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run both processes; return the planner's gaps and the executor's times awake, shape (n, 2), ns."""
+    """Run both processes; return the planner's gaps and the executor's times awake, shape (n, 2),
+    ns."""
     spawn = multiprocessing.get_context("spawn")
     gaps, awake, ready = (spawn.RawArray("q", size) for size in (2 * WAKES, 2 * WAKES, 2))
     shared = _Shared(os.getpid(), core, gaps, awake, ready, spawn.Barrier(3))
@@ -123,7 +137,8 @@ def _plan(work: str, shared: _Shared) -> None:
         over = 2 * at + 1
         seen = 0
         while not seen and last - begin < PATIENCE_NS:
-            # Read before the clock: wherever in this loop the executor interrupts, the next clock value shows it.
+            # Read before the clock: wherever in this loop the executor interrupts, the next clock
+            # value shows it.
             seen = awake[over]
             now = monotonic_ns()
             if now - last > longest:
@@ -186,11 +201,14 @@ def _await(shared: _Shared) -> None:
 
 
 def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
-    """Return the cost over the wake-ups that interrupted the planner. Raises `Failure` if none did."""
+    """Return the cost over the wake-ups that interrupted the planner. Raises `Failure` if none
+    did."""
     found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
     if not found.any():
         raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
     into = (awake - gaps)[found, 0] * 1e-3
     back = (gaps - awake)[found, 1] * 1e-3
-    in_us, out_us, switch_us = (distribution(times) or {} for times in (into, back, (into + back) / 2))
+    in_us, out_us, switch_us = (
+        distribution(times) or {} for times in (into, back, (into + back) / 2)
+    )
     return SwitchCost(core, int(found.sum()), in_us, out_us, switch_us)

@@ -1,9 +1,10 @@
-"""Ways to bring a message from one task to others: what `rack bench mailbox` compares our mailboxes with.
+"""Ways to bring a message from one task to others: what `rack bench mailbox` compares our mailboxes
+with.
 
-All are used as their users use them from Python, in their fastest form: a local message with numpy views of its fields
-is filled, its bytes are handed over, and every reader gets them into a local message of its own. Nothing listens on a
-network. Names in shared memory and in the file system are removed as soon as both ends are open, so that nothing is
-left even if the process is killed.
+All are used as their users use them from Python, in their fastest form: a local message with numpy
+views of its fields is filled, its bytes are handed over, and every reader gets them into a local
+message of its own. Nothing listens on a network. Names in shared memory and in the file system are
+removed as soon as both ends are open, so that nothing is left even if the process is killed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ SETTLE_S = 10.0
 
 
 class Transport(NamedTuple):
-    """Fill `message`, call `send` with a tick, then every reader with the same tick: each returns what it received."""
+    """Fill `message`, call `send` with a tick, then every reader with the same tick: each returns
+    what it received."""
 
     message: Message
     send: Callable[[int], object]
@@ -40,7 +42,8 @@ class Transport(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """A contestant: `opened` gives it for a message type and so many readers; `module` must be installed for it."""
+    """A contestant: `opened` gives it for a message type and so many readers; `module` must be
+    installed for it."""
 
     name: str
     module: str
@@ -49,7 +52,8 @@ class Peer(NamedTuple):
 
 @contextmanager
 def raw_copy(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Copy bytes into shared memory and out again: no serial, no check, no readers in step with the writer."""
+    """Copy bytes into shared memory and out again: no serial, no check, no readers in step with the
+    writer."""
     shared = mmap.mmap(-1, dtype.itemsize)
     message = Message(dtype)
     with memoryview(shared) as view:
@@ -70,7 +74,9 @@ def iceoryx2_publish_subscribe(dtype: np.dtype, readers: int) -> Iterator[Transp
     with _iceoryx2_names() as (iceoryx2, node):
         payload = _structure(dtype)
         name = iceoryx2.ServiceName.new(KEY)
-        service = node.service_builder(name).publish_subscribe(payload).max_subscribers(readers).create()
+        service = (
+            node.service_builder(name).publish_subscribe(payload).max_subscribers(readers).create()
+        )
         publisher = service.publisher_builder().create()
         own = payload.from_buffer(message.raw)
         subscribers = [service.subscriber_builder().create() for _ in range(readers)]
@@ -91,7 +97,9 @@ def iceoryx2_publish_subscribe(dtype: np.dtype, readers: int) -> Iterator[Transp
 
         return take
 
-    yield Transport(message, lambda tick: publisher.send_copy(own), [taker(one) for one in subscribers])
+    yield Transport(
+        message, lambda tick: publisher.send_copy(own), [taker(one) for one in subscribers]
+    )
 
 
 @contextmanager
@@ -101,7 +109,9 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     with _iceoryx2_names() as (iceoryx2, node):
         payload = _structure(dtype)
         key = ctypes.c_uint64(0)
-        creator = node.service_builder(iceoryx2.ServiceName.new(KEY)).blackboard_creator(ctypes.c_uint64)
+        creator = node.service_builder(iceoryx2.ServiceName.new(KEY)).blackboard_creator(
+            ctypes.c_uint64
+        )
         service = creator.add(key, payload()).max_readers(readers).create()
         writer = service.writer_builder().create()
         own = payload.from_buffer(message.raw)
@@ -131,7 +141,9 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
             entrance.send_bytes(message.raw)
 
     try:
-        yield Transport(message, send, [_into(Message(dtype), way_out.recv_bytes_into) for way_out, _ in pipes])
+        yield Transport(
+            message, send, [_into(Message(dtype), way_out.recv_bytes_into) for way_out, _ in pipes]
+        )
     finally:
         for end in (end for pipe in pipes for end in pipe):
             end.close()
@@ -163,14 +175,16 @@ def multiprocessing_queue(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
 @contextmanager
 def zenoh_within_a_session(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Put bytes on a key of a zenoh session with subscribers in it: they never leave the session."""
+    """Put bytes on a key of a zenoh session with subscribers in it: they never leave the
+    session."""
     with _zenoh(listen="", connect="") as session:
         yield _zenoh_transport(_publisher(session), dtype, _subscribers([session] * readers))
 
 
 @contextmanager
 def zenoh_sessions(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Put bytes on a key of a zenoh session; every subscriber has a session of its own, as in processes of their own.
+    """Put bytes on a key of a zenoh session; every subscriber has a session of its own, as in
+    processes of their own.
 
     They are connected through a socket in the file system: nothing listens on a network.
     """
@@ -273,7 +287,8 @@ def _into(message: Message, fetch: Callable[[memoryview], object]) -> Callable[[
 
 @contextmanager
 def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
-    """Give iceoryx2 and a node to open services with: files and shared memory have names while the context lasts."""
+    """Give iceoryx2 and a node to open services with: files and shared memory have names while the
+    context lasts."""
     import iceoryx2
 
     iceoryx2.set_log_level(iceoryx2.LogLevel.Fatal)

@@ -1,4 +1,5 @@
-"""The page as HTML: one file, its pictures in it, without scripts; for a screen, light or dark, and for paper."""
+"""The page as HTML: one file, its pictures in it, without scripts; for a screen, light or dark, and
+for paper."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ from rack.tools.lab.reproduction.sections.page import (
 )
 
 PAPER = (
-    "J. L. Michaloski, T. E. Wheatley, R. Lumia: <i>Analysis of Computational Parallelism with a Concurrent "
-    "Hierarchical Robot Control System</i>, NISTIR 90-4251, National Institute of Standards and Technology, March 1990"
+    "J. L. Michaloski, T. E. Wheatley, R. Lumia: <i>Analysis of Computational Parallelism with a"
+    " Concurrent Hierarchical Robot Control System</i>, NISTIR 90-4251, National Institute of"
+    " Standards and Technology, March 1990"
 )
 TITLE = "A robot controller of 1990, reproduced"
 MARKS = {
@@ -98,9 +100,15 @@ nav .mark { display: inline-block; width: 1.3rem; font-weight: 700; }
 def html(page: Page, folder: Path) -> str:
     """Return the page as HTML; its pictures are read from `folder`."""
     body = "\n".join(_body(page, folder))
-    head = '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+    head = (
+        '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width,'
+        ' initial-scale=1">\n'
+    )
     head += f"<title>{TITLE}</title>\n<style>{STYLE}</style>"
-    return f'<!doctype html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n{body}\n</body>\n</html>\n'
+    return (
+        "<!doctype html>\n<html"
+        f' lang="en">\n<head>\n{head}\n</head>\n<body>\n{body}\n</body>\n</html>\n'
+    )
 
 
 def _body(page: Page, folder: Path) -> Iterator[str]:
@@ -118,10 +126,11 @@ def _body(page: Page, folder: Path) -> Iterator[str]:
 def opening(page: Page) -> Iterator[str]:
     """Yield the first paragraphs."""
     yield (
-        "This page goes through the paper section by section. Each claim, equation and figure is given in the paper's "
-        "words, followed by our prediction from the timing model, our measurement on real processes, and a ruling. No "
-        "number is written by hand: predictions are computed from the configs of this project's racks, measurements "
-        "come from the runs listed at the end. Times are in ms unless a unit is given."
+        "This page goes through the paper section by section. Each claim, equation and figure is"
+        " given in the paper's words, followed by our prediction from the timing model, our"
+        " measurement on real processes, and a ruling. No number is written by hand: predictions"
+        " are computed from the configs of this project's racks, measurements come from the runs"
+        " listed at the end. Times are in ms unless a unit is given."
     )
     if odd := page.of(Ruling.CONTRADICTS):
         links = ", ".join(f'<a href="#{claim.name}">{claim.title}</a>' for claim in odd)
@@ -144,7 +153,10 @@ def _contents(page: Page) -> Iterator[str]:
         yield f'<li><a href="#section-{section.name}">{heading(section)}</a><ul>'
         for claim in section.claims:
             ruling = claim.tested.ruling
-            mark = f'<span class="mark {ruling.name.lower()}" title="{ruling.value}">{MARKS[ruling]}</span>'
+            mark = (
+                f'<span class="mark {ruling.name.lower()}"'
+                f' title="{ruling.value}">{MARKS[ruling]}</span>'
+            )
             yield f'<li>{mark}<a href="#{claim.name}">{claim.title}</a></li>'
         yield "</ul></li>"
     yield '<li><a href="#runs">The runs</a></li></ul></nav>'
@@ -167,13 +179,18 @@ def _claim(claim: PageClaim, folder: Path) -> Iterator[str]:
     ruling = claim.tested.ruling
     kind = ruling.name.lower()
     yield f'<article id="{claim.name}">'
-    yield f'<h3>{claim.title} <span class="ruling {kind}">{MARKS[ruling]} {ruling.value}</span></h3>'
+    yield (
+        f'<h3>{claim.title} <span class="ruling {kind}">{MARKS[ruling]} {ruling.value}</span></h3>'
+    )
     yield f"<blockquote>{claim.quote}</blockquote>"
     if claim.equation:
         yield f'<p class="equation">{claim.equation}</p>'
     yield from _side("Predicted", claim.predicted, folder)
     yield from _side("Measured", claim.tested.measured, folder)
-    yield f'<p class="why"><b class="{kind}">{ruling.value.capitalize()}.</b> {claim.tested.why}</p>\n</article>'
+    yield (
+        f'<p class="why"><b class="{kind}">{ruling.value.capitalize()}.</b>'
+        f" {claim.tested.why}</p>\n</article>"
+    )
 
 
 def _side(name: str, side: Side, folder: Path) -> Iterator[str]:
@@ -202,12 +219,18 @@ def _item(item: Item, folder: Path) -> Iterator[str]:
 
 def _table(table: Columns) -> Iterator[str]:
     columns = zip(*table.rows, strict=True) if table.rows else [() for _ in table.head]
-    numeric = [' class="number"' if column and all(map(is_figure, column)) else "" for column in columns]
+    numeric = [
+        ' class="number"' if column and all(map(is_figure, column)) else "" for column in columns
+    ]
     yield '<div class="wide"><table>'
     if any(table.head):
-        yield f"<tr>{''.join(f'<th{kind}>{cell}</th>' for cell, kind in zip(table.head, numeric, strict=True))}</tr>"
+        yield (
+            f"<tr>{''.join(f'<th{kind}>{cell}</th>' for cell, kind in zip(table.head, numeric, strict=True))}</tr>"
+        )
     for row in table.rows:
-        yield f"<tr>{''.join(f'<td{kind}>{cell}</td>' for cell, kind in zip(row, numeric, strict=True))}</tr>"
+        yield (
+            f"<tr>{''.join(f'<td{kind}>{cell}</td>' for cell, kind in zip(row, numeric, strict=True))}</tr>"
+        )
     yield "</table></div>"
     yield from _caption(table.caption)
 
@@ -219,4 +242,6 @@ def _caption(words: str) -> Iterator[str]:
 
 def is_figure(cell: str) -> bool:
     """Return whether a cell holds a number, with a unit or a sign of comparison, or nothing."""
-    return is_number(cell.removesuffix(" %").removesuffix(" ms").removesuffix(" us").removesuffix(" s"))
+    return is_number(
+        cell.removesuffix(" %").removesuffix(" ms").removesuffix(" us").removesuffix(" s")
+    )

@@ -6,7 +6,17 @@ from collections.abc import Iterator
 
 from rack.tools.console.tables import markdown_table
 from rack.tools.lab.reproduction.html import MARKS, PAPER, TITLE, heading, opening, rulings
-from rack.tools.lab.reproduction.sections.page import Columns, Item, Listing, Page, PageClaim, Plate, Prose, Side, plain
+from rack.tools.lab.reproduction.sections.page import (
+    Columns,
+    Item,
+    Listing,
+    Page,
+    PageClaim,
+    Plate,
+    Prose,
+    Side,
+    plain,
+)
 
 
 def markdown(page: Page) -> str:
@@ -26,7 +36,14 @@ def _lines(page: Page) -> Iterator[str]:
             yield f"  - {MARKS[claim.tested.ruling]} [{claim.title}](#{claim.name})"
     yield from ("- [The runs](#runs)", "")
     for section in page.sections:
-        yield from (f'<a id="section-{section.name}"></a>', "", f"## {heading(section)}", "", section.intro, "")
+        yield from (
+            f'<a id="section-{section.name}"></a>',
+            "",
+            f"## {heading(section)}",
+            "",
+            section.intro,
+            "",
+        )
         for claim in section.claims:
             yield from _claim(claim)
     yield from ('<a id="runs"></a>', "", "## The runs", "")
@@ -35,7 +52,12 @@ def _lines(page: Page) -> Iterator[str]:
 
 def _claim(claim: PageClaim) -> Iterator[str]:
     ruling = claim.tested.ruling
-    yield from (f'<a id="{claim.name}"></a>', "", f"### {claim.title}: {MARKS[ruling]} {ruling.value}", "")
+    yield from (
+        f'<a id="{claim.name}"></a>',
+        "",
+        f"### {claim.title}: {MARKS[ruling]} {ruling.value}",
+        "",
+    )
     yield from (f"> {claim.quote}", "")
     if claim.equation:
         yield from (f'<p align="center"><b>{claim.equation}</b></p>', "")
@@ -73,5 +95,7 @@ def _table(table: Columns) -> Iterator[str]:
         yield from (table.caption, "")
     # GitHub shows no table without a head.
     head = [cell or " " for cell in table.head]
-    yield from markdown_table(head, [[cell.replace("|", "&#124;") for cell in row] for row in table.rows])
+    yield from markdown_table(
+        head, [[cell.replace("|", "&#124;") for cell in row] for row in table.rows]
+    )
     yield ""

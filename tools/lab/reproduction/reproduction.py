@@ -1,4 +1,5 @@
-"""The whole reproduction: which experiments are still to be made, making them, and writing the page."""
+"""The whole reproduction: which experiments are still to be made, making them, and writing the
+page."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ PROJECT = (BackplaneError, BoardError, LevelError, Failure)
 
 
 def chapters_named(names: Sequence[str]) -> list[Chapter]:
-    """Return the chapters of these names, all for none. Raises `Failure` for a name that no chapter has."""
+    """Return the chapters of these names, all for none. Raises `Failure` for a name that no chapter
+    has."""
     known = {chapter.name: chapter for chapter in CHAPTERS}
     if unknown := [name for name in names if name not in known]:
         raise Failure(f"--only {unknown[0]}: no such section; permitted: {', '.join(known)}", 2)
@@ -71,9 +73,12 @@ def forget(wanted: Sequence[Chapter], folder: Path) -> None:
 
 
 def reproduce(wanted: Sequence[Chapter], workshop: Workshop, progress: Progress) -> Page:
-    """Make what is still to be made for these chapters; return the page of all, written into the folder."""
+    """Make what is still to be made for these chapters; return the page of all, written into the
+    folder."""
     workshop.prepare()
-    results = {one.name: found for one in experiments(CHAPTERS) if (found := kept(one, workshop.folder))}
+    results = {
+        one.name: found for one in experiments(CHAPTERS) if (found := kept(one, workshop.folder))
+    }
     needed = [one for one in experiments(wanted) if one.name not in results]
     reasons = _make(needed, workshop, progress, results)
     return write(workshop, {**results, **reasons})
@@ -106,7 +111,11 @@ def write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
     """Write the page into the folder, as HTML, Markdown and data, and return it."""
     sections = tuple(chapter.section(workshop, results) for chapter in CHAPTERS)
     page = Page(sections, tuple(_facts(results)))
-    documents = (html(page, workshop.folder), markdown(page), json.dumps(page.document(), indent=2) + "\n")
+    documents = (
+        html(page, workshop.folder),
+        markdown(page),
+        json.dumps(page.document(), indent=2) + "\n",
+    )
     for name, document in zip(FILES, documents, strict=True):
         (workshop.folder / name).write_text(document, encoding="utf-8")
     return page
@@ -118,9 +127,17 @@ def _facts(results: dict[str, Kept | str]) -> list[tuple[str, str]]:
     found = [one for one in results.values() if isinstance(one, Kept)]
     facts = [(name, text(value)) for name, value in here.items() if name != "libraries"]
     facts += [("libraries", libraries), ("program", program())]
-    facts += [("experiments", f"{len(found)} of {len(experiments(CHAPTERS))}, {sum(f.took_s for f in found):.0f} s")]
+    facts += [
+        (
+            "experiments",
+            f"{len(found)} of {len(experiments(CHAPTERS))}, {sum(f.took_s for f in found):.0f} s",
+        )
+    ]
     rows = [
-        (f"experiment {name}", f"{one.made_at}, {one.took_s:g} s{f'; {text(one.lacking)}' if one.lacking else ''}")
+        (
+            f"experiment {name}",
+            f"{one.made_at}, {one.took_s:g} s{f'; {text(one.lacking)}' if one.lacking else ''}",
+        )
         for name, one in results.items()
         if isinstance(one, Kept)
     ]
@@ -130,13 +147,18 @@ def _facts(results: dict[str, Kept | str]) -> list[tuple[str, str]]:
 def worked(page: Page, wanted: Sequence[Chapter]) -> bool:
     """Return whether every claim of these chapters was tested, and none that should hold failed."""
     names = {chapter.name for chapter in wanted}
-    claims = [claim for section in page.sections if section.name in names for claim in section.claims]
+    claims = [
+        claim for section in page.sections if section.name in names for claim in section.claims
+    ]
     return not any(claim.tested.ruling.is_failure for claim in claims)
 
 
 def summary(page: Page, folder: Path) -> list[str]:
     """Return the page in a few lines for the terminal."""
-    lines = [f"{MARKS[claim.tested.ruling]} {plain(claim.title)}: {claim.tested.ruling.value}" for claim in page.claims]
+    lines = [
+        f"{MARKS[claim.tested.ruling]} {plain(claim.title)}: {claim.tested.ruling.value}"
+        for claim in page.claims
+    ]
     counted = ", ".join(f"{count} {ruling[2:]}" for ruling, count, _ in rulings(page).rows)
     return [*lines, "", counted, f"{folder}/{FILES[0]}, {FILES[1]}"]
 

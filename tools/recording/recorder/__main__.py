@@ -1,7 +1,8 @@
 """The recorder process, `python -m rack.tools.recording.recorder`.
 
-Its argument names the class of the view, "package.module:Class". Its stdin names rack and folder, and closes when the
-run is over. It prints "recording" once it has attached; every other line is a message for the user.
+Its argument names the class of the view, "package.module:Class". Its stdin names rack and folder,
+and closes when the run is over. It prints "recording" once it has attached; every other line is a
+message for the user.
 """
 
 from __future__ import annotations
@@ -26,8 +27,10 @@ NICENESS = 10
 
 
 def main() -> None:
-    """Attach to the rack that one line of JSON names, and record until stdin closes; another line means: in a hurry."""
-    # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is complete.
+    """Attach to the rack that one line of JSON names, and record until stdin closes; another line
+    means: in a hurry."""
+    # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is
+    # complete.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
@@ -43,7 +46,8 @@ def main() -> None:
         return
     name, folder, port = json.loads(line)
     segment = Segment.attach(name)
-    # A run in real time need not wait for the libraries of the viewer, unless the user wants to look on from the start.
+    # A run in real time need not wait for the libraries of the viewer, unless the user wants to
+    # look on from the start.
     in_background = port is None and not segment.words[System.LOCKSTEP]
     view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
     try:
@@ -80,5 +84,6 @@ def _tell(text: str) -> None:
 
 if __name__ == "__main__":
     main()
-    # All files are complete. To take the interpreter apart under a thread that still imports could crash it.
+    # All files are complete. To take the interpreter apart under a thread that still imports could
+    # crash it.
     os._exit(0)

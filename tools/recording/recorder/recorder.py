@@ -22,10 +22,12 @@ from rack.tools.recording.spool import Frame, RunFiles, Spool, rings
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
-"""How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs faster than time."""
+"""How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs
+faster than time."""
 
 HURRIED_S = 0.5
-"""Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends within 2 s."""
+"""Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends
+within 2 s."""
 
 
 class Sink(Protocol):
@@ -42,20 +44,26 @@ class Sink(Protocol):
 
 
 class SafeSink:
-    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the recorder continues.
+    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the
+    recorder continues.
 
-    Opened `in_background`, by a thread, it lets the recorder begin earlier: what it imports may take as long as a
-    launch. The rows of that time wait.
+    Opened `in_background`, by a thread, it lets the recorder begin earlier: what it imports may
+    take as long as a launch. The rows of that time wait.
     """
 
-    def __init__(self, opened: Callable[[], Sink], tell: Callable[[str], None], in_background: bool = False) -> None:
+    def __init__(
+        self, opened: Callable[[], Sink], tell: Callable[[str], None], in_background: bool = False
+    ) -> None:
         self._tell = tell
         self._sink: Sink | None = None
-        # Kept: the viewer's library waits, maybe for ever, where a stream is dropped whose file could not be written.
+        # Kept: the viewer's library waits, maybe for ever, where a stream is dropped whose file
+        # could not be written.
         self._failed: Sink | None = None
         self._waiting: list[Callable[[Sink], None]] = []
         # A daemon: a process in a hurry does not wait for it.
-        self._opening = Thread(target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True)
+        self._opening = Thread(
+            target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True
+        )
         self._opening.start()
         if not in_background:
             self._opening.join()
@@ -74,7 +82,10 @@ class SafeSink:
         self._pass(lambda sink: sink.close(tick, lost))
         self._opening.join(self._patience_s)
         if self._opening.is_alive():
-            self._tell("run.rrd is missing: the run was interrupted before the libraries of the viewer were loaded")
+            self._tell(
+                "run.rrd is missing: the run was interrupted before the libraries of the viewer"
+                " were loaded"
+            )
         else:
             self._hand_over()
 
@@ -88,7 +99,8 @@ class SafeSink:
             self._hand_over()
 
     def _hand_over(self) -> None:
-        """Make the calls that waited for the sink; there are none to make of one that has failed."""
+        """Make the calls that waited for the sink; there are none to make of one that has
+        failed."""
         waiting = self._waiting
         self._waiting = []
         for call in waiting:
@@ -108,35 +120,43 @@ RISKED_PART = 4
 
 
 class Recorder:
-    """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the same rows.
+    """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the
+    same rows.
 
-    The first recorder of a rack in lockstep is its follower: the clock waits for it. `refresh` brings a mirror of a
-    segment on another machine up to date.
+    The first recorder of a rack in lockstep is its follower: the clock waits for it. `refresh`
+    brings a mirror of a segment on another machine up to date.
     """
 
     def __init__(
-        self, segment: Segment, folder: Path, view: Sink | None = None, refresh: Callable[[], object] | None = None
+        self,
+        segment: Segment,
+        folder: Path,
+        view: Sink | None = None,
+        refresh: Callable[[], object] | None = None,
     ) -> None:
         layout = segment.layout
         self._view = view
         self._refresh = refresh
         self._segment = segment
         self._words = segment.words
-        # The spool first: it fails where another recorder is running, and leaves that one's files alone.
+        # The spool first: it fails where another recorder is running, and leaves that one's files
+        # alone.
         self._spool = Spool(folder, layout, segment.launch)
         self._files = RunFiles(folder, layout, segment.launch)
         self._spool.resume(self._files.add)
         self._rings = rings(segment)
         for name, taken in self._files.taken.items():
             self._rings[name].resume(taken)
-        # Lockstep has no deadlines that the machine could break; the cores of another machine are not seen.
+        # Lockstep has no deadlines that the machine could break; the cores of another machine are
+        # not seen.
         self._cores = None if self._words[System.LOCKSTEP] or refresh is not None else CoreMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         is_awaited = follower == os.getpid()
         self._is_follower = is_awaited or not is_alive(follower)
-        # All rows up to here are in the spool's file. The launcher's recorder still has to read those after, even if
-        # the one before it died with no row in the file; another one begins now.
+        # All rows up to here are in the spool's file. The launcher's recorder still has to read
+        # those after, even if the one before it died with no row in the file; another one begins
+        # now.
         self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
         self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
         self._report_progress()
@@ -144,7 +164,12 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self.close()
 
     def drain(self) -> None:
@@ -160,7 +185,8 @@ class Recorder:
                 self._view.add(name, rows)
         if self._is_follower:
             self._words[System.FOLLOWER_DRAINED] = tick
-        # A killed recorder loses the rows that are not in its file: lockstep must not run far ahead of it.
+        # A killed recorder loses the rows that are not in its file: lockstep must not run far ahead
+        # of it.
         is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
         if self._spool.flush(now=is_late):
             self._safe_tick = tick
@@ -171,13 +197,15 @@ class Recorder:
         self._report_progress()
 
     def _report_progress(self) -> None:
-        """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost after a delay."""
+        """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost
+        after a delay."""
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
     def follow(self, until: int | None = None) -> None:
-        """Record until the run is over; with a descriptor `until`, until that is readable or closed."""
+        """Record until the run is over; with a descriptor `until`, until that is readable or
+        closed."""
         period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
         watched = [] if until is None else [until]
         while not select.select(watched, [], [], period_s)[0]:

@@ -1,4 +1,5 @@
-"""A run compared with the timing model: every equation twice, predicted from the budgets and as measured."""
+"""A run compared with the timing model: every equation twice, predicted from the budgets and as
+measured."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ OBSERVED = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
 
 @dataclass(frozen=True)
 class Pair:
-    """One equation put to one subject. `predicted` is None without a budget, `measured` if a run cannot show it."""
+    """One equation put to one subject. `predicted` is None without a budget, `measured` if a run
+    cannot show it."""
 
     equation: str
     subject: str
@@ -53,10 +55,11 @@ class Pair:
 class Analysis:
     """A run compared with the timing model.
 
-    `predicted` is the rack with the budgets of its config, `measured` the rack with those of the run. `cycles` are by
-    task, `loads` by core, as parts of its time; `response` is that of the system, None without a hierarchy. `pairs` are
-    of the `percentile`, `mostly` of the longest of `MOSTLY` in 100 cycles: a level that does not fit fails in most of
-    its cycles, a machine that stalls now and then does not.
+    `predicted` is the rack with the budgets of its config, `measured` the rack with those of the
+    run. `cycles` are by task, `loads` by core, as parts of its time; `response` is that of the
+    system, None without a hierarchy. `pairs` are of the `percentile`, `mostly` of the longest of
+    `MOSTLY` in 100 cycles: a level that does not fit fails in most of its cycles, a machine that
+    stalls now and then does not.
     """
 
     recording: Recording
@@ -73,21 +76,29 @@ class Analysis:
 
     @classmethod
     def of(
-        cls, recording: Recording, percentile: float = WORST, progress: Callable[[float], None] = lambda part: None
+        cls,
+        recording: Recording,
+        percentile: float = WORST,
+        progress: Callable[[float], None] = lambda part: None,
     ) -> Analysis:
-        """Analyze a recorded run; `progress` takes the part done. Raises `Failure` for an empty or old trace."""
+        """Analyze a recorded run; `progress` takes the part done. Raises `Failure` for an empty or
+        old trace."""
         config = recording.rack_config
         layout = recording.layout
         cycles = cycles_of(recording)
         if not cycles:
-            raise Failure(f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2)
+            raise Failure(
+                f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2
+            )
         progress(0.4)
         predicted = rack_timing(config, layout)
         loads = core_loads(recording, cycles, predicted)
         response = system_response(recording)
 
         def measured(percent: float) -> RackTiming:
-            return rack_timing(config, layout, without_interrupts(predicted, budgets_of(cycles, percent)))
+            return rack_timing(
+                config, layout, without_interrupts(predicted, budgets_of(cycles, percent))
+            )
 
         def pairs(percent: float) -> tuple[Pair, ...]:
             rack = measured(percent)
@@ -122,21 +133,28 @@ class Analysis:
         return tuple(breach for breach in self.breaches if breach.is_judged)
 
 
-def _paired(predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]) -> list[Pair]:
+def _paired(
+    predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]
+) -> list[Pair]:
     """Return every equation on every subject, in the order of the equations."""
     sides = [{_key(verdict): verdict for verdict in side} for side in (predicted, measured)]
-    pairs = [Pair(*key[:2], *(side.get(key) for side in sides)) for key in dict.fromkeys([*sides[0], *sides[1]])]
+    pairs = [
+        Pair(*key[:2], *(side.get(key) for side in sides))
+        for key in dict.fromkeys([*sides[0], *sides[1]])
+    ]
     return sorted(pairs, key=lambda pair: ORDER.index(pair.equation))
 
 
 def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
-    # The system's response is judged down and up; eq. 3.7 asks something else of a config than of a run.
+    # The system's response is judged down and up; eq. 3.7 asks something else of a config than of a
+    # run.
     meaning = verdict.meaning if verdict.equation in ("3.2", "3.3", "3.7") else ""
     return verdict.equation, verdict.subject, meaning
 
 
 def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield eq. 3.2 on the longest response of the run, and eq. 3.3 on the sum with its waits for the grid."""
+    """Yield eq. 3.2 on the longest response of the run, and eq. 3.3 on the sum with its waits for
+    the grid."""
     if response is None:
         return
     # The response is in simulated time.
@@ -152,12 +170,18 @@ def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[Eq
         longest_ns = times["max"] * wall_ns
         bound_ns = found[way]["bound_ms"] * wall_ns
         meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
-        yield EquationVerdict.of("3.2", found["subject"], Relation(longest_ns, "<=", bound), meaning)
+        yield EquationVerdict.of(
+            "3.2", found["subject"], Relation(longest_ns, "<=", bound), meaning
+        )
         meaning = f"R_s of a {way} <= sum of R_i and of the waits for the grid"
-        yield EquationVerdict.of("3.3", found["subject"], Relation(longest_ns, "<=", bound_ns), meaning)
+        yield EquationVerdict.of(
+            "3.3", found["subject"], Relation(longest_ns, "<=", bound_ns), meaning
+        )
 
 
-def _tasks(found: Mapping[str, Cycles], rack: RackTiming, percentile: float) -> Iterator[EquationVerdict]:
+def _tasks(
+    found: Mapping[str, Cycles], rack: RackTiming, percentile: float
+) -> Iterator[EquationVerdict]:
     for name, cycles in found.items():
         if cycles.task.role == "executor":
             step = worst_of(steps_ns(cycles, rack)[cycles.is_judged], percentile)
@@ -175,7 +199,9 @@ def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
         yield EquationVerdict.of(LOAD, f"core {core}", relation, "time used by its tasks", "1")
 
 
-def core_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[int, float]:
+def core_loads(
+    recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
+) -> dict[int, float]:
     """Return by core the part of its time that tasks used, as `task_loads`."""
     loads: dict[int, float] = {}
     for name, load in task_loads(recording, found, rack).items():
@@ -183,10 +209,13 @@ def core_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTimi
     return dict(sorted(loads.items()))
 
 
-def task_loads(recording: Recording, found: Mapping[str, Cycles], rack: RackTiming) -> dict[str, float]:
+def task_loads(
+    recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
+) -> dict[str, float]:
     """Return by task the part of its core's time that it used, without the clock's own.
 
-    An executor counts at all its releases, skipped ones too: so the load of an overloaded core exceeds 1.
+    An executor counts at all its releases, skipped ones too: so the load of an overloaded core
+    exceeds 1.
     """
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())

@@ -1,8 +1,9 @@
-"""Cycles that broke an equation by their own numbers, and the tasks that shared their core meanwhile.
+"""Cycles that broke an equation by their own numbers, and the tasks that shared their core
+meanwhile.
 
-A budget compares the worst of all cycles with an equation; here every cycle is compared by itself. A level may
-therefore fail eq. 3.6, whose longest execution and longest communication need not fall into one cycle, without a cycle
-that breaks it.
+A budget compares the worst of all cycles with an equation; here every cycle is compared by itself.
+A level may therefore fail eq. 3.6, whose longest execution and longest communication need not fall
+into one cycle, without a cycle that breaks it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ import numpy as np
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import Occupation
 from rack.tools.recording.cycles import Cycles
-from rack.tools.timing.analysis.rules import Rule, cycle_ns, response_ns, rules_for, slice_ns, steps_ns
+from rack.tools.timing.analysis.rules import (
+    Rule,
+    cycle_ns,
+    response_ns,
+    rules_for,
+    slice_ns,
+    steps_ns,
+)
 
 MENTIONED = 0.1
 """Part of a cycle's time from which on the text mentions its cause."""
@@ -28,9 +36,10 @@ UNUSUAL = 1.5
 class CoreSharing:
     """The use of the core from the time a cycle was due until its end, ns.
 
-    `own_ns` is the cycle's own processor time, `usual_ns` the median of that over all cycles: a virtual machine
-    stalled by its host counts the stall as own time. `others_ns` are the tasks of the rack that kept it from the
-    core. `nobody_ns` is in no trace: the clock's and the kernel's own work, or other programs.
+    `own_ns` is the cycle's own processor time, `usual_ns` the median of that over all cycles: a
+    virtual machine stalled by its host counts the stall as own time. `others_ns` are the tasks of
+    the rack that kept it from the core. `nobody_ns` is in no trace: the clock's and the kernel's
+    own work, or other programs.
     """
 
     lasted_ns: int
@@ -42,22 +51,37 @@ class CoreSharing:
     def text(self) -> str:
         """Return the main uses of the time, the longest first."""
         uses = sorted(self._uses(), reverse=True)
-        return "; ".join(text for _, text in uses) or f"computed {brief_ms(self.own_ns)} ms, as usual"
+        return (
+            "; ".join(text for _, text in uses) or f"computed {brief_ms(self.own_ns)} ms, as usual"
+        )
 
     def _uses(self) -> Iterator[tuple[int, str]]:
         least = MENTIONED * self.lasted_ns
         if self.own_ns > UNUSUAL * self.usual_ns:
-            yield self.own_ns, f"computed {brief_ms(self.own_ns)} ms, usually {brief_ms(self.usual_ns)} ms"
+            yield (
+                self.own_ns,
+                f"computed {brief_ms(self.own_ns)} ms, usually {brief_ms(self.usual_ns)} ms",
+            )
         for name, ns in self.others_ns.items():
             if ns > least:
-                yield ns, f"{'its previous cycle' if name == BEFORE else name} had the core for {brief_ms(ns)} ms"
+                yield (
+                    ns,
+                    (
+                        f"{'its previous cycle' if name == BEFORE else name} had the core for"
+                        f" {brief_ms(ns)} ms"
+                    ),
+                )
         if self.nobody_ns > least:
-            yield self.nobody_ns, f"no task of the rack had the core for {brief_ms(self.nobody_ns)} ms"
+            yield (
+                self.nobody_ns,
+                f"no task of the rack had the core for {brief_ms(self.nobody_ns)} ms",
+            )
 
 
 @dataclass(frozen=True)
 class Broken:
-    """An equation that a cycle broke, both sides in ns, or in parts of a cycle where `unit` is "1"."""
+    """An equation that a cycle broke, both sides in ns, or in parts of a cycle where `unit` is
+    "1"."""
 
     equation: str
     left: float
@@ -68,7 +92,8 @@ class Broken:
 
 @dataclass(frozen=True)
 class Breach:
-    """A cycle that broke equations. `excess` is its overrun as a multiple of the time available, for sorting.
+    """A cycle that broke equations. `excess` is its overrun as a multiple of the time available,
+    for sorting.
 
     `is_judged` excludes what `Cycles.is_judged` does."""
 
@@ -100,7 +125,9 @@ def _breaches_of(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> It
             task=name,
             tick=int(cycles.rows["tick"][row]),
             broken=tuple(
-                _broken(rule, int(row), count) for rule, failed in zip(rules, fails[:, row], strict=True) if failed
+                _broken(rule, int(row), count)
+                for rule, failed in zip(rules, fails[:, row], strict=True)
+                if failed
             ),
             excess=float(excess[row]),
             is_judged=bool(cycles.is_judged[row]),
@@ -115,7 +142,8 @@ def _broken(rule: Rule, row: int, count: int) -> Broken:
 
 
 def _due_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
-    """Return the time from which on each cycle was due: its release, or the first that was skipped before it."""
+    """Return the time from which on each cycle was due: its release, or the first that was skipped
+    before it."""
     release = cycles.rows["release_ns"]
     if rack.is_lockstep or cycles.task.role == "planner":
         return np.asarray(release)
@@ -128,20 +156,37 @@ def _excess(cycles: Cycles, rack: RackTiming) -> np.ndarray:
     if rack.is_lockstep:
         return excess
     excess = np.maximum(excess, response_ns(cycles, rack) / available_ns)
-    return np.maximum(excess, steps_ns(cycles, rack) / available_ns) if cycles.task.role == "executor" else excess
+    return (
+        np.maximum(excess, steps_ns(cycles, rack) / available_ns)
+        if cycles.task.role == "executor"
+        else excess
+    )
 
 
-def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackTiming) -> list[CoreSharing]:
+def _sharing(
+    name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackTiming
+) -> list[CoreSharing]:
     """Return the use of the core in the cycles of a task at the places `at`, shape (n,)."""
     cycles = found[name]
     rows = cycles.rows[at]
     starts = _due_ns(cycles, rack)[at]
     ends = rows["end_ns"]
-    others = {other: rival for other, rival in found.items() if other != name and rival.core == cycles.core}
+    others = {
+        other: rival
+        for other, rival in found.items()
+        if other != name and rival.core == cycles.core
+    }
     # By their priorities, these can have had the core while this task wanted it.
-    rivals = {o: Occupation.of(rival.rows) for o, rival in others.items() if rival.priority >= cycles.priority}
+    rivals = {
+        o: Occupation.of(rival.rows)
+        for o, rival in others.items()
+        if rival.priority >= cycles.priority
+    }
     # A plan update that is a critical section keeps the executor waiting.
-    if rack.boards[cycles.task.board].is_critical and (planner := found.get(f"{name}.planner")) is not None:
+    if (
+        rack.boards[cycles.task.board].is_critical
+        and (planner := found.get(f"{name}.planner")) is not None
+    ):
         rivals[planner.task.name] = Occupation(planner.rows["process_ns"], planner.rows["end_ns"])
     kept = {other: occupied.within(starts, ends) for other, occupied in rivals.items()}
     together = Occupation.union(list(rivals.values())).within(starts, ends)
@@ -159,7 +204,9 @@ def _sharing(name: str, at: np.ndarray, found: Mapping[str, Cycles], rack: RackT
             lasted_ns=int(lasted[row]),
             own_ns=int(own[row]),
             usual_ns=usual,
-            others_ns={other: int(min(ns[row], left[row])) for other, ns in kept.items() if ns[row]},
+            others_ns={
+                other: int(min(ns[row], left[row])) for other, ns in kept.items() if ns[row]
+            },
             nobody_ns=int(nobody[row]),
         )
         for row in range(len(at))

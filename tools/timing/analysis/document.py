@@ -42,13 +42,18 @@ def document(analysis: Analysis) -> Document:
         "untraced": recording.untraced(),
         "holds": analysis.holds,
         "levels": {name: _level(analysis, name) for name in config.board},
-        "tasks": {name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()},
+        "tasks": {
+            name: task_document(cycles, analysis.predicted)
+            for name, cycles in analysis.cycles.items()
+        },
         "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
         "restarts": restarts(recording),
         "equations": [_pair(pair) for pair in analysis.pairs],
         "mostly": {
             "percentile": MOSTLY,
-            "failed": [{"equation": p.equation, "subject": p.subject} for p in analysis.mostly if p.fails],
+            "failed": [
+                {"equation": p.equation, "subject": p.subject} for p in analysis.mostly if p.fails
+            ],
         },
         "system_response": analysis.response,
         "breaches": [_breach(breach, recording.layout.clock_ns) for breach in analysis.breaches],
@@ -56,8 +61,13 @@ def document(analysis: Analysis) -> Document:
 
 
 def _level(analysis: Analysis, board: str) -> Document:
-    sides = {"predicted": analysis.predicted.levels.get(board), "measured": analysis.measured.levels.get(board)}
-    timings = {side: None if timing is None else timing.document() for side, timing in sides.items()}
+    sides = {
+        "predicted": analysis.predicted.levels.get(board),
+        "measured": analysis.measured.levels.get(board),
+    }
+    timings = {
+        side: None if timing is None else timing.document() for side, timing in sides.items()
+    }
     return {"summary": summary(analysis, board), **timings}
 
 
@@ -72,7 +82,11 @@ def _pair(pair: Pair) -> Document:
 
 
 def _without_subject(verdict: EquationVerdict) -> Document:
-    return {name: value for name, value in verdict.document().items() if name not in ("equation", "subject")}
+    return {
+        name: value
+        for name, value in verdict.document().items()
+        if name not in ("equation", "subject")
+    }
 
 
 def _breach(breach: Breach, clock_ns: int) -> Document:
@@ -87,7 +101,8 @@ def _breach(breach: Breach, clock_ns: int) -> Document:
 
 
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:
-    """Return the times of the judged cycles of one task, ms; lateness and response are None in lockstep."""
+    """Return the times of the judged cycles of one task, ms; lateness and response are None in
+    lockstep."""
     judged = cycles.is_judged
     is_lockstep = rack.is_lockstep
     rows = cycles.rows[judged]
@@ -110,18 +125,23 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
         "lateness_ms": None if is_lockstep else distribution(lateness_ns(rows) * MS),
         "response_ms": None if is_lockstep else distribution(response_ns(rows) * MS),
         "slice_ms": slice_ns(rack, cycles.task) * MS,
-        "largest_gap_ms": None if is_lockstep or not len(gaps) else round(float(gaps.max()) * MS, 6),
+        "largest_gap_ms": (
+            None if is_lockstep or not len(gaps) else round(float(gaps.max()) * MS, 6)
+        ),
     }
 
 
 def deviation_ns(cycles: Cycles) -> float:
     """Return the standard deviation of the residual from cycle to cycle (eq. 3.6), ns."""
     judged = cycles.is_judged
-    return residual_deviation_ns(cycles.process_ns[judged].tolist(), cycles.communication_ns[judged].tolist())
+    return residual_deviation_ns(
+        cycles.process_ns[judged].tolist(), cycles.communication_ns[judged].tolist()
+    )
 
 
 def summary(analysis: Analysis, board: str) -> str:
-    """Return in one line the use of a level's cycle, whether its planner fits, and where it exceeds its budget."""
+    """Return in one line the use of a level's cycle, whether its planner fits, and where it exceeds
+    its budget."""
     timing = analysis.measured.levels.get(board)
     if timing is None:
         return "never ran"
@@ -137,7 +157,10 @@ def _clauses(analysis: Analysis, timing: LevelTiming) -> Iterator[str]:
     used_ns = timing.execution_ns + timing.communication_ns
     usual_ns = float(np.median(analysis.cycles[timing.board].used_ns))
     when = worst_words(analysis.percentile)
-    yield f"{brief_ms(used_ns)} of {brief_ms(timing.cycle_ns)} ms used {when}, {brief_ms(usual_ns)} usually"
+    yield (
+        f"{brief_ms(used_ns)} of {brief_ms(timing.cycle_ns)} ms used {when}, {brief_ms(usual_ns)}"
+        " usually"
+    )
     if timing.planning_ns is not None:
         yield _planner(timing, analysis.measured.context_switch_ns)
     elif timing.coupling != "none":
@@ -160,7 +183,10 @@ def _planner(timing: LevelTiming, switch_ns: int) -> str:
     if needed is None:
         return f"{took}, and no time is left for it in such a cycle"
     fits = needed <= (permitted or 0)
-    return f"{took}: {f'fits into {needed} of its' if fits else f'needs {needed} and has'} {permitted} cycles"
+    return (
+        f"{took}: {f'fits into {needed} of its' if fits else f'needs {needed} and has'} {permitted}"
+        " cycles"
+    )
 
 
 def _over(timing: LevelTiming, budget: LevelTiming) -> Iterator[str]:

@@ -1,4 +1,5 @@
-"""The section of a report on the network: what passed over it, how old it was, and which racks were lost."""
+"""The section of a report on the network: what passed over it, how old it was, and which racks were
+lost."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ Report = dict[str, Any]
 
 
 def network(recording: Recording) -> Report | None:
-    """Return counts and ages, ms, of what passed, and losses of other racks; None: no adapter, or nothing recorded."""
+    """Return counts and ages, ms, of what passed, and losses of other racks; None: no adapter, or
+    nothing recorded."""
     entries = exchanged(recording.config)
     if entries is None or STATUS not in recording.mailboxes:
         return None
@@ -32,7 +34,11 @@ def network(recording: Recording) -> Report | None:
         {"entry": f"{BOARD}.{port}", "source": source, "sent": last(f"export_{port}.sent")}
         for port, source in entries.exports.items()
     ]
-    return {"imports": imports, "exports": exports, "peers": [_peer(recording, rack) for rack in entries.peers]}
+    return {
+        "imports": imports,
+        "exports": exports,
+        "peers": [_peer(recording, rack) for rack in entries.peers],
+    }
 
 
 def _peer(recording: Recording, rack: str) -> Report:

@@ -29,7 +29,15 @@ from rack.tools.faults.judge import faults
 from rack.tools.live.host_side import entries_of
 from rack.tools.live.interrupts import interrupts
 from rack.tools.live.queues import queues
-from rack.tools.recording.history import counted, fired_rows, first_difference, frequency, holds, misses, steal
+from rack.tools.recording.history import (
+    counted,
+    fired_rows,
+    first_difference,
+    frequency,
+    holds,
+    misses,
+    steal,
+)
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
 from rack.tools.timing.analysis.network import network
@@ -41,15 +49,18 @@ DRIVING = ("servo_status", "arm_status")
 HAND_STATUS = "hand_status"
 WRENCH = "wrench"
 FORCE_STATUS = "force_status"
-"""Messages by name, as recordings hold them: to report on them takes no level that only other racks have."""
+"""Messages by name, as recordings hold them: to report on them takes no level that only other racks
+have."""
 FALLING_M_S = 0.05
 """Speed from which an object falls: a grip that slips, or fingers that lower it, are slower."""
 BOUNCE = 2
 """Samples between the parts of one fall."""
 SETTLE = 20
-"""Samples after a fall in which the object comes to rest: at first it sinks into what it landed on, or bounces."""
+"""Samples after a fall in which the object comes to rest: at first it sinks into what it landed on,
+or bounces."""
 LEAST_M = 0.005
-"""Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part along."""
+"""Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part
+along."""
 ENTRY_COUNTS = ("passed", "refused", "superseded", "full", "waiting")
 
 
@@ -109,7 +120,8 @@ def report_of(recording: Recording) -> Report:
 
 
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
-    """Return the report of a run that was not recorded: the same keys, null where only a recording could tell."""
+    """Return the report of a run that was not recorded: the same keys, null where only a recording
+    could tell."""
     unknown = (
         *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
         *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
@@ -117,13 +129,22 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
         *("rows_lost", "gaps", "untraced"),
     )
     layout = wire(config)
-    tasks = {task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks}
+    tasks = {
+        task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks
+    }
     head = _head(config, ended, 0)
-    return {**head, **dict.fromkeys(unknown), "folder": None, "tasks": tasks, "recording": ended["recording"]}
+    return {
+        **head,
+        **dict.fromkeys(unknown),
+        "folder": None,
+        "tasks": tasks,
+        "recording": ended["recording"],
+    }
 
 
 def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
-    """Return the part that needs no recording; `ticks` is the length of a run whose end is not known."""
+    """Return the part that needs no recording; `ticks` is the length of a run whose end is not
+    known."""
     outcome = ended.get("outcome", {})
     counters = ended.get("tasks", {}).values()
     return {
@@ -162,13 +183,17 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
     entry: Report = {
         **_about(task, layout),
         **recording.ended.get("tasks", {}).get(task.name, {}),
-        **task_times(task, cycles, layout.clock_ns if is_lockstep else tick_ns(config), is_lockstep),
+        **task_times(
+            task, cycles, layout.clock_ns if is_lockstep else tick_ns(config), is_lockstep
+        ),
     }
     plan = f"{task.board}.plan"
     if task.role == "executor" and plan in recording.mailboxes:
         made = recording.signal(plan, "tick")
         visible_at = recording.signal(plan, "visible_at")
-        entry["plan_age_ms"] = distribution(plan_ages(cycles["tick"], made, visible_at) * (layout.clock_ns * 1e-6))
+        entry["plan_age_ms"] = distribution(
+            plan_ages(cycles["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
+        )
     return entry
 
 
@@ -176,12 +201,16 @@ def _about(task: TaskSpec, layout: Layout) -> Report:
     return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
-def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False) -> Report:
-    """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec + t_comm + t_residual).
+def task_times(
+    task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False
+) -> Report:
+    """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec +
+    t_comm + t_residual).
 
-    `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and preemption.
-    `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its R is their time slice. In
-    lockstep a tick lasts as long as its tasks take: everything relative to a release or a time slice is None.
+    `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and
+    preemption. `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its
+    R is their time slice. In lockstep a tick lasts as long as its tasks take: everything relative
+    to a release or a time slice is None.
     """
     slice_ns = task.every * task.within_cycles * period_ns
     gaps = gaps_ns(cycles)
@@ -207,13 +236,16 @@ def task_times(task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: 
 
 
 def _entries(recording: Recording) -> list[Report]:
-    """Return the entries of all bus adapters: their counts at the end, and the ages of what passed, ms."""
+    """Return the entries of all bus adapters: their counts at the end, and the ages of what passed,
+    ms."""
     found = []
     tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
             ages = recording.signal(mailbox, f"{entry}.age")
-            counts = {name: int(recording.signal(mailbox, f"{entry}.{name}")[-1]) for name in ENTRY_COUNTS}
+            counts = {
+                name: int(recording.signal(mailbox, f"{entry}.{name}")[-1]) for name in ENTRY_COUNTS
+            }
             name = f"{mailbox.partition('.')[0]}.{entry}"
             ages_ms = distribution(ages[ages >= 0] * tick_ms)
             found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
@@ -229,8 +261,14 @@ def _task_outcome(recording: Recording) -> Report | None:
     def last(field: str) -> Any:
         return recording.signal(mailbox, field)[-1]
 
-    counts = {name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")}
-    return {"state": State(int(last("state"))).name.lower(), "reason": str(last("reason")), **counts}
+    counts = {
+        name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")
+    }
+    return {
+        "state": State(int(last("state"))).name.lower(),
+        "reason": str(last("reason")),
+        **counts,
+    }
 
 
 def _objects(recording: Recording, config: RackConfig) -> Iterator[Report]:
@@ -241,7 +279,8 @@ def _objects(recording: Recording, config: RackConfig) -> Iterator[Report]:
 
 
 def _drops(recording: Recording, row: int) -> Iterator[Report]:
-    """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the tool."""
+    """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
+    tool."""
     mailbox = _mailbox_of(recording, SCENE.name)
     if mailbox is None:
         return
@@ -260,7 +299,8 @@ def _drops(recording: Recording, row: int) -> Iterator[Report]:
 
 
 def _motion(recording: Recording) -> Report | None:
-    """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set points, or None."""
+    """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set
+    points, or None."""
     mailbox = _mailbox_of(recording, *DRIVING)
     if mailbox is None:
         return None
@@ -274,7 +314,9 @@ def _motion(recording: Recording) -> Report | None:
 
 def _counts(recording: Recording, mailbox: str) -> Report:
     """Return what a board that drives an arm or a hand has counted."""
-    names = {name: name for name in ("touches", "violations", "pushed")} | {"clipped_cycles": "clipped"}
+    names = {name: name for name in ("touches", "violations", "pushed")} | {
+        "clipped_cycles": "clipped"
+    }
     return {key: int(recording.signal(mailbox, name)[-1]) for key, name in names.items()}
 
 
@@ -287,7 +329,8 @@ def _rounded(value: float) -> float:
 
 
 def _hand(recording: Recording, config: RackConfig) -> Report | None:
-    """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or None."""
+    """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or
+    None."""
     mailbox = _mailbox_of(recording, HAND_STATUS)
     if mailbox is None or config.robot is None or config.robot.hand is None:
         return None
@@ -301,14 +344,17 @@ def _hand(recording: Recording, config: RackConfig) -> Report | None:
         "tension_peak_n": _rounded(np.abs(error).max()),
         "least_tension_n": _rounded(tension.min()),
         "largest_tension_n": _rounded(tension.max()),
-        "largest_force_n": {finger: _rounded(value) for finger, value in zip(fingers, most, strict=True)},
+        "largest_force_n": {
+            finger: _rounded(value) for finger, value in zip(fingers, most, strict=True)
+        },
         "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
         **_counts(recording, mailbox),
     }
 
 
 def _force(recording: Recording) -> Report | None:
-    """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N, or None."""
+    """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N,
+    or None."""
     wrench = _mailbox_of(recording, WRENCH)
     status = _mailbox_of(recording, FORCE_STATUS)
     if wrench is None:
@@ -329,6 +375,7 @@ def _force(recording: Recording) -> Report | None:
 
 
 def _mailbox_of(recording: Recording, *messages: str) -> str | None:
-    """Return the first mailbox with messages of one of these types; None when it is empty, or there is none."""
+    """Return the first mailbox with messages of one of these types; None when it is empty, or there
+    is none."""
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return name if name in recording.mailboxes else None

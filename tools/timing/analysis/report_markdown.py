@@ -22,7 +22,16 @@ SHOWN = 10
 CHANGED = 1.05
 """Ratio of a core's highest to its lowest frequency from which the text mentions it."""
 
-FAULTS = ("fault", "target", "at tick", "found as", "after", "bound", "reactions", "recovered after")
+FAULTS = (
+    "fault",
+    "target",
+    "at tick",
+    "found as",
+    "after",
+    "bound",
+    "reactions",
+    "recovered after",
+)
 COUNTS = ("task", "R", "cycles", "missed", "skipped")
 BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
 """Times relative to a release or a time slice: they mean nothing in lockstep."""
@@ -50,7 +59,9 @@ class Grid:
 
 def markdown(report: Report) -> str:
     """Return report.md of a report."""
-    blocks = (block.markdown() if isinstance(block, Grid) else (block,) for block in _blocks(report))
+    blocks = (
+        block.markdown() if isinstance(block, Grid) else (block,) for block in _blocks(report)
+    )
     return "\n".join(line for lines in blocks for line in lines) + "\n"
 
 
@@ -63,7 +74,11 @@ def show(report: Report, terminal: Console) -> None:
         else:
             style = "bold" if block.startswith("#") else ""
             terminal.print(block.lstrip("# "), style=style, highlight=False, markup=False)
-    terminal.print(f"\nall columns: {report['folder']}/report.md; all data: report.json", highlight=False, markup=False)
+    terminal.print(
+        f"\nall columns: {report['folder']}/report.md; all data: report.json",
+        highlight=False,
+        markup=False,
+    )
 
 
 def _blocks(report: Report) -> Iterator[str | Grid]:
@@ -108,7 +123,10 @@ def _times(report: Report) -> Iterator[str | Grid]:
     is_lockstep = report["mode"] == "lockstep"
     yield from ("", "## Cycles, ms", "")
     if is_lockstep:
-        yield "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no lateness, no residuals."
+        yield (
+            "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no"
+            " lateness, no residuals."
+        )
         yield ""
     for name, (traced, ran) in report["untraced"].items():
         yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
@@ -134,12 +152,21 @@ def _holds(report: Report) -> Iterator[str | Grid]:
         for hold in longest
     ]
     yield Grid(("level", "by", "since, s", "until, s", "lasted, s"), rows)
-    for level in (hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"):
-        yield from ("", f"Still held at the end: {level}; `{resume_command(report['rack'], level)}` releases it.")
+    for level in (
+        hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"
+    ):
+        yield from (
+            "",
+            (
+                f"Still held at the end: {level}; `{resume_command(report['rack'], level)}`"
+                " releases it."
+            ),
+        )
 
 
 def _state_tables(levels: dict[str, list[Report]]) -> Iterator[str | Grid]:
-    """Yield one line a level: the table, how many rows fired, and those that fired first and last."""
+    """Yield one line a level: the table, how many rows fired, and those that fired first and
+    last."""
     if not levels:
         return
     yield from ("", "## State tables", "")
@@ -151,7 +178,9 @@ def _state_tables(levels: dict[str, list[Report]]) -> Iterator[str | Grid]:
         count = [str(len(fired)), str(sum(row["cycles"] for row in fired))]
         ends = [f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, last)]
         rows.append([level, tables, *count, *ends])
-    yield Grid(("level", "table", "rows fired", "cycles", "most often, since", "newest, since"), rows)
+    yield Grid(
+        ("level", "table", "rows fired", "cycles", "most often, since", "newest, since"), rows
+    )
 
 
 def _first(rows: Sequence[Any], which: str) -> str:
@@ -159,7 +188,8 @@ def _first(rows: Sequence[Any], which: str) -> str:
 
 
 def _machine(report: Report) -> Iterator[str]:
-    """Yield what the machine did to its cores: when they were away, by whom if that is known; changes of frequency."""
+    """Yield what the machine did to its cores: when they were away, by whom if that is known;
+    changes of frequency."""
     steal = report["steal"]
     stalls = report["stalls"]
     frequency = report["frequency_mhz"] or {}
@@ -173,10 +203,15 @@ def _machine(report: Report) -> Iterator[str]:
         yield f"- {nothing} ({times}); {away['lost']} {lost}"
     if quota := stalls["quota"]:
         causes = [*(f"the cycle of {level}" for level in quota["levels"]), "a quota of the host"]
-        yield f"- {quota['together']} of {quota['stalls']} stalls end at one phase of 100 ms: {' or '.join(causes)}"
+        yield (
+            f"- {quota['together']} of {quota['stalls']} stalls end at one phase of 100 ms:"
+            f" {' or '.join(causes)}"
+        )
     changed = {core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED * mhz["min"]}
     if changed:
-        cores = ", ".join(f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz" for core, mhz in changed.items())
+        cores = ", ".join(
+            f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz" for core, mhz in changed.items()
+        )
         yield f"- the processor changed its frequency: {cores}"
 
 
@@ -189,7 +224,10 @@ def _against(against: Report | None) -> Iterator[str]:
         return
     missed = against["first_miss_tick"]
     why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
-    yield f"- diverges from {against['folder']} at tick {difference['tick']}, first in {difference['mailbox']}; {why}"
+    yield (
+        f"- diverges from {against['folder']} at tick {difference['tick']}, first in"
+        f" {difference['mailbox']}; {why}"
+    )
 
 
 def _faults(report: Report) -> Iterator[str | Grid]:
@@ -200,19 +238,31 @@ def _faults(report: Report) -> Iterator[str | Grid]:
         yield from ("", f"## Faults: {len(faults)}", "")
         yield Grid(FAULTS, [_fault_row(fault) for fault in faults])
     if restarts:
-        yield from ("", f"Restarts: {', '.join(f'{task} {count}' for task, count in restarts.items())}.")
+        yield from (
+            "",
+            f"Restarts: {', '.join(f'{task} {count}' for task, count in restarts.items())}.",
+        )
     if unexplained:
         yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
-        rows = [[str(found["tick"]), found["board"], found["code"], found["text"]] for found in unexplained]
+        rows = [
+            [str(found["tick"]), found["board"], found["code"], found["text"]]
+            for found in unexplained
+        ]
         yield Grid(("tick", "found by", "as", "what"), rows)
 
 
 def _fault_row(fault: Report) -> list[str]:
     subject = fault["mailbox"] or fault["joint"]
     is_struck = fault["seen"] != "not struck"
-    found = f"{fault['found_as']} by {fault['found_by']}" if fault["seen"] == "detected" else fault["seen"]
+    found = (
+        f"{fault['found_as']} by {fault['found_by']}"
+        if fault["seen"] == "detected"
+        else fault["seen"]
+    )
     in_ms = fault["bound_ms"] is not None
-    unit, after, bound = ("ms", "delay_ms", "bound_ms") if in_ms else ("cycles", "delay_cycles", "bound_cycles")
+    unit, after, bound = (
+        ("ms", "delay_ms", "bound_ms") if in_ms else ("cycles", "delay_cycles", "bound_cycles")
+    )
     recovered = "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms"
     return [
         fault["kind"],
@@ -230,10 +280,18 @@ def _misses(report: Report) -> Iterator[str | Grid]:
     if not misses:
         return
     late, skipped = counted(misses)
-    yield from ("", f"## Missed and skipped cycles: {late} and {skipped}{_first(misses, 'first')}", "")
+    yield from (
+        "",
+        f"## Missed and skipped cycles: {late} and {skipped}{_first(misses, 'first')}",
+        "",
+    )
     if (late, skipped) != (report["missed"], report["skipped"]):
         of_all = f"{report['missed']} and {report['skipped']}"
-        why = "the recorder lost rows" if report["rows_lost"] else "the recording does not hold all of it"
+        why = (
+            "the recorder lost rows"
+            if report["rows_lost"]
+            else "the recording does not hold all of it"
+        )
         yield from (f"The tasks counted {of_all}; {why}.", "")
     rows = [
         [
@@ -249,8 +307,14 @@ def _misses(report: Report) -> Iterator[str | Grid]:
 
 def _task(task: Report | None) -> Iterator[str]:
     if task is not None:
-        done = f"{task['action']} of {task['actions']} actions, {task['moves_done']} of {task['moves']} elemental moves"
-        yield from ("", f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}.")
+        done = (
+            f"{task['action']} of {task['actions']} actions, {task['moves_done']} of"
+            f" {task['moves']} elemental moves"
+        )
+        yield from (
+            "",
+            f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}.",
+        )
 
 
 def _objects(objects: Sequence[Report]) -> Iterator[str]:
@@ -268,9 +332,10 @@ def _objects(objects: Sequence[Report]) -> Iterator[str]:
 def _motion(motion: Report | None) -> Iterator[str]:
     if motion is not None:
         yield (
-            f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS, {motion['tracking_peak_mrad']:.3f} peak; "
-            f"{motion['touches']} touches, {motion['clipped_cycles']} cycles clipped; "
-            f"limits exceeded in {motion['violations']} substeps, by a push from outside in {motion['pushed']}."
+            f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS,"
+            f" {motion['tracking_peak_mrad']:.3f} peak; {motion['touches']} touches,"
+            f" {motion['clipped_cycles']} cycles clipped; limits exceeded in {motion['violations']}"
+            f" substeps, by a push from outside in {motion['pushed']}."
         )
 
 
@@ -278,10 +343,11 @@ def _hand(hand: Report | None) -> Iterator[str | Grid]:
     if hand is None:
         return
     yield (
-        f"Tensions {hand['tension_rms_n']:.2f} N RMS off their commands, {hand['tension_peak_n']:.2f} peak; "
-        f"{hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N; valves closed in {hand['closed_cycles']} "
-        f"cycles; {hand['touches']} touches, {hand['clipped_cycles']} cycles clipped; "
-        f"limits exceeded in {hand['violations']} substeps, by a push from outside in {hand['pushed']}."
+        f"Tensions {hand['tension_rms_n']:.2f} N RMS off their commands,"
+        f" {hand['tension_peak_n']:.2f} peak; {hand['least_tension_n']:.2f} to"
+        f" {hand['largest_tension_n']:.2f} N; valves closed in {hand['closed_cycles']} cycles;"
+        f" {hand['touches']} touches, {hand['clipped_cycles']} cycles clipped; limits exceeded in"
+        f" {hand['violations']} substeps, by a push from outside in {hand['pushed']}."
     )
     forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
     yield f"Largest force on each tip, N: {forces}."
@@ -290,10 +356,14 @@ def _hand(hand: Report | None) -> Iterator[str | Grid]:
 def _force(force: Report | None) -> Iterator[str]:
     if force is None:
         return
-    off = "" if force["force_rms_n"] is None else f"; axes of force {force['force_rms_n']:.2f} N RMS off"
+    off = (
+        ""
+        if force["force_rms_n"] is None
+        else f"; axes of force {force['force_rms_n']:.2f} N RMS off"
+    )
     yield (
-        f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N m, "
-        f"beyond the arm's limits in {force['exceeded_cycles']} cycles{off}."
+        f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N"
+        f" m, beyond the arm's limits in {force['exceeded_cycles']} cycles{off}."
     )
 
 
@@ -301,8 +371,8 @@ def _queues(queues: Sequence[Report]) -> Iterator[str]:
     for queue in queues:
         refused = f", {queue['refused']} refused" if queue["refused"] else ""
         yield (
-            f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at most "
-            f"{queue['waiting']} waiting, room for {queue['capacity']}{refused}."
+            f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at"
+            f" most {queue['waiting']} waiting, room for {queue['capacity']}{refused}."
         )
 
 
@@ -311,11 +381,14 @@ def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
         lost = f", {board['lost']} lost" if board["lost"] else ""
         latency = board["latency_us"]
         took = (
-            f"; {latency['p50']:g} us from sending to the end of service, at most {latency['max']:g}" if latency else ""
+            f"; {latency['p50']:g} us from sending to the end of service, at most"
+            f" {latency['max']:g}"
+            if latency
+            else ""
         )
         yield (
-            f"Interrupts of {board['board']}: {board['served']} messages served, at most {board['waiting']} waiting, "
-            f"room for {board['depth']}{lost}{took}."
+            f"Interrupts of {board['board']}: {board['served']} messages served, at most"
+            f" {board['waiting']} waiting, room for {board['depth']}{lost}{took}."
         )
 
 
@@ -325,8 +398,14 @@ def _times_row(name: str, task: Report) -> dict[str, str]:
     for title, key in (("late", "lateness_ms"), ("exec", "execution_ms")):
         row |= {f"{title} {part}": figure(task[key], part) for part in ("p50", "p99", "max")}
     row |= {key: decimal(task[f"{key}_ms"]) for key in ("deviation", "alpha")}
-    row |= {"comm p99": figure(task["communication_ms"], "p99"), "proc p99": figure(task["processor_ms"], "p99")}
-    row |= {"residual min": figure(task["residual_ms"], "min"), "plan age max": figure(task.get("plan_age_ms"), "max")}
+    row |= {
+        "comm p99": figure(task["communication_ms"], "p99"),
+        "proc p99": figure(task["processor_ms"], "p99"),
+    }
+    row |= {
+        "residual min": figure(task["residual_ms"], "min"),
+        "plan age max": figure(task.get("plan_age_ms"), "max"),
+    }
     return row
 
 
@@ -340,13 +419,22 @@ def _response(response: Report | None) -> Iterator[str | Grid]:
 
 def _response_along(response: Report) -> Iterator[str | Grid]:
     yield ""
-    bounds = f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
-    yield f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its cycle."
+    bounds = (
+        f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
+    )
+    yield (
+        f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its"
+        " cycle."
+    )
     yield ""
     ways = {"command, down": response["command"], "status, up": response["status"]}
     rows = [
         [
-            way if len(found["levels"]) == len(response["levels"]) else f"{way} from {found['levels'][0]}",
+            (
+                way
+                if len(found["levels"]) == len(response["levels"])
+                else f"{way} from {found['levels'][0]}"
+            ),
             *(figure(found["measured_ms"], key) for key in ("p50", "max")),
             f"{found['bound_ms']:g}",
             JUDGED[found["holds"]],
@@ -357,12 +445,21 @@ def _response_along(response: Report) -> Iterator[str | Grid]:
     yield Grid(("way", "measured p50", "measured max", "bound", ""), rows)
     for way, found in ways.items():
         if found["beyond"]:
-            yield from ("", f"{way}: {len(found['beyond'])} beyond the bound{_first(found['beyond'], 'longest')}:")
+            yield from (
+                "",
+                (
+                    f"{way}: {len(found['beyond'])} beyond the"
+                    f" bound{_first(found['beyond'], 'longest')}:"
+                ),
+            )
         for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
             why = "; ".join(each["delayed_by"]) or "no cause is recorded"
             yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
         if found["unseen"]:
-            yield from ("", f"{way}: {found['unseen']} not measured: messages are missing in the recording.")
+            yield from (
+                "",
+                f"{way}: {found['unseen']} not measured: messages are missing in the recording.",
+            )
 
 
 def _entries(entries: list[Report]) -> Iterator[str | Grid]:
@@ -372,26 +469,41 @@ def _entries(entries: list[Report]) -> Iterator[str | Grid]:
     yield from ("", "## Bus adapters, ages in ms of simulated time", "")
     counts = ("entry", "source", "passed", "refused", "superseded", "full", "waiting")
     rows = [
-        [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
+        [
+            *(str(row[name]) for name in counts),
+            *(figure(row["age_ms"], key) for key in ("p50", "p99", "max")),
+        ]
         for row in entries
     ]
-    yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("superseded", "waiting", "source"))
+    yield Grid(
+        (*counts, "age p50", "age p99", "age max"), rows, ("superseded", "waiting", "source")
+    )
 
 
 def _network(network: Report | None) -> Iterator[str | Grid]:
-    """Yield what passed over the network, and how often other racks were lost; nothing without a network adapter."""
+    """Yield what passed over the network, and how often other racks were lost; nothing without a
+    network adapter."""
     if network is None:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")
     if imports := network["imports"]:
         counts = [name for name in imports[0] if name != "age_ms"]
         rows = [
-            [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ("p50", "p99", "max"))]
+            [
+                *(str(row[name]) for name in counts),
+                *(figure(row["age_ms"], key) for key in ("p50", "p99", "max")),
+            ]
             for row in imports
         ]
-        yield Grid((*counts, "age p50", "age p99", "age max"), rows, ("disordered", "repeated", "superseded", "source"))
+        yield Grid(
+            (*counts, "age p50", "age p99", "age max"),
+            rows,
+            ("disordered", "repeated", "superseded", "source"),
+        )
     for row in network["exports"]:
         yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
     for row in network["peers"]:
-        times = f"lost {row['losses']} times, {row['lost_s']:g} s; restarted {row['restarts']} times"
+        times = (
+            f"lost {row['losses']} times, {row['lost_s']:g} s; restarted {row['restarts']} times"
+        )
         yield f"- rack {row['peer']}: {row['state']}; {times}"

@@ -27,7 +27,8 @@ from rack.tools.recording.cycles import Cycles
 
 @dataclass(frozen=True)
 class Rule:
-    """An equation put to all cycles of a task: each side of `relation` has shape (cycles,), or is one number for all.
+    """An equation put to all cycles of a task: each side of `relation` has shape (cycles,), or is
+    one number for all.
 
     Sides are ns, or parts of a cycle where `unit` is "1".
     """
@@ -38,9 +39,12 @@ class Rule:
 
 
 def rules_for(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> list[Rule]:
-    """Return the equations put to the cycles of a task; `found` are the cycles of the run, by task."""
+    """Return the equations put to the cycles of a task; `found` are the cycles of the run, by
+    task."""
     is_executor = found[name].task.role == "executor"
-    return list(_executor_rules(name, found, rack) if is_executor else _planner_rules(name, found, rack))
+    return list(
+        _executor_rules(name, found, rack) if is_executor else _planner_rules(name, found, rack)
+    )
 
 
 def _executor_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Rule]:
@@ -50,15 +54,28 @@ def _executor_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) ->
     execution = cycles.process_ns
     communication = cycles.communication_ns
     yield Rule("3.1", _put(fits_cycle, execution, communication, period_ns))
-    yield Rule("3.4", _put(executes_in_time, execution, round(rack.longest_cycles[board] * rack.tick_ns)))
+    yield Rule(
+        "3.4", _put(executes_in_time, execution, round(rack.longest_cycles[board] * rack.tick_ns))
+    )
     yield Rule("3.6", _put(residual_is_left, period_ns - execution - communication))
     yield Rule("3.7", _put(Relation, steps_ns(cycles, rack), "=", period_ns))
     if rack.boards[board].coupling == "tight":
         update = _updates_ns(cycles, found.get(f"{name}.planner"))
         yield Rule(
-            "3.9", _put(leaves_time_to_plan, execution, communication + update, rack.context_switch_ns, period_ns)
+            "3.9",
+            _put(
+                leaves_time_to_plan,
+                execution,
+                communication + update,
+                rack.context_switch_ns,
+                period_ns,
+            ),
         )
-        yield Rule("3.10", _put(coupling_may_be_tight, cycles.exchange_ns + update, period_ns, rack.small_share), "1")
+        yield Rule(
+            "3.10",
+            _put(coupling_may_be_tight, cycles.exchange_ns + update, period_ns, rack.small_share),
+            "1",
+        )
     yield from _deadline(cycles, rack)
 
 
@@ -67,16 +84,25 @@ def _planner_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> 
     task = cycles.task
     executor = found.get(cycles.task.board)
     if rack.boards[task.board].coupling != "tight":
-        yield Rule(LOOSE_PLAN, _put(plan_fits_loose, cycles.used_ns, task.within_cycles, cycle_ns(rack, task)))
+        yield Rule(
+            LOOSE_PLAN,
+            _put(plan_fits_loose, cycles.used_ns, task.within_cycles, cycle_ns(rack, task)),
+        )
     elif executor is not None:
         left = _left_to_plan_ns(cycles, executor, rack)
-        yield Rule("3.8", _put(plan_fits_tight, cycles.used_ns, task.within_cycles, left, rack.context_switch_ns))
+        yield Rule(
+            "3.8",
+            _put(plan_fits_tight, cycles.used_ns, task.within_cycles, left, rack.context_switch_ns),
+        )
     yield from _deadline(cycles, rack)
 
 
 def _deadline(cycles: Cycles, rack: RackTiming) -> Iterator[Rule]:
     if not rack.is_lockstep:
-        yield Rule(RESPONSE_TIME, _put(Relation, response_ns(cycles, rack), "<=", slice_ns(rack, cycles.task)))
+        yield Rule(
+            RESPONSE_TIME,
+            _put(Relation, response_ns(cycles, rack), "<=", slice_ns(rack, cycles.task)),
+        )
 
 
 def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
@@ -92,16 +118,19 @@ def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
 def response_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
     """Return the time from the release to the end of each cycle, shape (n,).
 
-    A cycle whose message came too late, as its trace says, has missed its deadline whenever it ended.
+    A cycle whose message came too late, as its trace says, has missed its deadline whenever it
+    ended.
     """
     least = np.where(trace_times.is_missed(cycles.rows), slice_ns(rack, cycles.task) + 1, 0)
     return np.asarray(np.maximum(trace_times.response_ns(cycles.rows), least))
 
 
 def steps_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
-    """Return the time from the previous release to that of each cycle, t_(k+1) - t_k of eq. 3.7, shape (n,).
+    """Return the time from the previous release to that of each cycle, t_(k+1) - t_k of eq. 3.7,
+    shape (n,).
 
-    It follows from the releases skipped as traced: a restart, or a row lost by the recorder, is not a skipped release.
+    It follows from the releases skipped as traced: a restart, or a row lost by the recorder, is not
+    a skipped release.
     """
     return np.asarray((1 + trace_times.skipped(cycles.rows)) * cycle_ns(rack, cycles.task))
 
@@ -110,7 +139,9 @@ def _updates_ns(executor: Cycles, plans: Cycles | None) -> np.ndarray:
     """Return the time spent on updating the plan in each cycle of an executor, shape (n,)."""
     updates = np.zeros(len(executor.rows), np.int64)
     if plans is not None:
-        cycle = np.searchsorted(executor.rows["release_ns"], plans.rows["process_ns"], side="right") - 1
+        cycle = (
+            np.searchsorted(executor.rows["release_ns"], plans.rows["process_ns"], side="right") - 1
+        )
         np.add.at(updates, np.maximum(cycle, 0), plans.write_ns)
     return updates
 
@@ -126,7 +157,9 @@ def _left_to_plan_ns(plans: Cycles, executor: Cycles, rack: RackTiming) -> np.nd
     last = first + plans.task.every * plans.task.within_cycles
     begin, end = (np.searchsorted(executor.rows["tick"], ticks) for ticks in (first, last))
     # A plan at the end of the run is compared with the fewer cycles that it had.
-    cycles = np.clip((executor.rows["tick"][-1] - first) // executor.task.every + 1, 1, plans.task.within_cycles)
+    cycles = np.clip(
+        (executor.rows["tick"][-1] - first) // executor.task.every + 1, 1, plans.task.within_cycles
+    )
     return np.asarray((before[end] - before[begin]) / cycles)
 
 

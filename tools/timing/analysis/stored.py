@@ -1,5 +1,5 @@
-"""A report as `rack report` and `rack run` print it: the one in the run's folder as long as that is newer than the
-recording and this program.
+"""A report as `rack report` and `rack run` print it: the one in the run's folder as long as that is
+newer than the recording and this program.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ PROGRAM = Path(__file__).resolve().parents[3]
 
 
 def stored_report(folder: Path) -> tuple[dict[str, Any], str] | None:
-    """Return the report in the folder of a run, as data and as text; None if it must be made anew."""
+    """Return the report in the folder of a run, as data and as text; None if it must be made
+    anew."""
     try:
         made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
         newest_ns = max((folder / name).stat().st_mtime_ns for name in RECORDED)
@@ -38,11 +39,14 @@ def _changed_ns() -> Iterator[int]:
     """Yield the times at which this program's files were changed."""
     for floor in ("backplane", "levels", "boards", "tools"):
         for path, _, names in os.walk(PROGRAM / floor):
-            yield from (Path(path, name).stat().st_mtime_ns for name in names if name.endswith(".py"))
+            yield from (
+                Path(path, name).stat().st_mtime_ns for name in names if name.endswith(".py")
+            )
 
 
 def show_report(run: str | Path, as_json: bool) -> None:
-    """Print the report of a run: the one in its folder if that is still right, otherwise a new one."""
+    """Print the report of a run: the one in its folder if that is still right, otherwise a new
+    one."""
     report = stored_report(Path(run))
     if report is None:
         from rack.tools.timing.analysis.report import write_report
@@ -52,7 +56,8 @@ def show_report(run: str | Path, as_json: bool) -> None:
 
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no recording, `text`."""
+    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no
+    recording, `text`."""
     if as_json:
         print_json(data)
         return

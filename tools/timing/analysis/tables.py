@@ -17,10 +17,28 @@ SHOWN = 10
 """Most cycles in the list of those that broke an equation; the document has them all."""
 LEVELS = ["level", "", "R_i", "t_exec", "C", "R", "W", "t_comm", "t_residual", "t_plan", "d"]
 BY_THE_CLOCK = [
-    *("late p50", "late p99", "late p99.9", "late max", "response p99", "response max", "of", "largest gap"),
+    *(
+        "late p50",
+        "late p99",
+        "late p99.9",
+        "late max",
+        "response p99",
+        "response max",
+        "of",
+        "largest gap",
+    ),
 ]
 TASKS = ["task", "cycles", "missed", "skipped", "deviation", "overhead", *BY_THE_CLOCK]
-TASKS_DROPPED = ("late p99.9", "overhead", "late p50", "deviation", "largest gap", "cycles", "response p99", "late p99")
+TASKS_DROPPED = (
+    "late p99.9",
+    "overhead",
+    "late p50",
+    "deviation",
+    "largest gap",
+    "cycles",
+    "response p99",
+    "late p99",
+)
 """Columns that a narrow terminal leaves out, the first of them first."""
 EQUATIONS = ["eq.", "of", "predicted", "holds", "measured", "margin", "held", "", "meaning"]
 EQUATIONS_DROPPED = ("meaning", "margin", "predicted", "holds")
@@ -34,16 +52,25 @@ def text(analysis: Analysis, width: int | None = None) -> str:
 def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
     yield from _head(analysis)
     yield ""
-    yield f"Levels: processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of eq. 3.6."
+    yield (
+        f"Levels: processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of"
+        " eq. 3.6."
+    )
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
-    levels = [_level_row(n, side, of[n]) for n in analysis.config.board for side, of in sides.items() if n in of]
+    levels = [
+        _level_row(n, side, of[n])
+        for n in analysis.config.board
+        for side, of in sides.items()
+        if n in of
+    ]
     yield from table(LEVELS, levels, width, ("C", "R", "W", "d"))
     yield ""
     yield from (f"{name}: {summary(analysis, name)}" for name in analysis.config.board)
     yield ""
     yield (
-        "Tasks: wall clock in ms. Deviation: standard deviation of the residual from cycle to cycle. Overhead: "
-        "processor time of a cycle outside its parts, for waking up and closing it; the equations use 2 t_cs for it."
+        "Tasks: wall clock in ms. Deviation: standard deviation of the residual from cycle to"
+        " cycle. Overhead: processor time of a cycle outside its parts, for waking up and closing"
+        " it; the equations use 2 t_cs for it."
     )
     rows = [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()]
     # In lockstep there is no lateness and no deadline.
@@ -58,7 +85,10 @@ def _head(analysis: Analysis) -> Iterator[str]:
     config = analysis.config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.fails]
-    yield f"{config.name}: {len(pairs) - len(failing)} of {len(pairs)} equations held in {analysis.recording.folder}"
+    yield (
+        f"{config.name}: {len(pairs) - len(failing)} of {len(pairs)} equations held in"
+        f" {analysis.recording.folder}"
+    )
     if failing:
         yield f"failed: {_named(failing)}"
         if analysis.percentile > MOSTLY:
@@ -72,25 +102,46 @@ def _head(analysis: Analysis) -> Iterator[str]:
         yield "lockstep: no deadlines, no lateness; processor times are real"
     if restarted := restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
-    yield f"the first {START_UP_S:g} s of each process are not judged; t_cs is {config.timing.context_switch_ms:g} ms"
-    if stalled := ", ".join(f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled):
+    yield (
+        f"the first {START_UP_S:g} s of each process are not judged; t_cs is"
+        f" {config.timing.context_switch_ms:g} ms"
+    )
+    if stalled := ", ".join(
+        f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
+    ):
         yield f"cycles with a stall in them are not judged: {stalled}"
     for name, (traced, ran) in analysis.recording.untraced().items():
         yield f"{name}: judged by {traced:,} of {ran:,} cycles"
-    yield from (f"{count} rows of {name} were lost" for name, count in analysis.recording.lost.items() if count)
+    yield from (
+        f"{count} rows of {name} were lost"
+        for name, count in analysis.recording.lost.items()
+        if count
+    )
     yield from map(str, analysis.recording.gaps())
 
 
 def _named(pairs: list[Pair]) -> str:
     """Return equations by subject: "servo 3.1, 3.6; core 1 load"."""
     subjects = dict.fromkeys(pair.subject for pair in pairs)
-    named = {name: ", ".join(pair.equation for pair in pairs if pair.subject == name) for name in subjects}
+    named = {
+        name: ", ".join(pair.equation for pair in pairs if pair.subject == name)
+        for name in subjects
+    }
     return "; ".join(f"{name} {equations}" for name, equations in named.items())
 
 
 def _level_row(name: str, side: str, timing: LevelTiming) -> list[str]:
-    parts = (timing.execution_ns, timing.exchange_ns, timing.read_ns, timing.write_ns, timing.communication_ns)
-    times = [decimal(None if ns is None else ns * 1e-6) for ns in (*parts, timing.residual_ns, timing.planning_ns)]
+    parts = (
+        timing.execution_ns,
+        timing.exchange_ns,
+        timing.read_ns,
+        timing.write_ns,
+        timing.communication_ns,
+    )
+    times = [
+        decimal(None if ns is None else ns * 1e-6)
+        for ns in (*parts, timing.residual_ns, timing.planning_ns)
+    ]
     d = "-" if timing.within_cycles is None else str(timing.within_cycles)
     return [name, side, f"{timing.cycle_ns * 1e-6:g}", *times, d]
 
@@ -134,7 +185,10 @@ def _sides(verdict: EquationVerdict | None) -> tuple[str, str]:
 
 
 def _relation(relation: EquationVerdict | Broken) -> str:
-    return f"{_number(relation.left, relation.unit)} {relation.sign} {_number(relation.right, relation.unit)}"
+    return (
+        f"{_number(relation.left, relation.unit)} {relation.sign}"
+        f" {_number(relation.right, relation.unit)}"
+    )
 
 
 def _broken_cycles(analysis: Analysis) -> Iterator[str]:
@@ -143,7 +197,10 @@ def _broken_cycles(analysis: Analysis) -> Iterator[str]:
     others = len(analysis.breaches) - len(judged)
     yield ""
     if not judged:
-        yield f"No cycle broke an equation by its own numbers, except {others} in start-ups and stalls."
+        yield (
+            f"No cycle broke an equation by its own numbers, except {others} in start-ups and"
+            " stalls."
+        )
         return
     yield "Cycles that broke an equation by their own numbers:"
     for task in dict.fromkeys(breach.task for breach in judged):

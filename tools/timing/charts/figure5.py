@@ -1,4 +1,5 @@
-"""Figure 5 of the paper, as text and picture: the kind of concurrency that suits the cycle of each level of a rack."""
+"""Figure 5 of the paper, as text and picture: the kind of concurrency that suits the cycle of each
+level of a rack."""
 
 from __future__ import annotations
 
@@ -21,18 +22,31 @@ WIDTH = 84
 SHORTEST_S = 3e-5
 LONGEST_S = 1e3
 """Range of the axis."""
-TICKS = {1e-4: "0.1 ms", 1e-3: "1 ms", 1e-2: "10 ms", 1e-1: "100 ms", 1.0: "1 s", 10.0: "10 s", 60.0: "1 min"}
+TICKS = {
+    1e-4: "0.1 ms",
+    1e-3: "1 ms",
+    1e-2: "10 ms",
+    1e-1: "100 ms",
+    1.0: "1 s",
+    10.0: "10 s",
+    60.0: "1 min",
+}
 """Labels of the axis, s."""
 BANDS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
 """From the fastest region to the slowest (light tints of Paul Tol's colours)."""
 EDGE = "#222222"
 MARKERS = {"tight": ("s", EDGE), "loose": ("s", "white"), "none": ("x", EDGE)}
-MEANINGS = {"tight": "planner on its executor's processor", "loose": "planner on its own", "none": "no planner"}
+MEANINGS = {
+    "tight": "planner on its executor's processor",
+    "loose": "planner on its own",
+    "none": "no planner",
+}
 
 
 @dataclass(frozen=True)
 class Region:
-    """A region of implementation: cycles up to `to_s`, s, its name in the figure, and the place it gives a planner."""
+    """A region of implementation: cycles up to `to_s`, s, its name in the figure, and the place it
+    gives a planner."""
 
     name: str
     to_s: float
@@ -41,19 +55,26 @@ class Region:
 
 
 REGIONS = (
-    Region("fine-grained", 1e-3, "fine-grained multiprocessing or dedicated hardware", "hardware of its own"),
+    Region(
+        "fine-grained",
+        1e-3,
+        "fine-grained multiprocessing or dedicated hardware",
+        "hardware of its own",
+    ),
     Region("asynchronous", 0.25, "asynchronous multiprocessing", "a processor of its own"),
     Region("multitasking", 60.0, "multitasking", "a task on the executor's processor"),
     Region("distributed", float("inf"), "distributed processing, on a LAN", "a machine of its own"),
 )
-"""By cycle: "under 1 ms", "250 ms", "seconds", "minutes". A bound belongs to the faster region, except 1 ms."""
+"""By cycle: "under 1 ms", "250 ms", "seconds", "minutes". A bound belongs to the faster region,
+except 1 ms."""
 COUPLING = {"tight": "multitasking", "loose": "asynchronous"}
 """The region of each coupling in the figure."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A level in the figure: its cycle, s, the region of that cycle, its coupling, and a remark on both."""
+    """A level in the figure: its cycle, s, the region of that cycle, its coupling, and a remark on
+    both."""
 
     level: str
     cycle_s: float
@@ -70,12 +91,21 @@ def placed(config: RackConfig) -> list[Placed]:
     for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1]):
         region = region_of(cycle_s)
         coupling = config.board[name].coupling
-        found.append(Placed(name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}"))
+        found.append(
+            Placed(
+                name,
+                cycle_s,
+                region.words,
+                coupling,
+                f"{region.words}: {_remark(region, coupling)}",
+            )
+        )
     return found
 
 
 def together(levels: Sequence[Placed]) -> list[Placed]:
-    """Return the levels, those of the same place in the figure as one: a board a joint needs one line."""
+    """Return the levels, those of the same place in the figure as one: a board a joint needs one
+    line."""
     names: dict[Placed, list[str]] = {}
     for level in levels:
         names.setdefault(replace(level, level=""), []).append(level.level)
@@ -84,17 +114,23 @@ def together(levels: Sequence[Placed]) -> list[Placed]:
 
 def region_of(cycle_s: float) -> Region:
     """Return the region of a cycle."""
-    return next(r for r in REGIONS if cycle_s < r.to_s or (cycle_s == r.to_s and r is not REGIONS[0]))
+    return next(
+        r for r in REGIONS if cycle_s < r.to_s or (cycle_s == r.to_s and r is not REGIONS[0])
+    )
 
 
 def lines(config: RackConfig) -> Iterator[str]:
     """Yield the figure as text."""
     found = together(placed(config))
     margin = max(len(level.level) for level in found) + 2
-    yield f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
+    yield (
+        f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
+    )
     yield ""
     starts = [0, *(bound + 2 for bound in BOUNDS)]
-    yield " " * margin + label_row((start, region.name) for start, region in zip(starts, REGIONS, strict=True))
+    yield " " * margin + label_row(
+        (start, region.name) for start, region in zip(starts, REGIONS, strict=True)
+    )
     for level in found:
         yield f"{level.level:{margin}}{_row(level.cycle_s)}"
     yield " " * margin + label_row((_column(at), label) for at, label in TICKS.items())
@@ -104,8 +140,15 @@ def lines(config: RackConfig) -> Iterator[str]:
 
 def document(config: RackConfig) -> dict[str, Any]:
     """Return the figure as plain data; the last region has no end."""
-    regions = [{"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS]
-    return {"rack": config.name, "figure": 5, "regions": regions, "levels": [asdict(level) for level in placed(config)]}
+    regions = [
+        {"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS
+    ]
+    return {
+        "rack": config.name,
+        "figure": 5,
+        "regions": regions,
+        "levels": [asdict(level) for level in placed(config)],
+    }
 
 
 def duration(cycle_s: float) -> str:
@@ -124,7 +167,9 @@ def save(config: RackConfig, stem: Path) -> list[Path]:
         _draw_regions(axes)
         _draw_levels(axes, levels)
         axes.set_ylim(len(levels) - 0.4, -2.0)
-        axes.set_title(f"Figure 5: implementations for the levels of {config.name}", fontsize=10, loc="left")
+        axes.set_title(
+            f"Figure 5: implementations for the levels of {config.name}", fontsize=10, loc="left"
+        )
         figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return paths
 
@@ -134,7 +179,9 @@ def _draw_regions(axes: Axes) -> None:
     ends = [*(region.to_s for region in REGIONS[:-1]), LONGEST_S]
     for region, start, end, colour in zip(REGIONS, starts, ends, BANDS, strict=True):
         axes.axvspan(start, end, color=colour, linewidth=0)
-        words = region.words.replace(" or ", "\nor ").replace(", ", ",\n").replace(" multi", "\nmulti")
+        words = (
+            region.words.replace(" or ", "\nor ").replace(", ", ",\n").replace(" multi", "\nmulti")
+        )
         axes.text((start * end) ** 0.5, -1.2, words, ha="center", va="center", fontsize=8)
     axes.set_xscale("log")
     axes.set_xlim(SHORTEST_S, LONGEST_S)
@@ -147,13 +194,17 @@ def _draw_regions(axes: Axes) -> None:
 def _draw_levels(axes: Axes, levels: Sequence[Placed]) -> None:
     for row, level in enumerate(levels):
         marker, face = MARKERS[level.coupling]
-        (point,) = axes.plot([level.cycle_s], [row], marker, markersize=8, markeredgewidth=1.4, clip_on=False)
+        (point,) = axes.plot(
+            [level.cycle_s], [row], marker, markersize=8, markeredgewidth=1.4, clip_on=False
+        )
         point.set(markerfacecolor=face, markeredgecolor=EDGE)
         label = f"{level.level}, {duration(level.cycle_s)}"
         axes.annotate(label, (level.cycle_s, row), (9, 0), textcoords="offset points", va="center")
     for coupling in dict.fromkeys(level.coupling for level in levels):
         marker, face = MARKERS[coupling]
-        axes.plot([], [], marker, markerfacecolor=face, markeredgecolor=EDGE, label=MEANINGS[coupling])
+        axes.plot(
+            [], [], marker, markerfacecolor=face, markeredgecolor=EDGE, label=MEANINGS[coupling]
+        )
 
 
 def _remark(region: Region, coupling: str) -> str:
@@ -171,7 +222,9 @@ def _remark(region: Region, coupling: str) -> str:
 
 
 def _column(cycle_s: float) -> int:
-    part = log10(min(max(cycle_s, SHORTEST_S), LONGEST_S) / SHORTEST_S) / log10(LONGEST_S / SHORTEST_S)
+    part = log10(min(max(cycle_s, SHORTEST_S), LONGEST_S) / SHORTEST_S) / log10(
+        LONGEST_S / SHORTEST_S
+    )
     return round(part * (WIDTH - 1))
 
 

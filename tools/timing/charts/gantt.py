@@ -18,7 +18,9 @@ from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.scheduled import Schedule
 from rack.tools.timing.charts.window import WindowOptions
 
-NO_BUDGET = "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
+NO_BUDGET = (
+    "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Subject:
 
 
 def subject_of(text: str, settings: Sequence[str], out: Path | None) -> Subject:
-    """Return the subject named by `text`: the folder of a run, else a config by name or path, with `settings`.
+    """Return the subject named by `text`: the folder of a run, else a config by name or path, with
+    `settings`.
 
     Raises `Failure` and `ConfigError`.
     """
@@ -64,7 +67,9 @@ class Gantt:
 
     def text(self) -> str:
         """Return the chart as text."""
-        panels = [f"{self.rack}: " + "\n".join(lines(panel, self.column_ns)) for panel in self.panels]
+        panels = [
+            f"{self.rack}: " + "\n".join(lines(panel, self.column_ns)) for panel in self.panels
+        ]
         return "\n\n".join([*panels, *self.notes])
 
     def document(self) -> dict[str, Any]:
@@ -81,21 +86,29 @@ class Gantt:
 
 
 def gantt_of(
-    subject: Subject, options: WindowOptions, process_ns: Mapping[str, Sequence[int]], progress: Callable[[float], None]
+    subject: Subject,
+    options: WindowOptions,
+    process_ns: Mapping[str, Sequence[int]],
+    progress: Callable[[float], None],
 ) -> Gantt:
     """Return the chart of a subject. Raises `Failure`.
 
-    `process_ns` are times of X in a schedule, cycle by cycle, by board. `progress` takes the part of a run read so far.
+    `process_ns` are times of X in a schedule, cycle by cycle, by board. `progress` takes the part
+    of a run read so far.
     """
     name = subject.config.name
     run = subject.run
-    schedule = Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
+    schedule = (
+        Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
+    )
     if run is not None and not run.is_lockstep:
         task = options.task(run.tasks)
         start, end = options.window(task, run.end_ns, run.middle_ns(task))
         measured = run.panel(start, end, progress)
         if schedule is None:
-            return Gantt(name, (measured,), (f"no schedule: {NO_BUDGET}",), column_for(end - start, None))
+            return Gantt(
+                name, (measured,), (f"no schedule: {NO_BUDGET}",), column_for(end - start, None)
+            )
         schedule.on_cores_of(run.recording.layout)
         panels = measured, schedule.panel(start, end)
         return Gantt(name, panels, (), column_for(end - start, schedule.shortest_ns))
@@ -104,4 +117,6 @@ def gantt_of(
         raise Failure(f"{still}; {NO_BUDGET}" if run is not None else f"{name}: {NO_BUDGET}", 2)
     start, end = options.window(options.task(schedule.tasks), None, 0, schedule.shown_ns)
     notes = () if run is None else (f"{still}; only the schedule is shown",)
-    return Gantt(name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns))
+    return Gantt(
+        name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns)
+    )

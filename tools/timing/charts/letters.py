@@ -1,4 +1,5 @@
-"""A Gantt chart in letters, as in the paper's figures: a row for each lane, a unit function in each column."""
+"""A Gantt chart in letters, as in the paper's figures: a row for each lane, a unit function in each
+column."""
 
 from __future__ import annotations
 
@@ -27,10 +28,16 @@ SHOWN = 4
 def lines(panel: Panel, column_ns: int) -> Iterator[str]:
     """Yield a panel as text."""
     chart = panel.chart
-    yield f"{panel.kind}, {ms(chart.start_ns)} to {ms(chart.end_ns)} ms, a column is {ms(column_ns)} ms"
+    yield (
+        f"{panel.kind}, {ms(chart.start_ns)} to {ms(chart.end_ns)} ms, a column is"
+        f" {ms(column_ns)} ms"
+    )
     margin = max(len(lane.title) for lane in panel.lanes) + 2
     if panel.frames:
-        starts = [((start - chart.start_ns) // column_ns, f"|{number}") for number, start in panel.frames.items()]
+        starts = [
+            ((start - chart.start_ns) // column_ns, f"|{number}")
+            for number, start in panel.frames.items()
+        ]
         yield f"{'frame':{margin}}{label_row(starts)}"
     for lane in panel.lanes:
         yield f"{lane.title:{margin}}{_row(chart, lane, column_ns)}"
@@ -43,10 +50,13 @@ def lines(panel: Panel, column_ns: int) -> Iterator[str]:
 
 
 def column_for(window_ns: int, shortest_ns: int | None) -> int:
-    """Return the time of a column, ns: 1, 2 or 5 times a power of ten; it shows the shortest part if possible."""
+    """Return the time of a column, ns: 1, 2 or 5 times a power of ten; it shows the shortest part
+    if possible."""
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
-    seen = max((step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits)
+    seen = max(
+        (step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits
+    )
     return max(fits, seen)
 
 
@@ -77,7 +87,8 @@ def _letter(share: dict[str, int], column_ns: int) -> str:
 
 
 def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
-    """Return "|" where cycles begin and "!" where a deadline was missed; empty when there are none."""
+    """Return "|" where cycles begin and "!" where a deadline was missed; empty when there are
+    none."""
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
     if lane.cycle_ns >= CYCLE_COLUMNS * column_ns:
@@ -106,7 +117,8 @@ def label_row(labels: Iterable[tuple[int, str]]) -> str:
 
 
 def step_for(panel: Panel, narrowest_ns: int) -> int:
-    """Return the time between two labels of the axis, ns: the cycle of a lane if not too short nor too long."""
+    """Return the time between two labels of the axis, ns: the cycle of a lane if not too short nor
+    too long."""
     longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
     cycles = sorted(lane.cycle_ns for lane in panel.lanes)
     step = next((cycle for cycle in cycles if narrowest_ns <= cycle <= longest_ns), None)
@@ -126,18 +138,25 @@ def _patterns(panel: Panel) -> Iterator[str]:
 
 
 def _counted(name: str, counts: Counter[str], of: str) -> Iterator[str]:
-    (first, count), *others = [(_short(pattern), number) for pattern, number in counts.most_common(SHOWN)]
+    (first, count), *others = [
+        (_short(pattern), number) for pattern, number in counts.most_common(SHOWN)
+    ]
     yield f"{name}: {first}: {count} of {counts.total()} {of}"
     yield from (f"{' ' * len(name)}  {pattern}: {number}" for pattern, number in others)
     hidden = len(counts) - len(others) - 1
     if hidden:
-        yield f"{' ' * len(name)}  and {hidden} more patterns: {counts.total() - count - sum(n for _, n in others)}"
+        yield (
+            f"{' ' * len(name)}  and {hidden} more patterns:"
+            f" {counts.total() - count - sum(n for _, n in others)}"
+        )
 
 
 def _short(pattern: str) -> str:
     """Return a pattern with long rows of equal cycles written once."""
     runs = [(cycle, len(list(equal))) for cycle, equal in groupby(pattern.split(" | "))]
-    return " | ".join(" | ".join([cycle] * n) if n <= REPEATED else f"({cycle}) x {n}" for cycle, n in runs)
+    return " | ".join(
+        " | ".join([cycle] * n) if n <= REPEATED else f"({cycle}) x {n}" for cycle, n in runs
+    )
 
 
 def _late(panel: Panel) -> Iterator[str]:

@@ -1,4 +1,5 @@
-"""The Gantt chart of a run, from its trace: spans of unit functions, cut where a higher priority had the core."""
+"""The Gantt chart of a run, from its trace: spans of unit functions, cut where a higher priority
+had the core."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ BLOCK_NS = 1_000_000_000
 class TracedRun:
     """A recorded run in the terms of the timing model. Times are ns of the wall clock since tick 0.
 
-    Raises `ConfigError` when a file named by its config is missing, `Failure` for a trace that lacks columns.
+    Raises `ConfigError` when a file named by its config is missing, `Failure` for a trace that
+    lacks columns.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -35,7 +37,9 @@ class TracedRun:
         layout = recording.layout
         known = rack_timing(self.config, layout, dict.fromkeys(self.config.board, Budget())).tasks
         # The cores that the run obtained; the clock leaves no trace.
-        self.tasks = tuple(replace(t, core=layout.task(t.name).core) for t in known if t.role != "clock")
+        self.tasks = tuple(
+            replace(t, core=layout.task(t.name).core) for t in known if t.role != "clock"
+        )
 
     @property
     def is_lockstep(self) -> bool:
@@ -70,7 +74,8 @@ class TracedRun:
         return found
 
     def middle_ns(self, task: TimedTask) -> int:
-        """Return the first release of a task, or of its plans, in the second half of the run; 0 without one."""
+        """Return the first release of a task, or of its plans, in the second half of the run; 0
+        without one."""
         ticks = self._records[task.name][0]["tick"]
         at = int(np.searchsorted(ticks, self.end_ns // self._tick_ns // 2))
         return int(ticks[at]) * self._tick_ns if at < len(ticks) else 0
@@ -80,7 +85,9 @@ class TracedRun:
         """The end of the last cycle traced."""
         traces = self.recording.cycles.items()
         layout = self.recording.layout
-        lasts = [int(rows["tick"][-1]) + layout.task(task).every for task, rows in traces if len(rows)]
+        lasts = [
+            int(rows["tick"][-1]) + layout.task(task).every for task, rows in traces if len(rows)
+        ]
         return max(lasts, default=0) * self._tick_ns
 
     @property
@@ -89,7 +96,9 @@ class TracedRun:
 
     def chart(self, start_ns: int, end_ns: int) -> Chart:
         """Return the chart of the time from `start_ns` to `end_ns`."""
-        traced = [_Traced(task, self._cut(task, start_ns, end_ns), self._tick_ns) for task in self.tasks]
+        traced = [
+            _Traced(task, self._cut(task, start_ns, end_ns), self._tick_ns) for task in self.tasks
+        ]
         spans: list[Span] = []
         for core in {task.core for task in self.tasks}:
             spans += _spans([found for found in traced if found.task.core == core])
@@ -106,14 +115,18 @@ class TracedRun:
         """Return the trace records of a task that extend into a stretch of time."""
         rows, longest_ns = self._records[task.name]
         # A skipped release is in the record of the next one.
-        bounds = (start_ns - longest_ns) // self._tick_ns, (end_ns + task.every_ns) // self._tick_ns + 1
+        bounds = (
+            (start_ns - longest_ns) // self._tick_ns,
+            (end_ns + task.every_ns) // self._tick_ns + 1,
+        )
         first, last = np.searchsorted(rows["tick"], bounds).tolist()
         found: np.ndarray = rows[first:last]
         return found
 
     @cached_property
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
-        """The records of every task, only those of plans for a planner, and its longest response, ns."""
+        """The records of every task, only those of plans for a planner, and its longest response,
+        ns."""
         found = {}
         for task in self.tasks:
             rows = self.recording.trace(task.name)
@@ -135,9 +148,13 @@ class _Traced:
         every = self.task.every_ns
         period = self.task.period_ns
         left_out = skipped(self.rows) * (self.task.role == "executor")
-        for release, count, end in zip(self._releases(), left_out.tolist(), self._at("end_ns"), strict=True):
+        for release, count, end in zip(
+            self._releases(), left_out.tolist(), self._at("end_ns"), strict=True
+        ):
             for missing in range(count, 0, -1):
-                yield Job(self.task.name, release - missing * every, release - (missing - 1) * every, None)
+                yield Job(
+                    self.task.name, release - missing * every, release - (missing - 1) * every, None
+                )
             yield Job(self.task.name, release, release + period, end)
 
     def units(self) -> Iterator[tuple[int, Unit, Stretch]]:
@@ -150,7 +167,9 @@ class _Traced:
     def waking(self) -> Iterator[Stretch]:
         """Yield the times before its cycles in which it already had the processor, to wake up."""
         took = waking_ns(self.rows).tolist()
-        yield from ((start - ns, start) for start, ns in zip(self._at("start_ns"), took, strict=True) if ns)
+        yield from (
+            (start - ns, start) for start, ns in zip(self._at("start_ns"), took, strict=True) if ns
+        )
 
     def _releases(self) -> list[int]:
         found: list[int] = (self.rows["tick"] * self.tick_ns).tolist()
@@ -158,26 +177,34 @@ class _Traced:
 
     def _at(self, moment: str) -> list[int]:
         # Relative to its own release: ticks count from 0, the machine's clock from anything.
-        found: list[int] = (self.rows["tick"] * self.tick_ns + self.rows[moment] - self.rows["release_ns"]).tolist()
+        found: list[int] = (
+            self.rows["tick"] * self.tick_ns + self.rows[moment] - self.rows["release_ns"]
+        ).tolist()
         return found
 
 
 def _spans(traced: Sequence[_Traced]) -> Iterator[Span]:
-    """Yield the spans of one core by falling priority, each without the time taken by those above it."""
+    """Yield the spans of one core by falling priority, each without the time taken by those above
+    it."""
     levels: dict[tuple[int, bool], list[tuple[TimedTask, int, Unit, Stretch]]] = defaultdict(list)
     waking: dict[int, list[Stretch]] = defaultdict(list)
     for found in traced:
         task = found.task
         for release, unit, stretch in found.units():
-            # A critical section runs at its ceiling: equal priorities cannot preempt it, but it starts after them.
+            # A critical section runs at its ceiling: equal priorities cannot preempt it, but it
+            # starts after them.
             is_locked = unit is Unit.UPDATE and task.ceiling > task.priority
-            levels[-(task.ceiling if is_locked else task.priority), is_locked].append((task, release, unit, stretch))
+            levels[-(task.ceiling if is_locked else task.priority), is_locked].append(
+                (task, release, unit, stretch)
+            )
         if task.role == "executor":
             waking[-task.priority] += found.waking()
     busy: list[Stretch] = []
     for level, is_locked in sorted(levels):
         taken: list[Stretch] = []
-        for task, release, unit, stretch in sorted(levels[level, is_locked], key=lambda entry: entry[3]):
+        for task, release, unit, stretch in sorted(
+            levels[level, is_locked], key=lambda entry: entry[3]
+        ):
             for start, end in without(stretch, busy):
                 yield Span(task.name, task.core, unit, start, end, release)
                 taken.append((start, end))

@@ -1,4 +1,5 @@
-"""A chart with its lanes, late jobs and patterns: of a schedule, or as measured; and the arithmetic of stretches."""
+"""A chart with its lanes, late jobs and patterns: of a schedule, or as measured; and the arithmetic
+of stretches."""
 
 from __future__ import annotations
 
@@ -38,8 +39,8 @@ class Count:
 class Panel:
     """A chart cut to a window of time, with its lanes.
 
-    `patterns` by lane, and `counts` by task, cover the whole run, or a longer schedule. `frame_ns` is the minor frame
-    of a static schedule; 0: there is none.
+    `patterns` by lane, and `counts` by task, cover the whole run, or a longer schedule. `frame_ns`
+    is the minor frame of a static schedule; 0: there is none.
     """
 
     kind: Literal["schedule", "measured"]
@@ -51,20 +52,28 @@ class Panel:
 
     @property
     def frames(self) -> dict[int, int]:
-        """The start of every minor frame that begins in the window, ns, by number from the start of the run."""
+        """The start of every minor frame that begins in the window, ns, by number from the start of
+        the run."""
         if not self.frame_ns:
             return {}
-        numbers = range(-(-self.chart.start_ns // self.frame_ns), -(-self.chart.end_ns // self.frame_ns))
+        numbers = range(
+            -(-self.chart.start_ns // self.frame_ns), -(-self.chart.end_ns // self.frame_ns)
+        )
         return {number: number * self.frame_ns for number in numbers}
 
     def late(self, lane: Lane) -> list[Job]:
         """Return the jobs of a lane that were late in the window, by deadline."""
         found = [job for task in lane.tasks for job in self.chart.late(task)]
-        return sorted((job for job in found if job.deadline_ns <= self.chart.end_ns), key=lambda job: job.deadline_ns)
+        return sorted(
+            (job for job in found if job.deadline_ns <= self.chart.end_ns),
+            key=lambda job: job.deadline_ns,
+        )
 
     def idle(self, lane: Lane) -> Iterator[Stretch]:
         """Yield the stretches of the window in which the core of a lane was idle."""
-        busy = union((span.start_ns, span.end_ns) for span in self.chart.spans if span.core == lane.core)
+        busy = union(
+            (span.start_ns, span.end_ns) for span in self.chart.spans if span.core == lane.core
+        )
         yield from without((self.chart.start_ns, self.chart.end_ns), busy)
 
     def document(self) -> dict[str, Any]:
@@ -109,7 +118,10 @@ def _lane(lane: Lane) -> dict[str, Any]:
 
 def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
     times = {name: getattr(entry, f"{name}_ns") for name in names}
-    return {f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS for name, time_ns in times.items()}
+    return {
+        f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS
+        for name, time_ns in times.items()
+    }
 
 
 def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:

@@ -1,4 +1,5 @@
-"""Lanes, the rows of a Gantt chart, and their patterns: the order of unit functions in the cycles of a plan.
+"""Lanes, the rows of a Gantt chart, and their patterns: the order of unit functions in the cycles
+of a plan.
 
 A pattern is written as in the paper: "R X W P | R X W P U -".
 """
@@ -19,19 +20,22 @@ Stretch = tuple[int, int]
 """Start and end, ns."""
 IDLE = "-"
 SHORT = 0.02
-"""Part of a cycle below which a measured stretch may be a remnant, of a late wake-up or of a stretch cut in two."""
+"""Part of a cycle below which a measured stretch may be a remnant, of a late wake-up or of a
+stretch cut in two."""
 REMNANT = 0.25
 """Part of the median of a unit function: a remnant is shorter than that too, and left out."""
 GAP = 0.1
-"""Part of a cycle below which a measured gap is left out: waking up takes time, and is not idleness."""
+"""Part of a cycle below which a measured gap is left out: waking up takes time, and is not
+idleness."""
 
 
 @dataclass(frozen=True)
 class Lane:
     """A row of a Gantt chart: the tasks of one board on one core.
 
-    That is an executor, with its planner where they are tightly coupled, or a planner alone. `cycle_ns` is the level's
-    cycle, `slice_ns` the time for one plan; without a planner, one cycle. `phase_ns` is the start of the first cycle.
+    That is an executor, with its planner where they are tightly coupled, or a planner alone.
+    `cycle_ns` is the level's cycle, `slice_ns` the time for one plan; without a planner, one cycle.
+    `phase_ns` is the start of the first cycle.
     """
 
     core: int
@@ -71,7 +75,10 @@ class Lane:
 def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
     """Return the lanes of `tasks`, by core, then by falling priority."""
     places = dict.fromkeys((task.core, task.board) for task in tasks)
-    lanes = [_lane(core, [t for t in tasks if (t.core, t.board) == (core, board)]) for core, board in places]
+    lanes = [
+        _lane(core, [t for t in tasks if (t.core, t.board) == (core, board)])
+        for core, board in places
+    ]
     return tuple(sorted(lanes, key=lambda lane: (lane.core, -lane.priority, lane.cycle_ns)))
 
 
@@ -91,7 +98,8 @@ def _lane(core: int, tasks: list[TimedTask]) -> Lane:
 
 
 class Patterns(NamedTuple):
-    """How often each pattern occurred in a lane: over the cycles of a plan, and in single cycles without one."""
+    """How often each pattern occurred in a lane: over the cycles of a plan, and in single cycles
+    without one."""
 
     plans: Counter[str]
     cycles: Counter[str]
@@ -109,14 +117,16 @@ class Patterns(NamedTuple):
 
 @dataclass(frozen=True)
 class Detail:
-    """The longest stretches that patterns leave out, ns: of each unit function, and of an idle core."""
+    """The longest stretches that patterns leave out, ns: of each unit function, and of an idle
+    core."""
 
     short_ns: Mapping[Unit, int] = field(default_factory=dict)
     gap_ns: int = 0
 
     @classmethod
     def measured(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> Detail:
-        """Return the detail of the measured patterns of a lane, from the medians of its unit functions."""
+        """Return the detail of the measured patterns of a lane, from the medians of its unit
+        functions."""
         longest = round(SHORT * lane.cycle_ns)
         short = {unit: min(longest, round(REMNANT * median)) for unit, median in median_ns.items()}
         if lane.is_tight:
@@ -126,7 +136,8 @@ class Detail:
 
 
 def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patterns:
-    """Return the patterns of a lane that began within a stretch, with " | " between the cycles of a plan.
+    """Return the patterns of a lane that began within a stretch, with " | " between the cycles of a
+    plan.
 
     `chart` must extend beyond the stretch by a slice.
     """
@@ -154,13 +165,16 @@ def _by_cycle(spans: Sequence[Span], lane: Lane) -> dict[int, list[Span]]:
     first = lane.phase_ns
     cycle_ns = lane.cycle_ns
     for span in spans:
-        for cycle in range((span.start_ns - first) // cycle_ns, (span.end_ns - 1 - first) // cycle_ns + 1):
+        for cycle in range(
+            (span.start_ns - first) // cycle_ns, (span.end_ns - 1 - first) // cycle_ns + 1
+        ):
             found[cycle].append(span)
     return found
 
 
 def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
-    """Yield start, number of cycles and True for every plan; start, 1 and False for every cycle without one."""
+    """Yield start, number of cycles and True for every plan; start, 1 and False for every cycle
+    without one."""
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
@@ -186,6 +200,13 @@ def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -
     if within[1] - busy_until > detail.gap_ns:
         stretches.append((None, within[1] - busy_until))
     # Pieces of a unit function that other boards have preempted count as one.
-    wholes = [(unit, sum(ns for _, ns in pieces)) for unit, pieces in groupby(stretches, key=itemgetter(0))]
-    shown = [unit.value if unit else IDLE for unit, ns in wholes if unit is None or ns > detail.short_ns.get(unit, 0)]
+    wholes = [
+        (unit, sum(ns for _, ns in pieces))
+        for unit, pieces in groupby(stretches, key=itemgetter(0))
+    ]
+    shown = [
+        unit.value if unit else IDLE
+        for unit, ns in wholes
+        if unit is None or ns > detail.short_ns.get(unit, 0)
+    ]
     return " ".join(letter for letter, _ in groupby(shown)) or IDLE

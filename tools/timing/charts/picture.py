@@ -52,7 +52,8 @@ LETTER = 0.012
 
 
 def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
-    """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return their paths."""
+    """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return
+    their paths."""
     lanes = [len(panel.lanes) for panel in panels]
     height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
     paths = paths_of(stem)
@@ -61,9 +62,19 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
         for axes, panel in zip(rows[:, 0], panels, strict=True):
             _draw(axes, panel)
         rows[-1, 0].set_xlabel("time, ms")
-        used = [unit for unit in Unit if any(span.unit is unit for panel in panels for span in panel.chart.spans)]
+        used = [
+            unit
+            for unit in Unit
+            if any(span.unit is unit for panel in panels for span in panel.chart.spans)
+        ]
         handles = [Patch(facecolor=COLOURS[unit], label=NAMES[unit]) for unit in used]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
+        figure.legend(
+            handles=handles,
+            loc="outside lower center",
+            ncols=len(handles),
+            fontsize=8,
+            frameon=False,
+        )
         figure.suptitle(title, fontsize=11)
     return paths
 
@@ -78,11 +89,20 @@ def _draw(axes: Axes, panel: Panel) -> None:
         starts = [start / NS_PER_MS for start in panel.frames.values()]
         axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
         for number, start in panel.frames.items():
-            axes.annotate(f"frame {number}", (start / NS_PER_MS, count - 0.5), fontsize=7, va="bottom", color=GRID)
+            axes.annotate(
+                f"frame {number}",
+                (start / NS_PER_MS, count - 0.5),
+                fontsize=7,
+                va="bottom",
+                color=GRID,
+            )
     axes.set_xlim(chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS)
     axes.set_ylim(-0.5, count - 0.5)
     step = step_for(panel, (chart.end_ns - chart.start_ns) // LABELS)
-    labels = [time / NS_PER_MS for time in range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)]
+    labels = [
+        time / NS_PER_MS
+        for time in range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
+    ]
     axes.set_xticks(labels)
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
@@ -99,7 +119,11 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
     axes.broken_barh([(start, end - start)], (low, BAR), facecolors=FLOOR)
     own = [span for span in chart.spans if span.task in lane.tasks]
     for unit in Unit:
-        bars = [(s.start_ns / NS_PER_MS, (s.end_ns - s.start_ns) / NS_PER_MS) for s in own if s.unit is unit]
+        bars = [
+            (s.start_ns / NS_PER_MS, (s.end_ns - s.start_ns) / NS_PER_MS)
+            for s in own
+            if s.unit is unit
+        ]
         axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
     letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in own]
     letters += [(IDLE, idle) for idle in panel.idle(lane)]

@@ -32,7 +32,9 @@ class Schedule:
     Raises `Failure` for a board in `process_ns` without a budget.
     """
 
-    def __init__(self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]) -> None:
+    def __init__(
+        self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]
+    ) -> None:
         timing = rack_timing(config, layout)
         self.tasks = timing.tasks
         self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
@@ -45,7 +47,9 @@ class Schedule:
     def on_cores_of(self, layout: Layout) -> None:
         """Move the tasks to the cores that a run obtained."""
         of_run = {task.name: task.core for task in layout.tasks}
-        self.tasks = tuple(replace(task, core=of_run.get(task.name, task.core)) for task in self.tasks)
+        self.tasks = tuple(
+            replace(task, core=of_run.get(task.name, task.core)) for task in self.tasks
+        )
 
     @property
     def shortest_ns(self) -> int:
@@ -54,8 +58,11 @@ class Schedule:
 
     def panel(self, start_ns: int, end_ns: int) -> Panel:
         """Return the panel of a window."""
-        # The schedule repeats with the least common multiple of all slices; with phases, from the second time on.
-        cycles = [len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks]
+        # The schedule repeats with the least common multiple of all slices; with phases, from the
+        # second time on.
+        cycles = [
+            len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks
+        ]
         period = lcm(*cycles, *(task.period_ns for task in self.tasks))
         has_phases = any(task.phase_ns for task in self.tasks)
         skipped = max(0, start_ns // period - has_phases) * period
@@ -63,7 +70,10 @@ class Schedule:
         counted_ns = SLICES * longest
         until = max(end_ns - skipped, counted_ns + longest)
         if (jobs := sum(until // task.period_ns for task in self.tasks)) > MOST_CYCLES:
-            why = f"{SLICES} slices of the slowest task, {longest * 1e-6:g} ms each, hold {jobs} cycles of all"
+            why = (
+                f"{SLICES} slices of the slowest task, {longest * 1e-6:g} ms each, hold {jobs}"
+                " cycles of all"
+            )
             raise Failure(f"no schedule: {why}; at most {MOST_CYCLES} are simulated", 2)
         chart = simulate(self.tasks, until, self.switch_ns, self._variants)
         lanes = lanes_of(self.tasks)
@@ -80,7 +90,11 @@ class Schedule:
     def _variant(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
         executors = {task.name: task for task in self.tasks if task.role == "executor"}
         if board not in executors:
-            raise Failure(f"--process {board}: no board of that name has a budget; boards: {', '.join(executors)}", 2)
+            raise Failure(
+                f"--process {board}: no board of that name has a budget; boards:"
+                f" {', '.join(executors)}",
+                2,
+            )
         parts = [part for part in executors[board].parts if part.unit is not Unit.PROCESS]
         at = sum(part.unit is not Unit.WRITE for part in parts)
         return [(*parts[:at], Part(Unit.PROCESS, time), *parts[at:]) for time in times_ns]
@@ -91,7 +105,10 @@ def _later(chart: Chart, by_ns: int) -> Chart:
 
     def moved(entry: T, *names: str) -> T:
         times = {name: getattr(entry, name) for name in names}
-        return replace(entry, **{name: time_ns + by_ns for name, time_ns in times.items() if time_ns is not None})
+        return replace(
+            entry,
+            **{name: time_ns + by_ns for name, time_ns in times.items() if time_ns is not None},
+        )
 
     spans = tuple(moved(span, "start_ns", "end_ns", "release_ns") for span in chart.spans)
     jobs = tuple(moved(job, "release_ns", "deadline_ns", "end_ns") for job in chart.jobs)

@@ -1,4 +1,5 @@
-"""A coordinator and one arm, all levels and the simulated PUMA, as boards of one rack in one process."""
+"""A coordinator and one arm, all levels and the simulated PUMA, as boards of one rack in one
+process."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ class CellRack(Lockstep):
     """The coordinator `cell` and the PUMA."""
 
     def __init__(self, *steps: Sequence[Mapping[str, Any]], **params: Any) -> None:
-        cell = BoardSpec("cell", TASK_EVERY, Coordinator, params={"arms": {"puma": "task.report"}, **params})
+        cell = BoardSpec(
+            "cell", TASK_EVERY, Coordinator, params={"arms": {"puma": "task.report"}, **params}
+        )
         nasrem = load("nasrem")
         below = [board(nasrem, name, {}) for name in nasrem.board if name != "task"]
         task = {"step": [{"do": [{"arm": "puma", **action} for action in step]} for step in steps]}

@@ -1,4 +1,5 @@
-"""The agreement on each step, between a coordinator and arms that play theirs, through losses and restarts."""
+"""The agreement on each step, between a coordinator and arms that play theirs, through losses and
+restarts."""
 
 from __future__ import annotations
 
@@ -51,7 +52,11 @@ class PlayedArm:
             self._plan(now_s)
         elif taken.is_under_way:
             self._move(is_first=not was_under_way)
-        self.report.program, self.report.echo, self.report.response = taken.program, taken.order, taken.response
+        self.report.program, self.report.echo, self.report.response = (
+            taken.program,
+            taken.order,
+            taken.response,
+        )
         self.report.error, self.report.reason = taken.error, taken.reason
         head = taken.program, taken.order, taken.response
         return ArmAnswer(True, *head, taken.error, taken.reason, self.until)
@@ -86,7 +91,8 @@ class PlayedArm:
 
 
 class Play:
-    """The program played cycle by cycle. Everyone reads the newest message of another that was not lost."""
+    """The program played cycle by cycle. Everyone reads the newest message of another that was not
+    lost."""
 
     def __init__(self, **arms: PlayedArm) -> None:
         self.arms = {name: arms.get(name, PlayedArm()) for name in ARMS}
@@ -108,11 +114,16 @@ class Play:
         self.agreement.write_to(self.progress)
         for name in ARMS:
             if f">{name}" not in lost:
-                self.orders[name] = self.agreement.order, self.agreement.verb(name), self.agreement.reason
+                self.orders[name] = (
+                    self.agreement.order,
+                    self.agreement.verb(name),
+                    self.agreement.reason,
+                )
         self.check()
 
     def restart(self, who: str) -> None:
-        """Restart an arm's board, the coordinator's board ("cell"), or its whole rack ("launch")."""
+        """Restart an arm's board, the coordinator's board ("cell"), or its whole rack
+        ("launch")."""
         if who in self.arms:
             self.arms[who].restart()
             return
@@ -171,7 +182,9 @@ def disturb(play: Play, events: list[frozenset[str] | str]) -> None:
 
 @given(EVENTS)
 @settings(max_examples=100, deadline=None)
-def test_program_is_done_once_by_all_whatever_is_lost_and_restarted(events: list[frozenset[str] | str]) -> None:
+def test_program_is_done_once_by_all_whatever_is_lost_and_restarted(
+    events: list[frozenset[str] | str],
+) -> None:
     play = Play()
     disturb(play, events)
     play.finish()
@@ -188,7 +201,9 @@ def test_step_that_one_arm_refuses_is_begun_by_none(
     disturb(play, events)
     play.finish()
     by_arm = {"puma": puma, "third": third}
-    refused = [step for step, arms in enumerate(STEPS) for arm in arms if step in by_arm.get(arm, ())]
+    refused = [
+        step for step, arms in enumerate(STEPS) for arm in arms if step in by_arm.get(arm, ())
+    ]
     first = min(refused, default=len(STEPS))
     assert all(play.done_by(arms, step) == {int(step < first)} for step, arms in enumerate(STEPS))
     assert not any(arm.stopped for arm in play.arms.values())
@@ -233,8 +248,12 @@ def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(
     assert is_done or "its rack was launched anew" in play.agreement.reason
 
 
-@pytest.mark.parametrize(("keeps_s", "error", "attempts"), [(3.0, Error.NONE, 1), (0.5, Error.TOO_LATE, MAX_ATTEMPTS)])
-def test_promise_that_expires_is_asked_for_so_many_times(keeps_s: float, error: Error, attempts: int) -> None:
+@pytest.mark.parametrize(
+    ("keeps_s", "error", "attempts"), [(3.0, Error.NONE, 1), (0.5, Error.TOO_LATE, MAX_ATTEMPTS)]
+)
+def test_promise_that_expires_is_asked_for_so_many_times(
+    keeps_s: float, error: Error, attempts: int
+) -> None:
     play = Play(puma=PlayedArm(keeps_s=keeps_s))
     disturb(play, [frozenset(), frozenset(), *[frozenset({"k1607"})] * 8])
     asked = set[int]()

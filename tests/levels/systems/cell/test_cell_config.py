@@ -46,7 +46,8 @@ do = [{ arm = "puma", do = "home", by = 30.0 }]
 
 
 def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
-    """Return all mistakes of the rack after these changes of its text, as `rack check` reports them."""
+    """Return all mistakes of the rack after these changes of its text, as `rack check` reports
+    them."""
     text = RACK
     for old, new in changes:
         assert old in text
@@ -60,7 +61,13 @@ def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
 def test_rack_of_a_coordinator_has_a_mailbox_for_each_arm(tmp_path: Path) -> None:
     (tmp_path / "cell.toml").write_text(RACK)
     names = {box.name for box in resolve(load(tmp_path / "cell.toml")).layout.mailboxes}
-    assert {"task.order_puma", "task.order_k1607", "task.progress", "lan.puma", "lan.k1607"} <= names
+    assert {
+        "task.order_puma",
+        "task.order_k1607",
+        "task.progress",
+        "lan.puma",
+        "lan.k1607",
+    } <= names
 
 
 @pytest.mark.parametrize(
@@ -74,7 +81,10 @@ def test_rack_of_a_coordinator_has_a_mailbox_for_each_arm(tmp_path: Path) -> Non
         (
             'arm = "k1607"',
             'arm = "puma"',
-            'task.step[0].do[1].arm = "puma": has another action in this step; permitted: one action per arm',
+            (
+                'task.step[0].do[1].arm = "puma": has another action in this step; permitted: one'
+                " action per arm"
+            ),
         ),
         (
             "by = 30.0",
@@ -96,12 +106,16 @@ def test_rack_of_a_coordinator_has_a_mailbox_for_each_arm(tmp_path: Path) -> Non
         (
             'do = "home", by = 30.0',
             'do = "transfer", object = "a part whose name is longer than 32", to = [0, 0, 0]',
-            'task.step[1].do[0].object = "a part whose name is longer than 32": permitted in an order: '
-            "at most 32 ASCII characters",
+            (
+                'task.step[1].do[0].object = "a part whose name is longer than 32": permitted in an'
+                " order: at most 32 ASCII characters"
+            ),
         ),
     ],
 )
-def test_each_mistake_in_a_coordinators_config_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
+def test_each_mistake_in_a_coordinators_config_is_one_line(
+    tmp_path: Path, old: str, new: str, line: str
+) -> None:
     (found,) = mistakes(tmp_path, (old, new)).splitlines()
     assert line in found
 

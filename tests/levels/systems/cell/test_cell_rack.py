@@ -1,4 +1,5 @@
-"""A coordinator and the PUMA in one rack: orders carried out, kept to their times, through losses and restarts."""
+"""A coordinator and the PUMA in one rack: orders carried out, kept to their times, through losses
+and restarts."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ HOME = {"do": "home"}
 
 def is_over(rack: Lockstep) -> bool:
     """Say whether both levels have ended."""
-    return all(rack.read(box).state in (State.DONE, State.ERROR) for box in ("cell.status", "task.status"))
+    return all(
+        rack.read(box).state in (State.DONE, State.ERROR) for box in ("cell.status", "task.status")
+    )
 
 
 def is_moving(rack: Lockstep) -> bool:
@@ -46,7 +49,9 @@ def test_promised_time_is_kept_though_one_board_after_another_is_killed() -> Non
         rack.after(150 * ticks, lambda board=board: rack.lose(board, 60))  # type: ignore[misc]
     assert rack.run(18.0, lambda rack: rack.read("cell.status").action == 2)
     assert 18.5 < rack.seconds <= 20.0 + 0.5
-    assert rack.read("servo.status").position == pytest.approx(rack.tasks["servo"].level.context.robot.home, abs=0.01)
+    assert rack.read("servo.status").position == pytest.approx(
+        rack.tasks["servo"].level.context.robot.home, abs=0.01
+    )
     assert rack.read("task.report").echo == 2000
 
 
@@ -55,7 +60,10 @@ def test_arm_holds_on_its_path_while_its_coordinator_is_lost_or_held_and_goes_on
     assert rack.run(8.0, is_moving)
     rack.lose("cell", 800)
     rack.run(1.9)
-    assert (rack.task.state, rack.task.reason) == (State.HOLDING, "the coordinator is lost: held until it is back")
+    assert (rack.task.state, rack.task.reason) == (
+        State.HOLDING,
+        "the coordinator is lost: held until it is back",
+    )
     assert_rests(rack)
     rack.run(0.6)
     assert rack.task.state == State.EXECUTING
@@ -88,9 +96,17 @@ def test_coordinator_that_remembers_nothing_goes_on_with_the_step_under_way() ->
 @pytest.mark.parametrize(
     ("action", "error", "words"),
     [
-        ({"do": "goto", "position": [1.5, 0.0, 0.6]}, Error.UNREACHABLE, "goto [1.5, 0.0, 0.6]: out of reach: [1.5"),
+        (
+            {"do": "goto", "position": [1.5, 0.0, 0.6]},
+            Error.UNREACHABLE,
+            "goto [1.5, 0.0, 0.6]: out of reach: [1.5",
+        ),
         ({**HOME, "by": 0.2}, Error.TOO_LATE, "home, by 0.2 s: it is 0.50 s already"),
-        ({**TRANSFER, "object": "cup"}, Error.UNREACHABLE, "object = 'cup': not in the scene; objects: block1, b"),
+        (
+            {**TRANSFER, "object": "cup"},
+            Error.UNREACHABLE,
+            "object = 'cup': not in the scene; objects: block1, b",
+        ),
     ],
 )
 def test_order_that_cannot_be_done_ends_both_runs_with_the_reason(
@@ -100,5 +116,9 @@ def test_order_that_cannot_be_done_ends_both_runs_with_the_reason(
     assert rack.run(8.0, is_over)
     assert (rack.cell.state, rack.cell.error, rack.cell.moves) == (State.ERROR, error, 0)
     assert rack.cell.reason.startswith(f"step 0 refused: puma: {words}")
-    assert (rack.task.state, rack.task.error, rack.task.reason) == (State.ERROR, Error.GIVEN_UP, rack.cell.reason)
+    assert (rack.task.state, rack.task.error, rack.task.reason) == (
+        State.ERROR,
+        Error.GIVEN_UP,
+        rack.cell.reason,
+    )
     assert rack.read("primitive.status").done == 0

@@ -18,7 +18,10 @@ ORDERED = (
     "board.task.planner=rack.levels.systems.cell:OrderedTaskPlanner",
     "board.task.params={orders='cell.order_puma', decision=2.0}",
     "board.task.ends_run=false",
-    "board.cell={slot=9, rate_hz=4, executor='rack.levels.systems.cell:Coordinator', ends_run=true}",
+    (
+        "board.cell={slot=9, rate_hz=4, executor='rack.levels.systems.cell:Coordinator',"
+        " ends_run=true}"
+    ),
     "board.cell.params={arms={puma='task.report'}}",
     "fault=[{kind='kill', board='cell', at=2.5}, {kind='kill', board='task', at=4.5}]",
 )
@@ -32,7 +35,9 @@ def one_rack(name: str) -> RackConfig:
     return config.model_copy(update={"task": {"step": [{"do": [REACH]}]}})
 
 
-def test_order_is_done_in_time_by_the_boards_of_one_rack_whichever_is_killed(rack_name: str) -> None:
+def test_order_is_done_in_time_by_the_boards_of_one_rack_whichever_is_killed(
+    rack_name: str,
+) -> None:
     with Rack(one_rack(rack_name)) as rack:
         outcome = rack.run()
     assert (outcome.cause, outcome.faults) == ("task done", ())

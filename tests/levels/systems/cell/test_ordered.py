@@ -1,4 +1,5 @@
-"""An ordered task level alone: the test gives its orders, and plays the level below and the world."""
+"""An ordered task level alone: the test gives its orders, and plays the level below and the
+world."""
 
 from __future__ import annotations
 
@@ -49,13 +50,22 @@ class PlayedMoves(Executor):
 
 
 class OrderBench(Lockstep):
-    """The task level of an arm; orders come from the rack `cell`, whose time is `ahead` of the arm's."""
+    """The task level of an arm; orders come from the rack `cell`, whose time is `ahead` of the
+    arm's."""
 
     def __init__(self, ahead: float = 0.0, uncertainty: float = 0.0, **params: Any) -> None:
         outside = {"lan.orders": CELL_ORDER, "lan.peer_cell": PEER, "servo.status": SERVO_STATUS}
         table = {"coordinator": "cell", **params}
         boards = [
-            BoardSpec("task", EVERY, OrderedTaskExecutor, OrderedTaskPlanner, 4, below="elemental_move", params=table),
+            BoardSpec(
+                "task",
+                EVERY,
+                OrderedTaskExecutor,
+                OrderedTaskPlanner,
+                4,
+                below="elemental_move",
+                params=table,
+            ),
             BoardSpec("elemental_move", MOVE_EVERY, PlayedMoves, above="task"),
         ]
         super().__init__(boards, ROBOT, SCENE, outside={**outside, "world.model": WORLD_MODEL})
@@ -81,7 +91,13 @@ class OrderBench(Lockstep):
         world.revision = self.revision
         self.write("world.model", world)
 
-    def order(self, what: OrderVerb, action: Transfer | Goto | Home = HOME, number: int = 1000, **said: Any) -> None:
+    def order(
+        self,
+        what: OrderVerb,
+        action: Transfer | Goto | Home = HOME,
+        number: int = 1000,
+        **said: Any,
+    ) -> None:
         """Give an order now."""
         order = self.message("lan.orders")
         write_action(action, order)
@@ -96,7 +112,9 @@ class OrderBench(Lockstep):
 
     def until(self, *responses: Response, seconds: float = 20.0) -> Message:
         """Run until the report says one of these; return it."""
-        assert self.run(seconds, lambda rack: rack.read("task.report").response in responses), self.report
+        assert self.run(seconds, lambda rack: rack.read("task.report").response in responses), (
+            self.report
+        )
         return self.report
 
     def ask_and_do(self, action: Transfer | Goto | Home, number: int = 1000) -> None:
@@ -120,7 +138,11 @@ class OrderBench(Lockstep):
         """Return what the move under way is."""
         command, current = self.read("task.command"), self.read("elemental_move.status").current
         shown = command.moves[: command.count]
-        return Verb(int(shown["verb"][shown["id"] == current][0])) if current in shown["id"] else Verb.NONE
+        return (
+            Verb(int(shown["verb"][shown["id"] == current][0]))
+            if current in shown["id"]
+            else Verb.NONE
+        )
 
 
 def test_times_are_those_of_the_rack_that_gives_the_orders() -> None:
@@ -141,14 +163,20 @@ def test_time_of_a_rack_whose_clock_is_not_compared_is_waited_for() -> None:
     bench.order(OrderVerb.ASK, Home(by=30.0))
     bench.run(2.0)
     why = "the clock of rack 'cell' has not been compared yet"
-    assert (bench.status.state, bench.status.reason, bench.report.reason) == (State.HOLDING, why, why)
+    assert (bench.status.state, bench.status.reason, bench.report.reason) == (
+        State.HOLDING,
+        why,
+        why,
+    )
     bench.compare(50.0, 0.001)
     assert bench.until(Response.REFUSED).reason.startswith("home, by 30 s: it is 5")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("changes", "plans"), [(False, 1), (True, 2)])
-def test_promised_plan_is_made_anew_only_if_the_world_has_changed(changes: bool, plans: int) -> None:
+def test_promised_plan_is_made_anew_only_if_the_world_has_changed(
+    changes: bool, plans: int
+) -> None:
     bench = OrderBench()
     bench.order(OrderVerb.ASK, TRANSFER)
     bench.until(Response.POSSIBLE)
@@ -220,7 +248,10 @@ def test_arm_is_held_while_its_orders_are_lost_and_goes_on_with_the_same_order()
 def test_arm_whose_coordinator_stays_away_ends_its_run_and_says_so() -> None:
     bench = OrderBench(stalled_s=3.0)
     bench.run(3.0)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "no orders from rack 'cell' yet")
+    assert (bench.status.state, bench.status.reason) == (
+        State.HOLDING,
+        "no orders from rack 'cell' yet",
+    )
     bench.run(1.0)
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
     assert bench.status.reason == "nothing has moved for 3 s: no orders from rack 'cell' yet"

@@ -1,4 +1,5 @@
-"""Two racks whose arms share a body: each has a copy of it, and the arm that touches it last moves it in both."""
+"""Two racks whose arms share a body: each has a copy of it, and the arm that touches it last moves
+it in both."""
 
 from __future__ import annotations
 
@@ -53,7 +54,8 @@ MOVE_S = 0.5
 
 
 class Hoist(ServoRig):
-    """One rack: a hand that goes up and down, and a part on the table between its fingers, a little off the middle."""
+    """One rack: a hand that goes up and down, and a part on the table between its fingers, a little
+    off the middle."""
 
     executor = SharingServoExecutor
     outside = {"primitive.command": JOINT_SET_POINT, "lan.shared": SHARED_BODIES}
@@ -72,7 +74,9 @@ class Hoist(ServoRig):
             jerk=(200.0,),
             gripper=gripper,
         )
-        super().__init__(robot, SceneConfig(objects=("part",), supports=("table",)), name, shared=("part",))
+        super().__init__(
+            robot, SceneConfig(objects=("part",), supports=("table",)), name, shared=("part",)
+        )
         self.course = Course(np.array([AWAY_M]), np.array([AWAY_M]), 1.0)
         self.begun = 0
 
@@ -82,7 +86,10 @@ class Hoist(ServoRig):
 
     def go(self, height: float) -> None:
         """Move the hand to a height, m, within `MOVE_S`."""
-        self.course, self.begun = Course(self.course.goal, np.array([height]), MOVE_S), self.rack.tick
+        self.course, self.begun = (
+            Course(self.course.goal, np.array([height]), MOVE_S),
+            self.rack.tick,
+        )
 
     def tick(self) -> None:
         """Run one tick along the course."""
@@ -107,7 +114,8 @@ class Hoist(ServoRig):
 
 
 class Pair:
-    """Two racks that step together and read each other's messages one exchange, 20 ms, later; unless `apart`."""
+    """Two racks that step together and read each other's messages one exchange, 20 ms, later;
+    unless `apart`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -151,7 +159,9 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
     pair.run(0.1)
     yield pair
     for hoist in (pair.alpha, pair.beta):
-        assert hoist.status.touches == hoist.status.violations == 0, "nothing was struck, no limit broken"
+        assert hoist.status.touches == hoist.status.violations == 0, (
+            "nothing was struck, no limit broken"
+        )
 
 
 def test_a_part_that_nobody_has_touched_belongs_to_nobody(pair: Pair) -> None:
@@ -168,7 +178,9 @@ def test_the_arm_that_takes_the_part_moves_it_in_both_simulations(pair: Pair) ->
 
 @pytest.mark.slow
 def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
-    for number, (hoist, other) in enumerate([(pair.alpha, pair.beta), (pair.beta, pair.alpha)] * 2, start=1):
+    for number, (hoist, other) in enumerate(
+        [(pair.alpha, pair.beta), (pair.beta, pair.alpha)] * 2, start=1
+    ):
         pair.lift(hoist)
         assert hoist.claim == other.claim == Claim(number, hoist.servo.context.rack.encode())
         assert other.part[2] == pytest.approx(0.025 + UP_M, abs=0.003), "the copy is lifted, too"
@@ -177,7 +189,9 @@ def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
         np.testing.assert_allclose(other.part, hoist.part, atol=1e-4)
     differing = [(a, b) for a, b in pair.claims if a != b]
     assert len(differing) <= 4 * 2 * PERIOD, "after two exchanges both know"
-    assert all(abs(a.number - b.number) == 1 for a, b in differing), "and until then one claim is the greater"
+    assert all(abs(a.number - b.number) == 1 for a, b in differing), (
+        "and until then one claim is the greater"
+    )
 
 
 def test_of_two_arms_that_take_the_part_at_once_the_name_decides(pair: Pair) -> None:
@@ -202,7 +216,9 @@ def test_a_copy_stays_in_the_air_when_the_other_rack_is_lost(pair: Pair) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"])
+@pytest.mark.parametrize(
+    "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
+)
 def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     pair: Pair, restarted: Callable[[Pair], Hoist]
 ) -> None:
@@ -265,7 +281,8 @@ def test_only_the_owner_says_where_its_body_is() -> None:
 
 
 @pytest.mark.parametrize(
-    "message", [word(b"beta", Claim(2, b"beta"), 1.0), word(b"beta", Claim(9, b"beta"), 1.0, b"peg")]
+    "message",
+    [word(b"beta", Claim(2, b"beta"), 1.0), word(b"beta", Claim(9, b"beta"), 1.0, b"peg")],
 )
 def test_a_smaller_claim_and_another_body_change_nothing(message: Message) -> None:
     body = SharedBody(b"part", b"alpha", Claim(3, b"alpha"))
@@ -287,7 +304,11 @@ def test_an_arm_that_still_touches_a_body_does_not_claim_it_back() -> None:
 def test_a_claim_after_the_greatest_number_is_that_number_again() -> None:
     message, body = Message(SHARED_BODIES.dtype({})), SharedBody(b"part", b"one")
     greatest = (1 << 32) - 1
-    message.bodies[0]["name"], message.bodies[0]["owner"], message.bodies[0]["claim"] = b"part", b"two", greatest
+    message.bodies[0]["name"], message.bodies[0]["owner"], message.bodies[0]["claim"] = (
+        b"part",
+        b"two",
+        greatest,
+    )
     body.hear(message)
     body.touch(True)
     body.show(message.bodies[0], np.zeros(7))

@@ -1,4 +1,5 @@
-"""A trajectory level, hybrid control, a board that servoes joints, and an arm with a pad over a table."""
+"""A trajectory level, hybrid control, a board that servoes joints, and an arm with a pad over a
+table."""
 
 from __future__ import annotations
 
@@ -32,9 +33,12 @@ START = (0.55, 0.0, TABLE_M + 0.02)
 
 
 class HybridRig:
-    """Runs the levels tick by tick; the test queues motions, and writes what is wanted of the contact."""
+    """Runs the levels tick by tick; the test queues motions, and writes what is wanted of the
+    contact."""
 
-    def __init__(self, folder: Path, every: int = 5, start: Sequence[float] = START, **gains: float) -> None:
+    def __init__(
+        self, folder: Path, every: int = 5, start: Sequence[float] = START, **gains: float
+    ) -> None:
         robot, scene = pad(folder)
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
         home = ik.solutions(pose(start, DOWN), np.array(robot.home), lambda q: True)[0]
@@ -43,10 +47,16 @@ class HybridRig:
         boards = [
             BoardSpec("arm", 1, ForceArmExecutor, above="servo"),
             BoardSpec("servo", 1, JointServo, above="hybrid", below="arm"),
-            BoardSpec("hybrid", every, HybridExecutor, above="trajectory", below="servo", params=gains),
+            BoardSpec(
+                "hybrid", every, HybridExecutor, above="trajectory", below="servo", params=gains
+            ),
             BoardSpec("trajectory", 20, TrajectoryExecutor, above="client", below="hybrid"),
         ]
-        outside = {"client.requests": MOTION_REQUEST, "trajectory.compliance": COMPLIANCE, "world.model": WORLD_MODEL}
+        outside = {
+            "client.requests": MOTION_REQUEST,
+            "trajectory.compliance": COMPLIANCE,
+            "world.model": WORLD_MODEL,
+        }
         self.rack = Lockstep(boards, robot, scene, outside=outside, clock_ns=CLOCK_NS)
         world = self.rack.message("world.model")
         world.revision = 1
@@ -60,13 +70,21 @@ class HybridRig:
     def line(self, position: Sequence[float], segment: float = 0.0) -> int:
         """Queue a line of the tool; return its id."""
         request = self._request
-        request.id, request.kind, request.body, request.segment = request.id + 1, MotionKind.POSE, -1, segment
+        request.id, request.kind, request.body, request.segment = (
+            request.id + 1,
+            MotionKind.POSE,
+            -1,
+            segment,
+        )
         request.position, request.quaternion = position, DOWN
         self.rack.write("client.requests", request)
         return int(request.id)
 
-    def comply(self, z: float | None, speed: float = 0.03, guard: Sequence[float] = (0.0,) * 6) -> int:
-        """Want the tool to press with a force, N, along z; None: z is an axis of motion. Return the command's id."""
+    def comply(
+        self, z: float | None, speed: float = 0.03, guard: Sequence[float] = (0.0,) * 6
+    ) -> int:
+        """Want the tool to press with a force, N, along z; None: z is an axis of motion. Return the
+        command's id."""
         command = self.compliance
         command.id, command.active = command.id + 1, z is not None or any(guard)
         command.selected = (0, 0, z is not None, 0, 0, 0)
@@ -108,8 +126,11 @@ class HybridRig:
         return self.output("trajectory", "status")
 
     def steps(self) -> tuple[float, float]:
-        """Return the greatest velocity and acceleration of the targets so far, as parts of the limits."""
+        """Return the greatest velocity and acceleration of the targets so far, as parts of the
+        limits."""
         speeds = np.diff(self.targets, axis=0) * 1e9 / CLOCK_NS
         bends = np.diff(speeds, axis=0) * 1e9 / CLOCK_NS
         limits = self.cell.limits
-        return float(np.abs(speeds / limits.velocity).max()), float(np.abs(bends / limits.acceleration).max())
+        return float(np.abs(speeds / limits.velocity).max()), float(
+            np.abs(bends / limits.acceleration).max()
+        )

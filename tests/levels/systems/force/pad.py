@@ -23,8 +23,9 @@ WORLD = """
 <geom name="wall" type="box" size=".02 .3 .3" pos=".78 0 .75"/>
 """
 SOFT = 'solref="-1000 -20" solimp=".5 .5 .001"'
-"""A rubber pad. In MuJoCo a contact at rest has the stiffness m k d / (1 - d), with the inertia m that it sees, the
-first number of `solref` for -k, and of `solimp` for d: with the usual d of 0.95 it would be 19 times as stiff."""
+"""A rubber pad. In MuJoCo a contact at rest has the stiffness m k d / (1 - d), with the inertia m
+that it sees, the first number of `solref` for -k, and of `solimp` for d: with the usual d of 0.95
+it would be 19 times as stiff."""
 SENSORS = """
 <sensor>
   <force name="wrist_force" site="{force}" cutoff="{range}"/>
@@ -48,15 +49,30 @@ def pad(
     `resolution` is that of the encoders, rad; `reach` the range of the sensor, N.
     """
     before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
-    after = rest.split("</body>", 3)[3].replace('<exclude body1="finger_left" body2="finger_right"/>', "")
-    after = after.replace('body2="hand"', 'body2="tool"').replace("</worldbody>", WORLD + "</worldbody>")
+    after = rest.split("</body>", 3)[3].replace(
+        '<exclude body1="finger_left" body2="finger_right"/>', ""
+    )
+    after = after.replace('body2="hand"', 'body2="tool"').replace(
+        "</worldbody>", WORLD + "</worldbody>"
+    )
     equality, actuator = after.index("<equality>"), after.index("<actuator>")
-    after = after[:equality] + SENSORS.format(force=sites[0], torque=sites[1], range=reach) + after[actuator:]
+    after = (
+        after[:equality]
+        + SENSORS.format(force=sites[0], torque=sites[1], range=reach)
+        + after[actuator:]
+    )
     after = after.replace('<motor name="grip" joint="finger_left" ctrlrange="-60 60"/>', "")
-    text = (before + PAD + after).replace("{contact}", contact).replace("{friction}", f"{friction:g}")
+    text = (
+        (before + PAD + after).replace("{contact}", contact).replace("{friction}", f"{friction:g}")
+    )
     model = folder / "pad.xml"
     model.write_text(text)
     robot, _ = config("puma560")
-    changes = {"model": model, "gripper": None, "substeps": 4, "wrist": WristConfig(**{**WRIST, **wrist})}
+    changes = {
+        "model": model,
+        "gripper": None,
+        "substeps": 4,
+        "wrist": WristConfig(**{**WRIST, **wrist}),
+    }
     changes["sensors"] = SensorConfig(resolution=resolution)
     return robot.model_copy(update=changes), SceneConfig(supports=("table", "wall"))

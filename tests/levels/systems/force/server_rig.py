@@ -26,7 +26,8 @@ STIFFNESS, YIELD = 6000.0, 0.002
 
 
 class ServerRig(TrajectoryRig):
-    """The board goes after the wanted force along z of the task frame; a guard that is struck stops it."""
+    """The board goes after the wanted force along z of the task frame; a guard that is struck stops
+    it."""
 
     level_class = ForceServer
     request_type = SERVER_REQUEST
@@ -76,7 +77,12 @@ class ServerRig(TrajectoryRig):
 
     def obey(self) -> None:
         """Follow set points and forces, or hold."""
-        command, wanted, force, status = self.write.command, self.write.compliance, self.force, self.statuses["joints0"]
+        command, wanted, force, status = (
+            self.write.command,
+            self.write.compliance,
+            self.force,
+            self.statuses["joints0"],
+        )
         if self.alive and not self.queue:
             self.queue.append(self.message(SERVER_REQUEST))
         before = status.target.copy()
@@ -87,7 +93,9 @@ class ServerRig(TrajectoryRig):
                 self.offset = 0.0
             if wanted.active and wanted.selected[2]:
                 missing = wanted.wrench[2] + force.wrench[2]
-                self.offset += PERIOD_S * float(np.clip(YIELD * missing, -wanted.speed[2], wanted.speed[2]))
+                self.offset += PERIOD_S * float(
+                    np.clip(YIELD * missing, -wanted.speed[2], wanted.speed[2])
+                )
             status.target = self._joints(self._lowered(self.ik.tool_at(command.position)), before)
         status.holding, status.position = not follows, status.target
         status.target_velocity = 0.0 if not follows else (status.target - before) / PERIOD_S

@@ -33,19 +33,26 @@ FREE_M, WALL_M = 0.74, 0.76
 
 
 class PressRig:
-    """An arm board and a board that servoes its joints, under references for the tool, forwards and backwards."""
+    """An arm board and a board that servoes its joints, under references for the tool, forwards and
+    backwards."""
 
-    def __init__(self, folder: Path, reach: float = 150.0, resolution: float = 0.0, **arm: Any) -> None:
+    def __init__(
+        self, folder: Path, reach: float = 150.0, resolution: float = 0.0, **arm: Any
+    ) -> None:
         robot, scene = pad(folder, reach=reach, resolution=resolution)
         boards = [
             BoardSpec("arm", 1, ForceArmExecutor, above="servo", params=arm),
             BoardSpec("servo", 1, JointServo, above="level", below="arm"),
         ]
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
-        self._near = ik.solutions(pose((FREE_M, 0.0, 0.75), FORWARD), np.array(robot.home), lambda q: True)[0]
+        self._near = ik.solutions(
+            pose((FREE_M, 0.0, 0.75), FORWARD), np.array(robot.home), lambda q: True
+        )[0]
         robot = robot.model_copy(update={"home": tuple(self._near)})
         cell = build_cell(robot, scene, CLOCK_NS)
-        self.rack = Lockstep(boards, robot, scene, outside={"level.command": JOINT_REFERENCE}, clock_ns=CLOCK_NS)
+        self.rack = Lockstep(
+            boards, robot, scene, outside={"level.command": JOINT_REFERENCE}, clock_ns=CLOCK_NS
+        )
         self._ik, self._dynamics, self.x = ik, Dynamics(cell), FREE_M
         self.command = self.rack.message("level.command")
         self.found: list[Found] = []
@@ -72,7 +79,9 @@ class PressRig:
             self._near = self._ik.nearby(pose((to, 0.0, 0.75), FORWARD), before)
             assert self._near is not None
             still = to == x
-            velocity = np.zeros(6) if still or speed == 0.0 else (self._near - before) / (PERIOD * 1e-3)
+            velocity = (
+                np.zeros(6) if still or speed == 0.0 else (self._near - before) / (PERIOD * 1e-3)
+            )
             terms = self._dynamics.terms(self._near, velocity)
             command, self.command.due = self.command, self.rack.tick + 2 * PERIOD
             command.id += 1
@@ -124,8 +133,12 @@ def test_free_motion_is_no_contact(tmp_path: Path, resolution: float, most: floa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("on_force_limit", "is_braked"), [("brake", True), ("stop", True), ("hold", False)])
-def test_a_contact_beyond_the_limit_stops_the_arm(tmp_path: Path, on_force_limit: str, is_braked: bool) -> None:
+@pytest.mark.parametrize(
+    ("on_force_limit", "is_braked"), [("brake", True), ("stop", True), ("hold", False)]
+)
+def test_a_contact_beyond_the_limit_stops_the_arm(
+    tmp_path: Path, on_force_limit: str, is_braked: bool
+) -> None:
     rig = pressed(tmp_path, 0.01, seconds=1.0, retry=2.0, on_force_limit=on_force_limit)
     assert rig.alarms() == [Alarm.FORCE_LIMIT]
     found = next(found for found in rig.found if found.finding.alarm is Alarm.FORCE_LIMIT)
@@ -157,7 +170,9 @@ def test_a_contact_that_stays_too_strong_is_latched(tmp_path: Path) -> None:
 
 def test_a_sensor_at_the_end_of_its_range_stops_the_arm(tmp_path: Path) -> None:
     rig = PressRig(tmp_path, reach=60.0)
-    rig.arm.contact.take(np.array([60.0, 0, 0, 0, 0, 0]), np.array([rig.arm.cell.home, np.zeros(6)]), np.zeros(6))
+    rig.arm.contact.take(
+        np.array([60.0, 0, 0, 0, 0, 0]), np.array([rig.arm.cell.home, np.zeros(6)]), np.zeros(6)
+    )
     assert rig.arm.contact.saturated
     rig.go(FREE_M, 0.1)
     rig.go(WALL_M + 0.02, 0.4)

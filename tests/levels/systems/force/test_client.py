@@ -87,7 +87,11 @@ def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
     arm.guard("wall")
     arm.free()
     comply, guard, free = bus.requests
-    assert [request["kind"] for request in bus.requests] == [MotionKind.COMPLY, MotionKind.GUARD, MotionKind.COMPLY]
+    assert [request["kind"] for request in bus.requests] == [
+        MotionKind.COMPLY,
+        MotionKind.GUARD,
+        MotionKind.COMPLY,
+    ]
     assert comply["selected"].tolist() == [False, False, True, True, False, False]
     assert comply["wrench"].tolist() == [0, 0, 20, 0, 0, 0]
     assert comply["speed"].tolist() == [0, 0, 0.1, 0, 0, 0]
@@ -112,7 +116,11 @@ def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
 
 
 def test_what_the_server_says_is_read(bus: Bus, arm: ForceMotions) -> None:
-    bus.status.wrench, bus.status.mode, bus.status.place = (0, 0, 14.5, 0, 0, 0), Mode.FORCE, (0.5, 0.1, 0.4)
+    bus.status.wrench, bus.status.mode, bus.status.place = (
+        (0, 0, 14.5, 0, 0, 0),
+        Mode.FORCE,
+        (0.5, 0.1, 0.4),
+    )
     assert arm.wrench()["z"] == 14.5
     assert arm.mode() is Mode.FORCE
     assert arm.where() == [0.5, 0.1, 0.4]
@@ -137,7 +145,12 @@ def test_what_the_server_says_is_read(bus: Bus, arm: ForceMotions) -> None:
             "contact 'wall': torque 9 N m; permitted by the arm and its sensor: 8",
         ),
         ("comply", "wipe", {"wrench": {"w": 5.0}}, "wrench.w"),
-        ("comply", "wipe", {"speed": {"x": 0.1}}, "contact 'wipe': axis x has a speed and no force; axes of force: z"),
+        (
+            "comply",
+            "wipe",
+            {"speed": {"x": 0.1}},
+            "contact 'wipe': axis x has a speed and no force; axes of force: z",
+        ),
     ],
 )
 def test_an_impossible_contact_is_refused_at_once(
@@ -175,7 +188,9 @@ def test_an_impossible_contact_is_refused_at_once(
         ),
     ],
 )
-def test_a_program_that_is_impossible_is_found_before_the_launch(table: Any, key: str, reason: str) -> None:
+def test_a_program_that_is_impossible_is_found_before_the_launch(
+    table: Any, key: str, reason: str
+) -> None:
     found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
     assert [(place, why) for place, _, why in found] == [(key, reason)]
 

@@ -1,4 +1,5 @@
-"""Hybrid control under a trajectory level: a tool that presses on a table, slides, and meets what guards it."""
+"""Hybrid control under a trajectory level: a tool that presses on a table, slides, and meets what
+guards it."""
 
 from __future__ import annotations
 
@@ -89,7 +90,9 @@ def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
         rig.comply(-2.0 * WANTED_N)
         rig.run(1.0)
     command = rig.comply(-2.0 * WANTED_N if axis == 1 else None, guard=guard)
-    way = (start[0], start[1] + 0.1, start[2]) if axis == 1 else (start[0], start[1], start[2] - 0.05)
+    way = (
+        (start[0], start[1] + 0.1, start[2]) if axis == 1 else (start[0], start[1], start[2] - 0.05)
+    )
     rig.line(way, segment=2.0)
     rig.run(0.8)
     assert (rig.force.struck, rig.force.axis) == (command, axis)
@@ -126,7 +129,9 @@ def test_motion_begins_again_with_another_command(tmp_path: Path) -> None:
         (hold_back(20), "wrench is stale, 21 ticks: waiting for the board of the arm"),
     ],
 )
-def test_force_axes_rest_while_the_wrench_is_not_fresh(tmp_path: Path, disturbance: Disturbance, reason: str) -> None:
+def test_force_axes_rest_while_the_wrench_is_not_fresh(
+    tmp_path: Path, disturbance: Disturbance, reason: str
+) -> None:
     rig = pressing(tmp_path)
     rig.rack.disturb("arm.wrench", disturbance, ticks=300)
     rig.run(0.05)
@@ -162,8 +167,12 @@ def test_a_force_beyond_the_arms_limit_is_cut_with_a_reason(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("field", "value"), [("frame", (0.0, 0.0, 0.0, 0.0)), ("wrench", (np.nan,) * 6)])
-def test_an_impossible_command_is_refused(tmp_path: Path, field: str, value: Sequence[float]) -> None:
+@pytest.mark.parametrize(
+    ("field", "value"), [("frame", (0.0, 0.0, 0.0, 0.0)), ("wrench", (np.nan,) * 6)]
+)
+def test_an_impossible_command_is_refused(
+    tmp_path: Path, field: str, value: Sequence[float]
+) -> None:
     rig = HybridRig(tmp_path)
     rig.run(0.1)
     setattr(rig.compliance, field, value)

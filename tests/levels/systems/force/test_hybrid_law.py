@@ -49,10 +49,15 @@ def place(cell: Cell, q: Array) -> Array:
     return tool.position
 
 
-def test_the_inverse_gives_the_velocity_wanted_and_stays_finite_at_a_singularity(cell: Cell) -> None:
+def test_the_inverse_gives_the_velocity_wanted_and_stays_finite_at_a_singularity(
+    cell: Cell,
+) -> None:
     tool, twist = ToolKinematics(cell), np.array([0.02, -0.01, 0.03, 0.1, 0.0, -0.1])
     tool.look(cell.home, np.zeros(6))
-    assert np.abs(tool.jacobian @ damped_inverse(tool.jacobian, twist) - twist).max() < 0.01 * np.abs(twist).max()
+    assert (
+        np.abs(tool.jacobian @ damped_inverse(tool.jacobian, twist) - twist).max()
+        < 0.01 * np.abs(twist).max()
+    )
     straight = cell.home.copy()
     straight[4] = 0.0  # joints 4 and 6 turn about one axis
     tool.look(straight, np.zeros(6))
@@ -75,7 +80,9 @@ def test_a_force_axis_moves_at_its_speed_and_others_stay(cell: Cell) -> None:
 
 def test_axes_are_those_of_the_task_frame(cell: Cell) -> None:
     law = HybridLaw(cell, HybridGains(bandwidth=50.0))
-    to_x = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # its z axis is the world's x axis
+    to_x = np.array(
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    )  # its z axis is the world's x axis
     for _ in range(100):
         command = law.step(resting(cell), task(np.zeros(6), to_x), PERIOD_S, EMPTY)
     way = place(cell, command.position) - place(cell, cell.home)
@@ -88,7 +95,9 @@ def test_every_joint_keeps_its_acceleration(cell: Cell) -> None:
     for cycle in range(60):
         wanted = task(np.zeros(6)) if cycle < 30 else None
         command = law.step(resting(cell), wanted, PERIOD_S, EMPTY)
-        assert (np.abs(command.velocity - before) <= 1.001 * cell.limits.acceleration * PERIOD_S).all()
+        assert (
+            np.abs(command.velocity - before) <= 1.001 * cell.limits.acceleration * PERIOD_S
+        ).all()
         assert command.acceleration == pytest.approx((command.velocity - before) / PERIOD_S)
         before = command.velocity
     assert law.rests

@@ -145,7 +145,10 @@ def test_a_force_that_swings_about_the_wanted_one_has_not_settled() -> None:
     ("fields", "why"),
     [
         ({"force": 200.0}, "force 200 N; permitted by the arm and its sensor: 80"),
-        ({"frame": (0.5, 0.0, 0.0, 0.0)}, "the task frame's quaternion has length 0.5; permitted: 1"),
+        (
+            {"frame": (0.5, 0.0, 0.0, 0.0)},
+            "the task frame's quaternion has length 0.5; permitted: 1",
+        ),
     ],
 )
 def test_an_impossible_contact_is_refused(fields: dict[str, object], why: str) -> None:
@@ -196,4 +199,6 @@ def test_a_joint_motion_is_a_request_of_a_server_too() -> None:
     rig.line((X, Y, HEIGHT + 0.03))
     rig.run(3.0)
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE}
-    assert np.allclose(rig.status.quaternion, DOWN, atol=1e-3) or np.allclose(-rig.status.quaternion, DOWN, atol=1e-3)
+    assert np.allclose(rig.status.quaternion, DOWN, atol=1e-3) or np.allclose(
+        -rig.status.quaternion, DOWN, atol=1e-3
+    )

@@ -47,10 +47,15 @@ def program(*steps: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class GraspRig(Lockstep):
-    """Runs a program of a grasp; `boards` are "loops", one for each loop, or "fingers", one for each finger."""
+    """Runs a program of a grasp; `boards` are "loops", one for each loop, or "fingers", one for
+    each finger."""
 
     def __init__(
-        self, boards: str, steps: Sequence[Mapping[str, Any]], pushes: tuple[PushConfig, ...] = (), **params: Any
+        self,
+        boards: str,
+        steps: Sequence[Mapping[str, Any]],
+        pushes: tuple[PushConfig, ...] = (),
+        **params: Any,
     ) -> None:
         robot, scene = config("utah_mit")
         if boards == "loops":
@@ -65,7 +70,9 @@ class GraspRig(Lockstep):
             specs = [
                 BoardSpec("hand", EVERY, HandExecutor, above=FINGERS),
                 *(
-                    BoardSpec(f, EVERY, FingerExecutor, above="grasp", below="hand", params={"finger": f})
+                    BoardSpec(
+                        f, EVERY, FingerExecutor, above="grasp", below="hand", params={"finger": f}
+                    )
                     for f in FINGERS
                 ),
                 BoardSpec("grasp", 5 * EVERY, GraspExecutor, below=FINGERS, params=params),
@@ -81,13 +88,16 @@ class GraspRig(Lockstep):
         return self.read("grasp.status")
 
     def go(self, seconds: float, steps: int | None = None) -> bool:
-        """Run until the program has ended, or `steps` of it are done; return False if the time is over before."""
+        """Run until the program has ended, or `steps` of it are done; return False if the time is
+        over before."""
 
         def ended(rack: Lockstep) -> bool:
             hand = rack.read("hand.status")
             if hand.state == State.EXECUTING:
                 self.least_tension = min(self.least_tension, float(hand.tension.min()))
             status = self.grasp
-            return status.state in (State.DONE, State.ERROR) or (steps is not None and status.step >= steps)
+            return status.state in (State.DONE, State.ERROR) or (
+                steps is not None and status.step >= steps
+            )
 
         return self.run(seconds, ended)

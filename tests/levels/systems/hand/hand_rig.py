@@ -1,4 +1,5 @@
-"""A hand whose tendons are driven by test boards: each holds its joints at positions, as a joint loop would."""
+"""A hand whose tendons are driven by test boards: each holds its joints at positions, as a joint
+loop would."""
 
 from __future__ import annotations
 
@@ -26,7 +27,10 @@ AMPLITUDE_RAD, RATE = 0.15, 6.0
 class Swing(Executor):
     """Swings the joints of the finger `finger`, or of all."""
 
-    inputs = {"status": Input(HAND_STATUS, "below.status"), "before": Input(TENSION_COMMAND, "own.command")}
+    inputs = {
+        "status": Input(HAND_STATUS, "below.status"),
+        "before": Input(TENSION_COMMAND, "own.command"),
+    }
     outputs = {"command": TENSION_COMMAND}
 
     def __init__(self, context: LevelContext) -> None:
@@ -35,7 +39,11 @@ class Swing(Executor):
         assert hand is not None
         self.hand = hand
         finger = context.params.get("finger")
-        self.driven = np.ones(len(hand.arms), bool) if finger is None else hand.fingers[hand.names.index(finger)]
+        self.driven = (
+            np.ones(len(hand.arms), bool)
+            if finger is None
+            else hand.fingers[hand.names.index(finger)]
+        )
         self.is_blind = False  # it takes no new status
         self.override: float | None = None  # N: commanded of all tendons instead
 
@@ -44,11 +52,18 @@ class Swing(Executor):
         if not read.status.is_there or self.is_blind:
             command.sampled = -1 if not read.status.is_there else command.sampled
             return
-        wanted = np.array(self.context.robot.home) + AMPLITUDE_RAD * np.sin(RATE * tick * self.context.tick_s)
+        wanted = np.array(self.context.robot.home) + AMPLITUDE_RAD * np.sin(
+            RATE * tick * self.context.tick_s
+        )
         torque = STIFFNESS * (wanted - status.position) - DAMPING * status.velocity
         tension = np.zeros((2, len(torque)))
-        tension[FLEXOR], tension[EXTENSOR] = hand.rest + torque / (2 * hand.arms), hand.rest - torque / (2 * hand.arms)
-        command.tension = np.clip(tension, hand.least, hand.most) if self.override is None else self.override
+        tension[FLEXOR], tension[EXTENSOR] = (
+            hand.rest + torque / (2 * hand.arms),
+            hand.rest - torque / (2 * hand.arms),
+        )
+        command.tension = (
+            np.clip(tension, hand.least, hand.most) if self.override is None else self.override
+        )
         command.driven, command.sampled = self.driven, status.tick
 
 
@@ -58,10 +73,16 @@ class HandRig(Lockstep):
     def __init__(self, fingers: tuple[str, ...] = (), pushes: tuple[PushConfig, ...] = ()) -> None:
         robot, scene = config("utah_mit")
         above = tuple(fingers) or ("all",)
-        params: dict[str, dict[str, Any]] = {name: {"finger": name} if fingers else {} for name in above}
+        params: dict[str, dict[str, Any]] = {
+            name: {"finger": name} if fingers else {} for name in above
+        }
         boards = [BoardSpec("hand", EVERY, HandExecutor, above=above)]
-        boards += [BoardSpec(name, EVERY, Swing, below="hand", params=params[name]) for name in above]
-        super().__init__(boards, robot, scene.model_copy(update={"push": pushes}), clock_ns=CLOCK_NS)
+        boards += [
+            BoardSpec(name, EVERY, Swing, below="hand", params=params[name]) for name in above
+        ]
+        super().__init__(
+            boards, robot, scene.model_copy(update={"push": pushes}), clock_ns=CLOCK_NS
+        )
 
     @property
     def executor(self) -> HandExecutor:

@@ -25,12 +25,16 @@ def the_kinematics() -> FingerKinematics:
 
 
 class Tips:
-    """The law of all fingers; the joints are always where their targets are, unless `sensed` is set."""
+    """The law of all fingers; the joints are always where their targets are, unless `sensed` is
+    set."""
 
     def __init__(self) -> None:
         self.law = FingertipLaw(the_kinematics(), range(4), FingertipGains(), PERIOD_S)
         self.law.start(BENT)
-        self.grasp, self.target = Message(GRASP_TARGET.dtype(SIZES)), Message(FINGER_TARGET.dtype(SIZES))
+        self.grasp, self.target = (
+            Message(GRASP_TARGET.dtype(SIZES)),
+            Message(FINGER_TARGET.dtype(SIZES)),
+        )
         self.grasp.position = BENT
 
     def run(self, cycles: int, sensed: Array | None = None) -> Array:
@@ -50,7 +54,9 @@ def test_the_jacobian_is_the_derivative_of_the_tip() -> None:
             moved = BENT.copy()
             moved[joint] += step
             kinematics.look(moved)
-            assert (kinematics.tip(finger) - tip) / step == pytest.approx(jacobian[:, column], abs=1e-5)
+            assert (kinematics.tip(finger) - tip) / step == pytest.approx(
+                jacobian[:, column], abs=1e-5
+            )
 
 
 def test_a_tip_comes_to_its_point_evenly_and_other_fingers_keep_their_posture() -> None:
@@ -72,7 +78,10 @@ def test_a_tip_comes_to_its_point_evenly_and_other_fingers_keep_their_posture() 
 def test_a_point_out_of_reach_keeps_the_joints_within_their_limits() -> None:
     tips = Tips()
     start = tips.run(1)
-    tips.grasp.mode[FINGER], tips.grasp.tip[FINGER] = FingerMode.POINT, start[FINGER] + (0.3, 0.0, -0.3)
+    tips.grasp.mode[FINGER], tips.grasp.tip[FINGER] = (
+        FingerMode.POINT,
+        start[FINGER] + (0.3, 0.0, -0.3),
+    )
     tips.run(200)
     low, high = HAND.limits.position.T
     assert (tips.target.position >= low).all()

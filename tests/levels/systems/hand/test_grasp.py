@@ -1,4 +1,5 @@
-"""A grasp by all loops of a hand: takes an object, keeps it while it is pulled and boards die, and lets it go."""
+"""A grasp by all loops of a hand: takes an object, keeps it while it is pulled and boards die, and
+lets it go."""
 
 from __future__ import annotations
 
@@ -113,9 +114,21 @@ def test_a_program_that_is_kept_for_too_long_fails() -> None:
 
 
 WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
-    "finger": (program() | {"opposing": "little"}, "opposing", "no such finger; fingers: index, middle, ring, thumb"),
-    "posture": (program({**PRESHAPE, "posture": "fist"}), "step[0].posture", "no such posture; postures: open, around"),
-    "object": (program({**CLOSE, "object": "cup"}), "step[0].object", "not in the scene; objects: can"),
+    "finger": (
+        program() | {"opposing": "little"},
+        "opposing",
+        "no such finger; fingers: index, middle, ring, thumb",
+    ),
+    "posture": (
+        program({**PRESHAPE, "posture": "fist"}),
+        "step[0].posture",
+        "no such posture; postures: open, around",
+    ),
+    "object": (
+        program({**CLOSE, "object": "cup"}),
+        "step[0].object",
+        "not in the scene; objects: can",
+    ),
     "order": (program(SQUEEZE), "step[0].do", "a 'close' must come before it"),
     "held": (program(CLOSE, PRESHAPE), "step[1].do", "a 'release' must come before it"),
     "lone": (
@@ -123,12 +136,18 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
         "step[0].points",
         "the opposing finger, 'thumb'",
     ),
-    "short": ({"posture": {"fist": {"thumb": [1.0]}}}, "posture.fist.thumb", "1 values; permitted: 4, one per joint"),
+    "short": (
+        {"posture": {"fist": {"thumb": [1.0]}}},
+        "posture.fist.thumb",
+        "1 values; permitted: 4, one per joint",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_mistakes_of_a_program_name_key_and_what_is_permitted(case: str) -> None:
     task, key, reason = WRONG[case]
-    found = {key: why for key, _, why in GraspProgram.model_validate(task).misfits(*config("utah_mit"))}
+    found = {
+        key: why for key, _, why in GraspProgram.model_validate(task).misfits(*config("utah_mit"))
+    }
     assert reason in found[key]

@@ -1,4 +1,5 @@
-"""Planned grasps: tips on opposite sides of the object, joints that reach them, and no contact before they close."""
+"""Planned grasps: tips on opposite sides of the object, joints that reach them, and no contact
+before they close."""
 
 from __future__ import annotations
 
@@ -45,7 +46,9 @@ def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planner: Grasp
 
 
 @pytest.mark.slow
-def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_asked(planner: GraspPlanner) -> None:
+def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_asked(
+    planner: GraspPlanner,
+) -> None:
     found = planner.plan(0, AT, UPRIGHT)
     assert found is not None
     outside = AT + found.contact - RULES.clear * found.normal
@@ -55,14 +58,18 @@ def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_
 
 
 @pytest.mark.slow
-def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(planner: GraspPlanner) -> None:
+def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(
+    planner: GraspPlanner,
+) -> None:
     turned = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)])
     moved = planner.plan(0, AT + np.array([0.006, -0.004, 0.003]), UPRIGHT)
     rotated = planner.plan(0, AT, turned)
     assert moved is not None
     assert rotated is not None
     for found in (moved, rotated):
-        assert np.sqrt((found.contact[:, :2] ** 2).sum(axis=1)) == pytest.approx(np.full(4, CAN_RADIUS_M))
+        assert np.sqrt((found.contact[:, :2] ** 2).sum(axis=1)) == pytest.approx(
+            np.full(4, CAN_RADIUS_M)
+        )
     straight = planner.plan(0, AT, UPRIGHT)
     assert straight is not None
     spin = np.zeros(9)
@@ -86,5 +93,7 @@ def test_the_grip_bears_weight_and_pull_by_friction_with_a_reserve() -> None:
 
 
 def test_a_finger_that_the_hand_lacks_cannot_oppose() -> None:
-    with pytest.raises(LevelError, match="opposing = little: the hand has no such finger; fingers: index, middle"):
+    with pytest.raises(
+        LevelError, match="opposing = little: the hand has no such finger; fingers: index, middle"
+    ):
         GraspPlanner(HAND, "little", RULES)

@@ -1,4 +1,5 @@
-"""The board of a hand: driven by the tensions of one board or of four, and what it does without them."""
+"""The board of a hand: driven by the tensions of one board or of four, and what it does without
+them."""
 
 from __future__ import annotations
 
@@ -34,7 +35,12 @@ def swinging(fingers: tuple[str, ...] = FINGERS) -> HandRig:
 def assert_follows(rig: HandRig) -> None:
     rig.cycles(40)
     status = rig.status
-    assert (status.state, status.holding, status.stopped, status.reason) == (State.EXECUTING, 0, 0, "")
+    assert (status.state, status.holding, status.stopped, status.reason) == (
+        State.EXECUTING,
+        0,
+        0,
+        "",
+    )
     rig.cycles(10)
     assert np.abs(rig.status.position - status.position).min() > 1e-4
 
@@ -46,7 +52,11 @@ def test_four_boards_move_the_hand_as_one_does() -> None:
     assert np.array_equal(together.status.position, apart.status.position)
     off = together.status.position - np.array(config("utah_mit")[0].home)
     assert np.abs(off).max() == pytest.approx(AMPLITUDE_RAD, abs=0.06)
-    assert (together.status.violations, together.status.touches, together.status.clipped) == (0, 0, 0)
+    assert (together.status.violations, together.status.touches, together.status.clipped) == (
+        0,
+        0,
+        0,
+    )
 
 
 def test_hand_is_idle_until_every_board_sends_tensions() -> None:
@@ -91,7 +101,10 @@ def test_board_that_sees_nothing_new_closes_the_valves() -> None:
     rig.cycles(8)
     status = rig.status
     assert (status.state, status.stopped) == (State.HOLDING, 1)
-    assert status.reason == "stale tensions from board 'index': based on a status more than 20 ticks old"
+    assert (
+        status.reason
+        == "stale tensions from board 'index': based on a status more than 20 ticks old"
+    )
     rig.swing("index").is_blind = False
     rig.cycles(10)
     assert_follows(rig)
@@ -107,7 +120,9 @@ def test_emergency_stop_closes_the_valves_and_keeps_the_tensions(demand: Demand)
     rig.cycles(30)
     status = rig.status
     assert (status.demand, status.stopped, status.state) == (demand, 1, State.HOLDING)
-    assert status.reason.startswith(f"demand '{demand.name.lower()}' on the hand: valves closed until")
+    assert status.reason.startswith(
+        f"demand '{demand.name.lower()}' on the hand: valves closed until"
+    )
     assert np.abs(status.velocity).max() < 0.5 * np.abs(held.velocity).max()
     assert status.tension.min() > 10.0  # it does not let go
     rig.cycles(20)
@@ -121,7 +136,10 @@ def test_operator_holds_the_hand_and_lets_it_go_on() -> None:
     rig.cycles(4)
     status = rig.status
     assert (status.order, status.answer, status.standing) == (serial, Answer.DONE, Operation.HOLD)
-    assert (status.stopped, status.reason) == (1, "held by the operator: valves closed; `resume` opens them")
+    assert (status.stopped, status.reason) == (
+        1,
+        "held by the operator: valves closed; `resume` opens them",
+    )
     operator.say("hand", Operation.RESUME)
     rig.cycles(10)
     assert_follows(rig)
@@ -147,7 +165,9 @@ def test_tension_beyond_its_limits_is_cut(asked: float, given: float) -> None:
     rig.cycles(5)
     assert rig.status.wanted == pytest.approx(given)
     assert rig.status.clipped > 0
-    assert [(found.alarm, found.value) for found in rig.executor.findings] == [(Alarm.TENSION_LIMIT, asked)]
+    assert [(found.alarm, found.value) for found in rig.executor.findings] == [
+        (Alarm.TENSION_LIMIT, asked)
+    ]
 
 
 def test_restarted_board_finds_the_hand_where_the_valves_have_kept_it() -> None:
@@ -218,10 +238,22 @@ def test_slack_that_closed_valves_bring_about_is_no_torn_tendon() -> None:
 
 
 def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContext]:
-    """Return the context of a hand's board, then those of the boards `above` with the fingers that they drive."""
+    """Return the context of a hand's board, then those of the boards `above` with the fingers that
+    they drive."""
     robot, scene = config("utah_mit" if hand else "puma560")
     return [
-        LevelContext(name, EVERY, 1, CLOCK_NS, 0, robot, scene, {}, {}, params={"finger": finger} if finger else {})
+        LevelContext(
+            name,
+            EVERY,
+            1,
+            CLOCK_NS,
+            0,
+            robot,
+            scene,
+            {},
+            {},
+            params={"finger": finger} if finger else {},
+        )
         for name, finger in (("hand", None), *above.items())
     ]
 
@@ -241,7 +273,9 @@ def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContex
         ),
     ],
 )
-def test_every_joint_must_be_driven_by_one_board(above: dict[str, str | None], why: str | None) -> None:
+def test_every_joint_must_be_driven_by_one_board(
+    above: dict[str, str | None], why: str | None
+) -> None:
     own, *others = context(above)
     found = [misfit[2] for misfit in HandExecutor.misfits(own, others, [])]
     assert found[:1] == ([] if why is None else [why])
@@ -259,7 +293,11 @@ def test_board_of_a_hand_needs_a_hand() -> None:
 def test_board_of_an_arm_drives_no_hand(kind: type[ArmExecutor | ServoExecutor]) -> None:
     own, *_ = context({})
     first, *_ = kind.misfits(own, [], [])
-    assert first == ("executor", kind.__name__, "it drives an arm with motors; [robot.hand] is a hand of tendons")
+    assert first == (
+        "executor",
+        kind.__name__,
+        "it drives an arm with motors; [robot.hand] is a hand of tendons",
+    )
 
 
 def test_rig_swings_by_what_the_hand_has_sensed() -> None:

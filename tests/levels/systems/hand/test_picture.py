@@ -7,7 +7,14 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from rack.levels.systems.hand.picture import NEWTONS_A_VIEW, REACH_M, SIDE, HandPicture, HandScene, hull
+from rack.levels.systems.hand.picture import (
+    NEWTONS_A_VIEW,
+    REACH_M,
+    SIDE,
+    HandPicture,
+    HandScene,
+    hull,
+)
 from tests.levels.arms import cell
 
 HAND = cell("utah_mit")
@@ -37,8 +44,15 @@ def test_every_finger_is_a_line_through_its_joints_to_its_tip_and_has_its_name()
     for view in (front, above):
         lines = view.findall(f"{SVG}polyline")
         assert [len(line.attrib["points"].split()) for line in lines] == [5, 5, 5, 5]
-        assert [text.text for text in view.findall(f"{SVG}text")][:-1] == ["index", "middle", "ring", "thumb"]
-    ends = [line.attrib["points"].split()[-1].split(",") for line in front.findall(f"{SVG}polyline")]
+        assert [text.text for text in view.findall(f"{SVG}text")][:-1] == [
+            "index",
+            "middle",
+            "ring",
+            "thumb",
+        ]
+    ends = [
+        line.attrib["points"].split()[-1].split(",") for line in front.findall(f"{SVG}polyline")
+    ]
     heights = [float(y) for _, y in ends]
     # Index, middle and ring are above each other, 3 cm apart.
     assert np.diff(heights[:3]) == pytest.approx(np.full(2, 0.03 / REACH_M * SIDE / 2), abs=0.2)

@@ -1,4 +1,5 @@
-"""The simulated hand: tensions behind valves, limits at every step, forces on fingertips, exact restarts."""
+"""The simulated hand: tensions behind valves, limits at every step, forces on fingertips, exact
+restarts."""
 
 from __future__ import annotations
 
@@ -68,7 +69,9 @@ def test_torque_is_the_arm_times_the_difference_of_the_tensions() -> None:
     hand.pull(flexed(hand, INDEX1, 40.0))
     hand.step(60)
     sample = hand.sense()
-    assert sample.torque == pytest.approx(hand.hand.arms * (sample.tension[FLEXOR] - sample.tension[EXTENSOR]))
+    assert sample.torque == pytest.approx(
+        hand.hand.arms * (sample.tension[FLEXOR] - sample.tension[EXTENSOR])
+    )
 
 
 @pytest.mark.slow
@@ -115,7 +118,10 @@ def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:
     for _ in range(300):
         sample, tension = hand.sense(), np.array(hand.wanted)
         torque = 1.5 * (around - sample.position) - 0.1 * sample.velocity
-        tension[FLEXOR], tension[EXTENSOR] = 20.0 + torque / (2 * hand.hand.arms), 20.0 - torque / (2 * hand.hand.arms)
+        tension[FLEXOR], tension[EXTENSOR] = (
+            20.0 + torque / (2 * hand.hand.arms),
+            20.0 - torque / (2 * hand.hand.arms),
+        )
         hand.pull(tension.clip(hand.hand.least, hand.hand.most))
         hand.step(EVERY)
     force = hand.sense().force

@@ -1,4 +1,5 @@
-"""The law of the tendons: no tension below the least, torques within reach, and valves that lag and err."""
+"""The law of the tendons: no tension below the least, torques within reach, and valves that lag and
+err."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def the_hand() -> Hand:
 
 
 class Valves:
-    """Valves of all tendons: gain, offset and lag; what the hand senses is a cycle old when it is read."""
+    """Valves of all tendons: gain, offset and lag; what the hand senses is a cycle old when it is
+    read."""
 
     def __init__(self, gain: float = 1.0, offset: float = 0.0, gains: TendonGains = EXACT) -> None:
         self.hand, self._gain, self._offset = the_hand(), gain, offset
@@ -47,7 +49,9 @@ class Valves:
             self.law.tensions(torque, self.wanted)
             for _ in range(SUBSTEPS):
                 aim = self._gain * self.wanted + self._offset
-                self.tension += (aim - self.tension) * (1.0 - math.exp(-PERIOD_S / SUBSTEPS / LAG_S))
+                self.tension += (aim - self.tension) * (
+                    1.0 - math.exp(-PERIOD_S / SUBSTEPS / LAG_S)
+                )
             self.status.tension, self.status.wanted = sensed, wanted
             self.status.tick += EVERY
             self.histories.append(self.torque)
@@ -58,7 +62,9 @@ class Valves:
 
 
 @pytest.mark.parametrize("part", [0.0, 0.1, -0.1, 0.5, -0.9, 1.0, -1.0])
-def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_slack(part: float) -> None:
+def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_slack(
+    part: float,
+) -> None:
     valves = Valves()
     hand = valves.hand
     torque = part * hand.torque
@@ -69,7 +75,9 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
     assert (valves.wanted <= hand.most + 1e-9).all()
     half = np.abs(torque) / hand.arms / 2
     easy = (hand.rest - half >= hand.least) & (hand.rest + half <= hand.most)
-    mean = np.where(easy, hand.rest, np.minimum(np.maximum(hand.rest, hand.least + half), hand.most - half))
+    mean = np.where(
+        easy, hand.rest, np.minimum(np.maximum(hand.rest, hand.least + half), hand.most - half)
+    )
     assert (flexors + extensors) / 2 == pytest.approx(mean)
     assert valves.law.clipped == 0
 
@@ -97,7 +105,9 @@ def test_a_lead_brings_torques_earlier_without_overshoot() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain", "offset"), [(0.9, 0.0), (1.1, 0.0), (1.0, 1.0), (0.95, -0.8)])
-def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(gain: float, offset: float) -> None:
+def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(
+    gain: float, offset: float
+) -> None:
     valves = Valves(gain, offset, TendonGains())
     torque = 0.1 * valves.hand.torque
     valves.run(torque, 3.0)

@@ -1,4 +1,5 @@
-"""The workstation of a hand, on a bus of the test: when it plans, what it sends, and what it draws."""
+"""The workstation of a hand, on a bus of the test: when it plans, what it sends, and what it
+draws."""
 
 from __future__ import annotations
 
@@ -25,13 +26,16 @@ CYCLES = 17
 
 
 class Crate:
-    """A bus with one board, whose messages the test sets: ports of `Workstation`. A second passes between two looks."""
+    """A bus with one board, whose messages the test sets: ports of `Workstation`. A second passes
+    between two looks."""
 
     tasks = ("coordinator",)
     tick = 12
 
     def __init__(self) -> None:
-        self.messages = {port: Message(source.type.dtype(SIZES)) for port, source in Workstation.inputs.items()}
+        self.messages = {
+            port: Message(source.type.dtype(SIZES)) for port, source in Workstation.inputs.items()
+        }
         self.sends: list[dict[str, Any]] = []
         self.looks = 20
         world, hand = self.messages["world"], self.messages["hand"]
@@ -68,7 +72,12 @@ class Crate:
 
 def workstation(tmp_path: Path, **params: Any) -> Workstation:
     robot, scene = config("utah_mit")
-    table = {"object": "can", "opposing": "thumb", "picture": str(tmp_path / "{rack}" / "hand.svg"), "every_s": 1e-6}
+    table = {
+        "object": "can",
+        "opposing": "thumb",
+        "picture": str(tmp_path / "{rack}" / "hand.svg"),
+        "every_s": 1e-6,
+    }
     context = LevelContext(
         board="workstation",
         every=1,
@@ -117,14 +126,21 @@ def test_it_waits_until_it_knows_object_and_coordinator(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_picture_is_replaced_whole_and_shows_forces_and_the_crates_counts(tmp_path: Path) -> None:
+def test_the_picture_is_replaced_whole_and_shows_forces_and_the_crates_counts(
+    tmp_path: Path,
+) -> None:
     crate, host = Crate(), workstation(tmp_path)
     crate.messages["hand"].force[3] = (0.0, 0.0, 4.0)
     host.run(crate)  # type: ignore[arg-type]
     assert [path.name for path in (tmp_path / "lab").iterdir()] == ["hand.svg"]
     text = (tmp_path / "lab" / "hand.svg").read_text()
     ElementTree.fromstring(text)
-    for line in ("lab, tick 12", "thumb: 4.0 N, tendons 0 to 0 N", f"coordinator: {CYCLES}, 0, 0", "planned: grip"):
+    for line in (
+        "lab, tick 12",
+        "thumb: 4.0 N, tendons 0 to 0 N",
+        f"coordinator: {CYCLES}, 0, 0",
+        "planned: grip",
+    ):
         assert line in text
 
 

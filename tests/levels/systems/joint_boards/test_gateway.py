@@ -1,4 +1,5 @@
-"""A gateway between a trajectory level and boards that servo joints: on time, extrapolating, frozen, and back."""
+"""A gateway between a trajectory level and boards that servo joints: on time, extrapolating,
+frozen, and back."""
 
 from __future__ import annotations
 
@@ -27,13 +28,19 @@ def message(kind: MessageType) -> Message:
 
 
 class GatewayRig:
-    """Runs a gateway; references of a steady motion are visible when those of a trajectory level are."""
+    """Runs a gateway; references of a steady motion are visible when those of a trajectory level
+    are."""
 
     def __init__(self) -> None:
         robot, scene = config("puma560")
-        paces = {"above": {"above": Pace(PERIOD, 1)}, "below": {name: Pace(1, 1) for name in BOARDS}}
+        paces = {
+            "above": {"above": Pace(PERIOD, 1)},
+            "below": {name: Pace(1, 1) for name in BOARDS},
+        }
         params = {"delay": DELAY * TICK_S, "missing": MISSING}
-        context = LevelContext("gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, {}, **paces, params=params)
+        context = LevelContext(
+            "gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, {}, **paces, params=params
+        )
         self.gateway = JointGateway(context)
         self.write = Ports(command=message(JOINT_REFERENCE), status=message(JOINT_STATUS))
         self.statuses = {name: message(JOINT_STATUS) for name in BOARDS}
@@ -43,14 +50,17 @@ class GatewayRig:
         self.lost: set[str] = set()
         self.tick = 0
         self.made = -1  # tick of the newest reference read
-        self.given: list[tuple[int, int, float]] = []  # tick, due and position of the references given
+        self.given: list[
+            tuple[int, int, float]
+        ] = []  # tick, due and position of the references given
 
     @property
     def status(self) -> Message:
         return self.write.status
 
     def run(self, ticks: int, late: int = 0, missing: bool = False) -> None:
-        """Run up to a tick; references come `late` ticks late, or are `missing`; the motion goes on meanwhile."""
+        """Run up to a tick; references come `late` ticks late, or are `missing`; the motion goes on
+        meanwhile."""
         for _ in range(ticks // EVERY):
             made = (self.tick - PERIOD - late) // PERIOD * PERIOD
             reference = message(JOINT_REFERENCE)
@@ -60,11 +70,16 @@ class GatewayRig:
                 reference.id, reference.due = made // PERIOD + 1, made + 2 * PERIOD
                 reference.position, reference.velocity = SPEED * TICK_S * reference.due, SPEED
             command = Reading(reference, Verdict.NEW if is_new else Verdict.OLD)
-            statuses = {name: Reading(status, Verdict.NEW, name in self.lost) for name, status in self.statuses.items()}
+            statuses = {
+                name: Reading(status, Verdict.NEW, name in self.lost)
+                for name, status in self.statuses.items()
+            }
             before = self.write.command.due
             self.gateway.process(Ports(command=command, statuses=statuses), self.write, self.tick)
             if self.write.command.due != before:
-                self.given.append((self.tick, self.write.command.due, float(self.write.command.position[0])))
+                self.given.append(
+                    (self.tick, self.write.command.due, float(self.write.command.position[0]))
+                )
             self.tick += EVERY
 
 
@@ -74,7 +89,9 @@ def test_references_are_handed_on_later_by_a_constant_time_and_in_time_to_be_fol
     ticks, dues, positions = zip(*rig.given, strict=True)
     assert np.diff(dues).tolist() == [PERIOD] * (len(dues) - 1)
     assert dues[0] == 2 * PERIOD + LATENCY
-    assert [due - LATENCY for due in dues] == pytest.approx([position / (SPEED * TICK_S) for position in positions])
+    assert [due - LATENCY for due in dues] == pytest.approx(
+        [position / (SPEED * TICK_S) for position in positions]
+    )
     # Visible a cycle later, each comes before the one before it is due.
     assert all(tick + EVERY <= due for tick, due in zip(ticks[1:], dues, strict=False))
 
@@ -125,7 +142,11 @@ def test_a_level_above_that_wants_no_motion_is_obeyed_without_extrapolation() ->
 def test_the_boards_appear_as_one_after_the_delay() -> None:
     rig = GatewayRig()
     rig.run(50)
-    rig.statuses["far"].stopped, rig.statuses["far"].reason, rig.statuses["far"].error = 1, "braked", Error.LIMIT
+    rig.statuses["far"].stopped, rig.statuses["far"].reason, rig.statuses["far"].error = (
+        1,
+        "braked",
+        Error.LIMIT,
+    )
     rig.run(DELAY)
     assert not rig.status.stopped
     rig.run(EVERY)

@@ -1,4 +1,5 @@
-"""Every mistake in a state table is found, with its row; a table without one never runs out of rows."""
+"""Every mistake in a state table is found, with its row; a table without one never runs out of
+rows."""
 
 from __future__ import annotations
 
@@ -52,12 +53,18 @@ MISTAKES = {
     "missing do": (
         'do = ["take", "drive slowly"]\n',
         "",
-        "row 1 'open it': do: missing; actions with their parameters, in order; may be an empty list",
+        (
+            "row 1 'open it': do: missing; actions with their parameters, in order; may be an empty"
+            " list"
+        ),
     ),
     "missing status": (
         'do = ["take", "drive slowly"]\nstatus = "executing"\n',
         'do = ["take", "drive slowly"]\n',
-        "row 1 'open it': status: missing; state shown upwards: idle, executing, done, error, holding",
+        (
+            "row 1 'open it': status: missing; state shown upwards: idle, executing, done, error,"
+            " holding"
+        ),
     ),
     "unknown status": (
         'status = "done"',
@@ -84,12 +91,18 @@ MISTAKES = {
         'next = "shut"\ndo = ["take"',
         "row 4, 5, 6: unreachable: no row leads from 'shut' to the state 'moving'",
     ),
-    "unknown start": ('start = "shut"', 'start = "ajar"', "start: no row has the state 'ajar'; states: shut, moving"),
+    "unknown start": (
+        'start = "shut"',
+        'start = "ajar"',
+        "start: no row has the state 'ajar'; states: shut, moving",
+    ),
     "overlap": (
         'when = { place = ["open", "shut"] }',
         "when = { }",
-        "row 5 'arrived': overlaps row 4 'moves' in 'moving' when place = between, late = no; "
-        "let them exclude each other, or give the later one else = true",
+        (
+            "row 5 'arrived': overlaps row 4 'moves' in 'moving' when place = between, late = no; "
+            "let them exclude each other, or give the later one else = true"
+        ),
     ),
     "hole": (
         'when = { place = "between", late = "yes" }',
@@ -101,9 +114,21 @@ MISTAKES = {
         'when = { place = ["between"], late = "no" }\nelse = true',
         "row 5 'arrived': never fires in 'moving': the rows above it take every case of it",
     ),
-    "unknown key": ('status = "idle"', 'status = "idle"\nspeed = 3', "row 3: speed: unknown key; known: name, state"),
-    "unknown key of the plan": ("width = 0.9", "height = 0.9", "plan: height: unknown key; known: width"),
-    "value of the plan": ("width = 0.9", "width = -1.0", "plan: width: '-1.0': input should be greater than 0"),
+    "unknown key": (
+        'status = "idle"',
+        'status = "idle"\nspeed = 3',
+        "row 3: speed: unknown key; known: name, state",
+    ),
+    "unknown key of the plan": (
+        "width = 0.9",
+        "height = 0.9",
+        "plan: height: unknown key; known: width",
+    ),
+    "value of the plan": (
+        "width = 0.9",
+        "width = -1.0",
+        "plan: width: '-1.0': input should be greater than 0",
+    ),
 }
 
 
@@ -115,7 +140,9 @@ def test_a_table_without_a_mistake_passes(tmp_path: Path) -> None:
 def test_every_mistake_is_found_with_its_row(tmp_path: Path, mistake: str) -> None:
     before, after, expected = MISTAKES[mistake]
     assert before in DOOR
-    assert any(line.startswith(expected) for line in found(tmp_path, DOOR.replace(before, after))), expected
+    assert any(
+        line.startswith(expected) for line in found(tmp_path, DOOR.replace(before, after))
+    ), expected
 
 
 def test_all_mistakes_of_a_table_are_reported_together(tmp_path: Path) -> None:
@@ -131,7 +158,9 @@ def test_all_mistakes_of_a_table_are_reported_together(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("text", ["start = ", "start = 3", 'start = "shut"', "\x00", 'start = "shut"\nrow = 5'])
+@pytest.mark.parametrize(
+    "text", ["start = ", "start = 3", 'start = "shut"', "\x00", 'start = "shut"\nrow = 5']
+)
 def test_a_file_that_is_no_table_is_one_error(tmp_path: Path, text: str) -> None:
     with pytest.raises(TableError):
         read_text(written(tmp_path, text), DOORS)
@@ -147,23 +176,38 @@ def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
     case = {"command": "open", "new": "yes", "lock": "free", "place": "shut", "late": "no"}
     names = [
         door.decide(state, case | change)
-        for state, change in [("shut", {}), ("shut", {"new": "no"}), ("shut", {"lock": "stuck"}), ("moving", {})]
+        for state, change in [
+            ("shut", {}),
+            ("shut", {"new": "no"}),
+            ("shut", {"lock": "stuck"}),
+            ("moving", {}),
+        ]
     ]
-    assert [row.name for row in names if row is not None] == ["open it", "stay shut", "locked", "arrived"]
+    assert [row.name for row in names if row is not None] == [
+        "open it",
+        "stay shut",
+        "locked",
+        "arrived",
+    ]
     assert door.decide("nowhere", case) is None
 
 
 NAMES = tuple(DOORS.conditions)
 CONDITIONS = st.dictionaries(
     st.sampled_from(NAMES),
-    st.sets(st.sampled_from(sorted({v for name in NAMES for v in DOORS.conditions[name].values})), min_size=1),
+    st.sets(
+        st.sampled_from(sorted({v for name in NAMES for v in DOORS.conditions[name].values})),
+        min_size=1,
+    ),
     max_size=3,
 )
 
 
 def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowConfig:
     """Return a row of the state "on" that is sound but for its cases."""
-    known = {name: sorted(values & set(DOORS.conditions[name].values)) for name, values in when.items()}
+    known = {
+        name: sorted(values & set(DOORS.conditions[name].values)) for name, values in when.items()
+    }
     kept = {name: values for name, values in known.items() if values}
     return RowConfig(
         **{"name": f"row {number}", "state": "on", "when": kept, "else": otherwise},
@@ -175,22 +219,29 @@ def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowCo
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(CONDITIONS, st.booleans()), min_size=1, max_size=7))
-def test_a_table_passes_exactly_if_one_row_fires_in_every_case(rows: list[tuple[dict[str, set[str]], bool]]) -> None:
+def test_a_table_passes_exactly_if_one_row_fires_in_every_case(
+    rows: list[tuple[dict[str, set[str]], bool]],
+) -> None:
     configs = {number: row_config(number, *row) for number, row in enumerate(rows, 1)}
     text = TableText("on", 1.0, configs, DOORS.plan(), 0, ())
     complaints = flaws(text, DOORS, LEXICON)
     table = text.table()
     cases = [
-        dict(zip(NAMES, values, strict=True)) for values in product(*(DOORS.conditions[name].values for name in NAMES))
+        dict(zip(NAMES, values, strict=True))
+        for values in product(*(DOORS.conditions[name].values for name in NAMES))
     ]
     fires = [[row for row in table.rows["on"] if row.matches(case)] for case in cases]
     assert any("hole" in line for line in complaints) == any(not rows for rows in fires)
-    assert any("overlaps" in line for line in complaints) == any(not row.is_else for rows in fires for row in rows[1:])
+    assert any("overlaps" in line for line in complaints) == any(
+        not row.is_else for rows in fires for row in rows[1:]
+    )
     if not complaints:
         assert all(table.decide("on", case) is not None for case in cases)
 
 
-BOXES = st.fixed_dictionaries({name: st.frozensets(st.sampled_from("abc"), min_size=1) for name in "xyz"})
+BOXES = st.fixed_dictionaries(
+    {name: st.frozensets(st.sampled_from("abc"), min_size=1) for name in "xyz"}
+)
 
 
 @given(BOXES, BOXES)

@@ -40,7 +40,8 @@ class Bench:
         writer.close()
 
     def restarted(self) -> tuple[MoveTable, Message]:
-        """Return the level after it has recalled its last messages, and the command that it would send down."""
+        """Return the level after it has recalled its last messages, and the command that it would
+        send down."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == LEVEL)
         level = find_class(wiring.target, Executor)(wiring.context)
         task = VirtualControlLoop(self.segment, wiring, level)
@@ -64,10 +65,24 @@ def bench(rack_name: str) -> Iterator[Bench]:
 def test_it_goes_on_with_the_command_that_it_sent_down_last(bench: Bench) -> None:
     joints = np.linspace(0.1, 0.6, 6)
     bench.write("status", **LAST)
-    bench.write("command", words="pose above", speed=0.5, object=1, joints=joints, aim=(1.0, 2.0, 3.0), yaw=0.25)
+    bench.write(
+        "command",
+        words="pose above",
+        speed=0.5,
+        object=1,
+        joints=joints,
+        aim=(1.0, 2.0, 3.0),
+        yaw=0.25,
+    )
     level, command = bench.restarted()
     assert (level.state, level.words) == ("reaching", ["pick", "block1"])
-    assert (level._sent, level._reached, level._speed, level._row, level._yaw) == (7, True, 0.5, 1, 0.25)
+    assert (level._sent, level._reached, level._speed, level._row, level._yaw) == (
+        7,
+        True,
+        0.5,
+        1,
+        0.25,
+    )
     np.testing.assert_array_equal(level._joints, joints)
     np.testing.assert_array_equal(level._aim, (1.0, 2.0, 3.0))
     assert (command.words, command.object) == ("pose above", 1)
@@ -77,7 +92,8 @@ def test_without_a_command_of_its_own_it_starts_where_the_arm_is(bench: Bench) -
     bench.write("status", **LAST)
     level, command = bench.restarted()
     home = level._cell.home
-    # It knows its own state, and nothing of a command: no joints are taken from a mailbox that is still empty.
+    # It knows its own state, and nothing of a command: no joints are taken from a mailbox that is
+    # still empty.
     assert (level.state, level._sent, level._reached, level._speed) == ("reaching", 0, True, 1.0)
     np.testing.assert_array_equal(level._joints, home)
     assert (level._row, command.words) == (-1, "")
@@ -89,10 +105,14 @@ def test_a_board_that_starts_for_the_first_time_recalls_nothing(bench: Bench) ->
     np.testing.assert_array_equal(level._joints, level._cell.home)
 
 
-def test_it_recalls_its_last_messages_in_its_first_cycle_only(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_recalls_its_last_messages_in_its_first_cycle_only(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.write("status", **LAST)
     wiring = next(wiring for wiring in bench.plan.tasks if wiring.task == LEVEL)
-    task = VirtualControlLoop(bench.segment, wiring, find_class(wiring.target, Executor)(wiring.context))
+    task = VirtualControlLoop(
+        bench.segment, wiring, find_class(wiring.target, Executor)(wiring.context)
+    )
     recalled: list[int] = []
     monkeypatch.setattr(task.executor, "recall", lambda read, write: recalled.append(1))
     for tick in (50, 62):

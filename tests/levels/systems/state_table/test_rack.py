@@ -1,4 +1,5 @@
-"""The rack of state tables, from its config: it picks a block up, and goes on where its boards have died."""
+"""The rack of state tables, from its config: it picks a block up, and goes on where its boards have
+died."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ KILLED = 'fault=[{ kind = "kill", board = "primitive", at = 0.3 }]'
 
 
 def fired(rack: Rack, level: str) -> list[str]:
-    """Return the names of the rows that fired in a level, in order, each once until another fires."""
+    """Return the names of the rows that fired in a level, in order, each once until another
+    fires."""
     names = MailboxRing(rack.segment, f"{level}.status").drain().rows["message"]["fired"]
     return [name.decode() for at, name in enumerate(names) if not at or name != names[at - 1]]
 
@@ -61,11 +63,14 @@ def test_without_a_task_level_the_operator_commands_the_elemental_moves(rack_nam
 
 def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "task.toml"
-    path.write_text((FOLDER / "tables" / "task.toml").read_text().replace('place = "left"', 'place = "roof"'))
+    path.write_text(
+        (FOLDER / "tables" / "task.toml").read_text().replace('place = "left"', 'place = "roof"')
+    )
     with pytest.raises(ConfigError) as caught:
         resolve(load("nist-state-table", [f"board.task.params.tables.normal={path}"]))
     expected = (
-        "plan.step[1].place: unknown 'roof'; 'elemental_move' knows: pick block1, pick block2, pick peg, place right"
+        "plan.step[1].place: unknown 'roof'; 'elemental_move' knows: pick block1, pick block2, pick"
+        " peg, place right"
     )
     assert expected in str(caught.value)
 
@@ -76,9 +81,10 @@ def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: 
     path.write_text("\n".join(line for line in lines if not line.startswith("left =")))
     with pytest.raises(ConfigError) as caught:
         resolve(load("nist-state-table", [f"board.elemental_move.params.tables.careful={path}"]))
-    assert str(caught.value) == (
-        "board.elemental_move.params.tables.careful = \"careful.toml\": does not know 'place left', as 'normal' does; "
-        "all tables of a level know the same commands"
+    assert (
+        str(caught.value)
+        == 'board.elemental_move.params.tables.careful = "careful.toml": does not know \'place'
+        " left', as 'normal' does; all tables of a level know the same commands"
     )
 
 

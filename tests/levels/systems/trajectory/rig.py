@@ -50,7 +50,9 @@ class TrajectoryRig:
             params=params,
         )
         self.level = self.level_class(self.context)
-        self.write = Ports(**{port: self._output(kind) for port, kind in self.level.outputs.items()})
+        self.write = Ports(
+            **{port: self._output(kind) for port, kind in self.level.outputs.items()}
+        )
         self.statuses = {name: self.message(JOINT_STATUS) for name in paces}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::boards] = 1
@@ -80,7 +82,12 @@ class TrajectoryRig:
         """Queue a request; return its id."""
         self.ids += 1
         request = self.message(self.request_type)
-        request.id, request.kind, request.body, request.quaternion = self.ids, kind, -1, (0.0, 0.0, 1.0, 0.0)
+        request.id, request.kind, request.body, request.quaternion = (
+            self.ids,
+            kind,
+            -1,
+            (0.0, 0.0, 1.0, 0.0),
+        )
         for name, value in fields.items():
             setattr(request, name, value)
         self.queue.append(request)
@@ -95,7 +102,8 @@ class TrajectoryRig:
         self.order.id, self.order.what, self.ordered = self.order.id + 1, what, True
 
     def restart(self) -> None:
-        """Replace the level, as after the death of its board: its set points end, and the boards hold."""
+        """Replace the level, as after the death of its board: its set points end, and the boards
+        hold."""
         self.level = self.level_class(self.context)
         self.brake()
 
@@ -105,15 +113,28 @@ class TrajectoryRig:
             status.holding, status.target_velocity = 1, 0.0
 
     def _read(self) -> Ports:
-        taken, self.queue = self.queue[: self.level.room("requests")], self.queue[self.level.room("requests") :]
+        taken, self.queue = (
+            self.queue[: self.level.room("requests")],
+            self.queue[self.level.room("requests") :],
+        )
         empty = self.message(self.request_type)
-        requests = Reading(taken[-1], Verdict.NEW, False, tuple(taken[:-1])) if taken else Reading(empty, Verdict.OLD)
+        requests = (
+            Reading(taken[-1], Verdict.NEW, False, tuple(taken[:-1]))
+            if taken
+            else Reading(empty, Verdict.OLD)
+        )
         boards = {
-            name: Reading(status, Verdict.OLD if name in self.lost else Verdict.NEW, name in self.lost)
+            name: Reading(
+                status, Verdict.OLD if name in self.lost else Verdict.NEW, name in self.lost
+            )
             for name, status in self.statuses.items()
         }
         ordered, self.ordered = self.ordered, False
-        own = {port: self._last(source) for port, source in self.level.inputs.items() if source.source[:4] == "own."}
+        own = {
+            port: self._last(source)
+            for port, source in self.level.inputs.items()
+            if source.source[:4] == "own."
+        }
         own["operator"] = Reading(self.order, Verdict.NEW if ordered else Verdict.OLD)
         world = Reading(self.world, Verdict.NEW)
         return Ports(requests=requests, boards=boards, world=world, **own, **self.others())
@@ -135,7 +156,11 @@ class TrajectoryRig:
         before = self.write.command
         for status in self.statuses.values():
             if before.due and not status.stopped:
-                status.holding, status.target, status.target_velocity = 0, before.position, before.velocity
+                status.holding, status.target, status.target_velocity = (
+                    0,
+                    before.position,
+                    before.velocity,
+                )
             else:
                 status.holding, status.target_velocity = 1, 0.0
 
@@ -158,11 +183,18 @@ class TrajectoryRig:
     def ends(self) -> dict[int, int]:
         """Return how the last requests ended, by id."""
         status = self.write.status
-        return {int(request): int(how) for request, how in zip(status.ended, status.ends, strict=True) if request}
+        return {
+            int(request): int(how)
+            for request, how in zip(status.ended, status.ends, strict=True)
+            if request
+        }
 
     def excess(self) -> tuple[float, float]:
-        """Return the greatest velocity and acceleration of the positions so far, as parts of the limits."""
+        """Return the greatest velocity and acceleration of the positions so far, as parts of the
+        limits."""
         speeds = np.diff(self.positions, axis=0) / PERIOD_S
         bends = np.diff(speeds, axis=0) / PERIOD_S
         limits = self.cell.limits
-        return float(np.abs(speeds / limits.velocity).max()), float(np.abs(bends / limits.acceleration).max())
+        return float(np.abs(speeds / limits.velocity).max()), float(
+            np.abs(bends / limits.acceleration).max()
+        )

@@ -1,4 +1,5 @@
-"""Motion has no step in position or velocity, whatever requests come when, and keeps the limits of every joint."""
+"""Motion has no step in position or velocity, whatever requests come when, and keeps the limits of
+every joint."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from tests.levels.systems.trajectory.rig import PERIOD_S, TrajectoryRig
 
 changes = st.lists(st.floats(-0.8, 0.8), min_size=6, max_size=6)
 requests = st.lists(
-    st.tuples(changes, st.floats(0.1, 0.6), st.floats(0.0, 1.5), st.floats(0.0, 1.2)), min_size=2, max_size=4
+    st.tuples(changes, st.floats(0.1, 0.6), st.floats(0.0, 1.5), st.floats(0.0, 1.2)),
+    min_size=2,
+    max_size=4,
 )
 DOWN = (0.0, 0.0, 1.0, 0.0)
 WITHIN = (1.0, 1.0, 1.0, 1.0, 0.3, 1.0)  # joint 5 is near a limit at home
@@ -87,7 +90,11 @@ def test_a_corner_is_rounded_and_the_next_goal_reached() -> None:
 @pytest.mark.parametrize("cycles", range(10, 110, 9))
 def test_a_cancel_at_any_time_ramps_to_rest_and_drops_the_rest(cycles: int) -> None:
     rig = TrajectoryRig()
-    first = [rig.joints([0.5, 0.2, 0, 0, 0, 0.5]), rig.joints([1.0, 0, 0.3, 0, 0.2, 0.5]), rig.joints([0] * 6)]
+    first = [
+        rig.joints([0.5, 0.2, 0, 0, 0, 0.5]),
+        rig.joints([1.0, 0, 0.3, 0, 0.2, 0.5]),
+        rig.joints([0] * 6),
+    ]
     rig.run(cycles * PERIOD_S)
     before = dict(rig.ends())
     cancel = rig.request(MotionKind.CANCEL)

@@ -1,4 +1,5 @@
-"""The command environment of the host side: calls become requests, in order, each until it is done."""
+"""The command environment of the host side: calls become requests, in order, each until it is
+done."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ SIZES = {"joints": 6}
 
 
 class Level:
-    """A bus with a level at its other end, which does one request at each wait, a second. `room` messages may wait."""
+    """A bus with a level at its other end, which does one request at each wait, a second. `room`
+    messages may wait."""
 
     def __init__(self, room: int = 100, sent: int = 0) -> None:
         self.room, self.serial, self.is_over, self.tick = room, sent, False, 0
@@ -39,7 +41,11 @@ class Level:
             request = self.queue.popleft()
             if request["id"] in self.loses:
                 self.loses.remove(request["id"])
-            elif request["id"] == self.status.done + 1 or not self.done or request["kind"] == MotionKind.CANCEL:
+            elif (
+                request["id"] == self.status.done + 1
+                or not self.done
+                or request["kind"] == MotionKind.CANCEL
+            ):
                 self.done.append(request)
                 self.status.done = self.status.taken = request["id"]
                 self.status.ended[0], self.status.ends[0] = request["id"], RequestEnd.DONE
@@ -127,19 +133,25 @@ def test_a_wait_ends_when_its_condition_holds() -> None:
 
 
 def test_an_unknown_body_is_refused() -> None:
-    with pytest.raises(LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "):
+    with pytest.raises(
+        LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "
+    ):
         motions(Level()).line((0.0, 0.0, 0.1), body="block9")
 
 
 @pytest.fixture
-def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], CommandEnvironment]:
+def environment(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[[str], CommandEnvironment]:
     """Make a command environment that runs a script of this text."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
     def make(text: str) -> CommandEnvironment:
         (tmp_path / "moves.py").write_text(text)
         params = {"script": "moves.py"}
-        return CommandEnvironment(LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params))
+        return CommandEnvironment(
+            LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params)
+        )
 
     return make
 
@@ -152,6 +164,10 @@ def test_a_script_finds_the_calls_by_name(environment: Callable[[str], CommandEn
 
 def test_a_script_that_is_not_there_is_one_line() -> None:
     params = {"script": "nowhere.py"}
-    program = CommandEnvironment(LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params))
-    with pytest.raises(LevelError, match=r"params.script = nowhere.py: not in a folder of python_path"):
+    program = CommandEnvironment(
+        LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params)
+    )
+    with pytest.raises(
+        LevelError, match=r"params.script = nowhere.py: not in a folder of python_path"
+    ):
         program.run(Level())

@@ -1,4 +1,5 @@
-"""A guarded line: a lasting change of a torque ends it; one across brakes, holds or missed cycles does not."""
+"""A guarded line: a lasting change of a torque ends it; one across brakes, holds or missed cycles
+does not."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def end(rig: TrajectoryRig, seconds: float = 0.6) -> int:
 
 
 @pytest.mark.parametrize("torque", [TOUCH, -TOUCH])
-def test_a_touch_ends_the_line_and_the_next_request_goes_on_from_there(rig: TrajectoryRig, torque: float) -> None:
+def test_a_touch_ends_the_line_and_the_next_request_goes_on_from_there(
+    rig: TrajectoryRig, torque: float
+) -> None:
     height = float(rig.write.status.tool[2])
     press(rig, torque)
     assert end(rig) == RequestEnd.GUARDED

@@ -43,7 +43,9 @@ def test_two_legs_begun_half_a_blend_apart_are_one_straight_motion() -> None:
 @pytest.mark.slow
 @given(parts, times, st.floats(0.0, 2.0))
 @settings(max_examples=60, deadline=None)
-def test_a_leg_takes_half_the_acceleration_at_most(change: list[float], half: float, segment: float) -> None:
+def test_a_leg_takes_half_the_acceleration_at_most(
+    change: list[float], half: float, segment: float
+) -> None:
     limits = CELL.limits
     leg = JointLeg(CELL.home, CELL.home + np.array(change), Times(segment, half), limits)
     assert leg.law.segment_s >= max(segment, 2.0 * half)
@@ -53,13 +55,17 @@ def test_a_leg_takes_half_the_acceleration_at_most(change: list[float], half: fl
     bend = np.diff(speed, axis=0) / t[1]
     assert (np.abs(speed) <= limits.velocity * (1 + 1e-9)).all()
     assert (np.abs(bend) <= 0.5 * limits.acceleration * (1 + 1e-6) + 1e-6).all()
-    assert np.allclose(leg.at(leg.law.ends_s + 1.0), CELL.home + np.array(change), rtol=0.0, atol=1e-12)
+    assert np.allclose(
+        leg.at(leg.law.ends_s + 1.0), CELL.home + np.array(change), rtol=0.0, atol=1e-12
+    )
 
 
 @pytest.mark.slow
 @given(parts, parts, st.floats(0.1, 1.0))
 @settings(max_examples=60, deadline=None)
-def test_a_ramp_to_rest_continues_its_state_within_the_limits(v: list[float], a: list[float], least: float) -> None:
+def test_a_ramp_to_rest_continues_its_state_within_the_limits(
+    v: list[float], a: list[float], least: float
+) -> None:
     limits = CELL.limits
     velocity, acceleration = np.array(v) * limits.velocity, np.array(a) * limits.acceleration
     ramp = Settling((CELL.home, velocity, acceleration), limits.acceleration, least)

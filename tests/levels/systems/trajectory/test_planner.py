@@ -1,4 +1,5 @@
-"""The planning level alone: requests of a program, a few ahead of the arm, none lost and none done twice."""
+"""The planning level alone: requests of a program, a few ahead of the arm, none lost and none done
+twice."""
 
 from __future__ import annotations
 
@@ -58,7 +59,9 @@ class PlanningRig:
         """Plan in some cycles; return the ids sent in them."""
         before = len(self.sent)
         for _ in range(cycles):
-            read = Ports(status=Reading(self.below, Verdict.NEW), world=Reading(self.world, Verdict.NEW))
+            read = Ports(
+                status=Reading(self.below, Verdict.NEW), world=Reading(self.world, Verdict.NEW)
+            )
             if self.planner.wanted(read, self.tick):
                 self.planner.plan(read, Outbox(self), self.tick)
             self.tick += EVERY
@@ -94,7 +97,9 @@ def test_requests_are_queued_a_few_ahead_of_the_arm() -> None:
     assert rig.run(5) == [4]
     rig.below.taken = rig.below.done = 4
     assert rig.run(5) == [5, 6]
-    assert [record["joints"][0] for record in rig.sent] == pytest.approx([0.1 * k for k in range(6)])
+    assert [record["joints"][0] for record in rig.sent] == pytest.approx(
+        [0.1 * k for k in range(6)]
+    )
 
 
 def test_a_full_queue_is_tried_again_later() -> None:
@@ -134,11 +139,21 @@ def test_a_cancel_waits_for_its_time() -> None:
 
 def test_tool_goals_become_joint_positions_near_those_before() -> None:
     place = [0.45, 0.30, 0.75]
-    rig = PlanningRig([{"do": "move", "position": place}, {"do": "line", "position": [0.6, 0.1, 0.65]}, {"do": "home"}])
+    rig = PlanningRig(
+        [
+            {"do": "move", "position": place},
+            {"do": "line", "position": [0.6, 0.1, 0.65]},
+            {"do": "home"},
+        ]
+    )
     rig.run(3)
     ik = InverseKinematics(CELL, 1)
     assert np.allclose(ik.tool_at(rig.sent[0]["joints"]).position, place, atol=1e-4)
-    assert [record["kind"] for record in rig.sent] == [MotionKind.JOINTS, MotionKind.POSE, MotionKind.JOINTS]
+    assert [record["kind"] for record in rig.sent] == [
+        MotionKind.JOINTS,
+        MotionKind.POSE,
+        MotionKind.JOINTS,
+    ]
     assert np.array_equal(rig.sent[2]["joints"], CELL.home)
     assert rig.sent[1]["body"] == -1
     assert np.allclose(rig.sent[1]["quaternion"], ik.tool_at(CELL.home).quaternion)
@@ -160,9 +175,18 @@ def test_live_goals_name_their_body() -> None:
 @pytest.mark.parametrize(
     ("step", "why"),
     [
-        ({"do": "move", "joints": [0.0]}, "task.step[0].joints = [0.0]: 1 values; permitted: 6, one per joint"),
-        ({"do": "line", "position": [0, 0, 0], "body": "car"}, "task.step[0].body = 'car': not in the scene; bodies: "),
-        ({"do": "line", "position": [0, 0, 0], "live": True}, "a live goal needs a body that it follows"),
+        (
+            {"do": "move", "joints": [0.0]},
+            "task.step[0].joints = [0.0]: 1 values; permitted: 6, one per joint",
+        ),
+        (
+            {"do": "line", "position": [0, 0, 0], "body": "car"},
+            "task.step[0].body = 'car': not in the scene; bodies: ",
+        ),
+        (
+            {"do": "line", "position": [0, 0, 0], "live": True},
+            "a live goal needs a body that it follows",
+        ),
         ({"do": "move"}, "a move has either position or joints"),
     ],
 )

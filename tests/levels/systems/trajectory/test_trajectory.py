@@ -26,7 +26,9 @@ class TrackingRig(TrajectoryRig):
     def track(self) -> None:
         """Place the body as sensed now."""
         now_s = self.tick * 1e-3
-        self.world.position[POST] = np.add(self.tool, [0.0, self.speed * max(now_s - self.at, 0.0), -0.1])
+        self.world.position[POST] = np.add(
+            self.tool, [0.0, self.speed * max(now_s - self.at, 0.0), -0.1]
+        )
         self.world.velocity[POST] = [0.0, self.speed * (now_s >= self.at), 0.0]
         self.world.sensed = self.tick
 
@@ -120,10 +122,16 @@ def test_an_error_refuses_what_comes_until_a_cancel() -> None:
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
-        ({"kind": MotionKind.JOINTS, "joints": [9.0] * 6}, "joint 1 to 9 rad; permitted: -2.788 to 2.788"),
+        (
+            {"kind": MotionKind.JOINTS, "joints": [9.0] * 6},
+            "joint 1 to 9 rad; permitted: -2.788 to 2.788",
+        ),
         ({"kind": MotionKind.JOINTS, "joints": [np.nan] * 6}, "joint 1 to nan rad"),
         ({"kind": MotionKind.POSE, "position": [np.nan] * 3}, "the pose is not finite"),
-        ({"kind": MotionKind.POSE, "position": [0.5] * 3, "body": 7}, "body 7 is not in the world model"),
+        (
+            {"kind": MotionKind.POSE, "position": [0.5] * 3, "body": 7},
+            "body 7 is not in the world model",
+        ),
         ({"kind": MotionKind.STAY, "segment": -1.0}, "times 0 and -1 s"),
         ({"kind": 9}, "kind 9; permitted: 1 to 5"),
     ],

@@ -62,7 +62,9 @@ def test_the_same_seed_draws_the_same_plans(course: RackUnderTest, kinds: list[s
     assert [plan.number for plan in plans] == list(range(1, len(plans) + 1))
 
 
-def test_every_plan_fits_its_rack(course: RackUnderTest, kinds: list[str], config: RackConfig) -> None:
+def test_every_plan_fits_its_rack(
+    course: RackUnderTest, kinds: list[str], config: RackConfig
+) -> None:
     for plan in [*drawn(course, kinds, "3", True), *drawn(course, kinds, "3", False)]:
         planned = plan.config(config, "other")
         assert fault_mistakes(places(planned), planned, course.targets.layout) == []
@@ -70,7 +72,9 @@ def test_every_plan_fits_its_rack(course: RackUnderTest, kinds: list[str], confi
 
 
 @pytest.mark.parametrize("lockstep", BOTH)
-def test_every_kind_is_drawn_as_often_as_asked_for(course: RackUnderTest, kinds: list[str], lockstep: bool) -> None:
+def test_every_kind_is_drawn_as_often_as_asked_for(
+    course: RackUnderTest, kinds: list[str], lockstep: bool
+) -> None:
     plans = drawn(course, kinds, "1", lockstep)
     found = Counter(table["kind"] for plan in plans for table in plan.faults)
     found[EXTERNAL] += sum(len(plan.kills) for plan in plans)
@@ -95,10 +99,15 @@ def test_faults_of_a_trial_follow_each_other_with_time_to_recover(
     for plan in plans:
         assert 1 <= len(plan.faults) + len(plan.kills) <= MOST_FAULTS
         ends = [
-            (t.get("tick", 0), t.get("tick", 0) + _lasts(t) + _undone(t["kind"], t["board"], course))
+            (
+                t.get("tick", 0),
+                t.get("tick", 0) + _lasts(t) + _undone(t["kind"], t["board"], course),
+            )
             for t in plan.faults
         ]
-        ends += [(kill.tick, kill.tick + _undone("kill", kill.board, course)) for kill in plan.kills]
+        ends += [
+            (kill.tick, kill.tick + _undone("kill", kill.board, course)) for kill in plan.kills
+        ]
         ends.sort()
         assert all(later[0] > earlier[1] for earlier, later in pairwise(ends))
         assert ends[-1][0] <= TICKS
@@ -110,9 +119,13 @@ def _undone(kind: str, board: str, course: RackUnderTest) -> int:
     return KINDS[kind].recovery_ticks(board, course.targets.layout, course.restart_s)
 
 
-def test_a_mailbox_is_struck_again_only_where_its_readers_would_tell_of_it_again(course: RackUnderTest) -> None:
+def test_a_mailbox_is_struck_again_only_where_its_readers_would_tell_of_it_again(
+    course: RackUnderTest,
+) -> None:
     layout, again = course.targets.layout, 0
-    for plan in fault_plans(course, dict.fromkeys(("drop", "corrupt", "delay", "mute"), 100), "5", True, first=1):
+    for plan in fault_plans(
+        course, dict.fromkeys(("drop", "corrupt", "delay", "mute"), 100), "5", True, first=1
+    ):
         quiet_from: dict[str, int] = {}
         for table in plan.faults:
             box = layout.mailbox(table["mailbox"])
@@ -130,26 +143,43 @@ def _lasts(table: Mapping[str, Any]) -> int:
     return 0 if table["kind"] == "hang" else round(table.get("for", 0.0) * SECOND)
 
 
-def test_a_board_that_fails_its_start_has_a_trial_of_its_own(course: RackUnderTest, kinds: list[str]) -> None:
-    plans = [p for p in drawn(course, kinds, "2", True) if any(t["kind"] == "self-test" for t in p.faults)]
+def test_a_board_that_fails_its_start_has_a_trial_of_its_own(
+    course: RackUnderTest, kinds: list[str]
+) -> None:
+    plans = [
+        p
+        for p in drawn(course, kinds, "2", True)
+        if any(t["kind"] == "self-test" for t in p.faults)
+    ]
     assert plans
     assert all(len(plan.faults) == 1 and not plan.kills for plan in plans)
 
 
-def test_faults_strike_at_phases_of_the_tick_in_real_time_alone(course: RackUnderTest, kinds: list[str]) -> None:
+def test_faults_strike_at_phases_of_the_tick_in_real_time_alone(
+    course: RackUnderTest, kinds: list[str]
+) -> None:
     plans = [*drawn(course, kinds, "2", True), *drawn(course, kinds, "2", False)]
-    phased = [table for plan in plans if not plan.lockstep for table in plan.faults if "phase" in table]
+    phased = [
+        table for plan in plans if not plan.lockstep for table in plan.faults if "phase" in table
+    ]
     assert len({table["phase"] for table in phased}) > 5
     assert all(KINDS[table["kind"]].within_tick for table in phased)
-    assert not [table for plan in plans if plan.lockstep for table in plan.faults if "phase" in table]
+    assert not [
+        table for plan in plans if plan.lockstep for table in plan.faults if "phase" in table
+    ]
 
 
 def test_only_mailboxes_that_somebody_reads_are_struck(small: Path) -> None:
     counting = load(small)
     targets = Targets(counting, wire(counting))
-    struck = {target.mailbox for found in targets.by_kind.values() for target in found if target.mailbox}
+    struck = {
+        target.mailbox for found in targets.by_kind.values() for target in found if target.mailbox
+    }
     # Nobody reads upper.status; lower.plan is of a planner, and no periodic message.
-    assert {target.mailbox for target in targets.by_kind["mute"]} == {"upper.command", "lower.status"}
+    assert {target.mailbox for target in targets.by_kind["mute"]} == {
+        "upper.command",
+        "lower.status",
+    }
     assert struck == {"upper.command", "lower.status", "lower.plan"}
 
 
@@ -158,7 +188,9 @@ def test_a_muted_mailbox_stays_mute_for_longer_than_its_bound(course: RackUnderT
     for plan in drawn(course, ["mute"], "4", True):
         for table in plan.faults:
             readers = layout.mailbox(table["mailbox"]).readers
-            bound = 2 * cycle_ticks(layout, table["board"]) + min(cycle_ticks(layout, r) for r in readers)
+            bound = 2 * cycle_ticks(layout, table["board"]) + min(
+                cycle_ticks(layout, r) for r in readers
+            )
             assert table["for"] * SECOND >= bound
 
 
@@ -183,13 +215,23 @@ def test_every_size_of_the_sweep_comes_once(course: RackUnderTest, kinds: list[s
 
 
 def test_a_plan_is_a_file_that_repeats_it(config: RackConfig, tmp_path: Path) -> None:
-    fault = {"kind": "drop", "board": "servo", "tick": 7, "for": 0.05, "mailbox": "servo.status", "probability": 0.5}
+    fault = {
+        "kind": "drop",
+        "board": "servo",
+        "tick": 7,
+        "for": 0.05,
+        "mailbox": "servo.status",
+        "probability": 0.5,
+    }
     plan = Plan(3, "faults", lockstep=True, faults=(fault,), kills=(Kill("task", 90, 0.25),))
     text = plan.toml("nasrem")
     assert "rack run nasrem --lockstep --faults" in text
     assert "# external kill: task at tick 90 + 0.25" in text
     tables = tomllib.loads(text)["fault"]
-    assert tuple(FaultConfig.model_validate(table) for table in tables) == plan.config(config, "other").fault
+    assert (
+        tuple(FaultConfig.model_validate(table) for table in tables)
+        == plan.config(config, "other").fault
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""The surroundings of trials: leftovers are noticed, the load loads, and the violation counter is checked."""
+"""The surroundings of trials: leftovers are noticed, the load loads, and the violation counter is
+checked."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def test_a_file_left_in_shared_memory_is_noticed(rack_name: str) -> None:
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_left_behind_is_noticed_whoever_its_parent_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("rack.tools.faults.campaigns.environment.BOUND_S", 0.05)
     rack = f"p{os.getpid()}x"
 
@@ -49,7 +52,9 @@ def test_a_process_left_behind_is_noticed_whoever_its_parent_is(monkeypatch: pyt
 
 @pytest.mark.slow
 @pytest.mark.parametrize("has_stress", [True, False])
-def test_a_load_is_a_busy_process_a_core_and_one_that_writes(has_stress: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_load_is_a_busy_process_a_core_and_one_that_writes(
+    has_stress: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if has_stress and shutil.which("stress-ng") is None:
         pytest.skip("stress-ng is not installed")
     if not has_stress:
@@ -60,16 +65,25 @@ def test_a_load_is_a_busy_process_a_core_and_one_that_writes(has_stress: bool, m
         wait_until(lambda: len(children() - before) >= cores + 1 + has_stress)
         busy = children() - before
     wait_until(lambda: not any(runs(pid) for pid in busy))
-    assert told == (f"stress-ng --cpu {cores} --io 1" if has_stress else f"{cores} busy processes and one that writes")
+    assert told == (
+        f"stress-ng --cpu {cores} --io 1"
+        if has_stress
+        else f"{cores} busy processes and one that writes"
+    )
 
 
 def test_a_counter_of_violations_that_counts_passes() -> None:
     examine(config.load("nasrem"))
 
 
-def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(LimitMonitor, "_count", lambda monitor, *_: None)
-    with pytest.raises(Failure, match=r"violation counter: joint 'j1' at \d+.* rad/s, twice its limit, is not counted"):
+    with pytest.raises(
+        Failure,
+        match=r"violation counter: joint 'j1' at \d+.* rad/s, twice its limit, is not counted",
+    ):
         examine(config.load("nasrem"))
 
 

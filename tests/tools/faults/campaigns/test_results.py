@@ -60,13 +60,22 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
             trial(SEEN, FLOWS, event(110, "reaction", "restart", "lower")),
             "mute of lower.status, struck at tick 100: restart never undone; bound 152",
         ),
-        (trial(SEEN), "mute of lower.status, struck at tick 100: loss of messages never undone; bound 152"),
         (
-            trial(SEEN, flows(300)),
-            "mute of lower.status, struck at tick 100: loss of messages undone after 200 ticks; bound 152",
+            trial(SEEN),
+            "mute of lower.status, struck at tick 100: loss of messages never undone; bound 152",
         ),
         (
-            trial(found(100, "command_invalid", "lower"), strikes=(strike("command-nan", "lower", 100, 110),)),
+            trial(SEEN, flows(300)),
+            (
+                "mute of lower.status, struck at tick 100: loss of messages undone after 200 ticks;"
+                " bound 152"
+            ),
+        ),
+        (
+            trial(
+                found(100, "command_invalid", "lower"),
+                strikes=(strike("command-nan", "lower", 100, 110),),
+            ),
             "command-nan of lower, struck at tick 100: no brakes closed follows",
         ),
         (
@@ -74,7 +83,10 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
             "the task is not done, and no fault had to end it: task failed; level 'lower': blocked",
         ),
         (replace(trial(SEEN, FLOWS), arm=ArmEnd(violations=3)), "limits violated at 3 substeps"),
-        (replace(trial(SEEN, FLOWS), left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),
+        (
+            replace(trial(SEEN, FLOWS), left=("process 7 (x:servo)",)),
+            "left behind: process 7 (x:servo)",
+        ),
         (
             trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status")),
             "upper: gap: no fault explains it (tick 9000)",
@@ -110,11 +122,18 @@ def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_i
     good = refused("self-test", "board 'lower': the self-test fails", outcome("time over"))
     assert (good.ended, good.shortfalls) == ("not armed", [])
     assert good.verdict.faults[0].seen == "detected"
-    assert refused("self-test", "board 'upper': the self-test fails").verdict.faults[0].seen == "missed"
+    assert (
+        refused("self-test", "board 'upper': the self-test fails").verdict.faults[0].seen
+        == "missed"
+    )
 
 
-@pytest.mark.parametrize("again", [None, outcome("board lost", "board 'lower' ended")], ids=["not armed", "lost"])
-def test_a_self_test_that_failed_is_recovered_from_when_the_rack_then_runs_without_it(again: Outcome | None) -> None:
+@pytest.mark.parametrize(
+    "again", [None, outcome("board lost", "board 'lower' ended")], ids=["not armed", "lost"]
+)
+def test_a_self_test_that_failed_is_recovered_from_when_the_rack_then_runs_without_it(
+    again: Outcome | None,
+) -> None:
     why = "board 'lower': the self-test fails"
     assert refused("self-test", why, outcome("time over")).verdict.faults[0].is_recovered
     assert refused("self-test", why, again).shortfalls == [

@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from rack.tools.faults.campaigns.statistics import by_kind, curve, part_of_bound, rate, spread, totals, wilson
+from rack.tools.faults.campaigns.statistics import (
+    by_kind,
+    curve,
+    part_of_bound,
+    rate,
+    spread,
+    totals,
+    wilson,
+)
 from rack.tools.faults.ending import EXTERNAL
 from rack.tools.faults.judge import Judgement
 from tests.tools.fault_events import TICK_NS
@@ -28,14 +36,26 @@ def judgement(kind: str = "mute", delay: int | None = 5, bound: int = 10, **more
     delay_ms = None if delay is None else delay * 2.5
     found = replace(FOUND, kind=kind, delay=delay, delay_ms=delay_ms, bound=bound)
     is_within = delay is not None and delay <= bound
-    return replace(replace(found, seen="missed" if delay is None else "detected", is_within=is_within), **more)
+    return replace(
+        replace(found, seen="missed" if delay is None else "detected", is_within=is_within), **more
+    )
 
 
 def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> None:
-    faults = [judgement(), judgement(delay=12), judgement(delay=None), judgement(seen="not struck", struck=-1)]
+    faults = [
+        judgement(),
+        judgement(delay=12),
+        judgement(delay=None),
+        judgement(seen="not struck", struck=-1),
+    ]
     found = totals(faults)
     assert (found["drawn"], found["not_struck"], found["injected"]) == (4, 1, 3)
-    assert (found["detected"], found["missed"], found["within_bound"], found["recovered"]) == (2, 1, 1, 3)
+    assert (found["detected"], found["missed"], found["within_bound"], found["recovered"]) == (
+        2,
+        1,
+        1,
+        3,
+    )
 
 
 def test_a_size_that_need_not_be_found_counts_nowhere() -> None:
@@ -73,8 +93,14 @@ def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:
 
 
 def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
-    faults = [judgement("sensor-bias", size=0.1), judgement("sensor-bias", size=0.001, delay=None), judgement()]
-    assert [(point["size"], point["delay_ms"]) for point in curve(faults, "sensor-bias", TICK_NS)] == [
+    faults = [
+        judgement("sensor-bias", size=0.1),
+        judgement("sensor-bias", size=0.001, delay=None),
+        judgement(),
+    ]
+    assert [
+        (point["size"], point["delay_ms"]) for point in curve(faults, "sensor-bias", TICK_NS)
+    ] == [
         (0.001, None),
         (0.1, 12.5),
     ]

@@ -20,7 +20,8 @@ PERIOD_NS = 2_500_000
 
 
 def bus(make: MakeBus, pid: int, lockstep: bool = True) -> Segment:
-    """Return the memory of a rack whose board `level` is this process, and whose clock stands at tick 0."""
+    """Return the memory of a rack whose board `level` is this process, and whose clock stands at
+    tick 0."""
     segment = make(task("level"), task("other", slot=3))
     words, block = segment.words, segment.block("level")
     words[System.PERIOD_NS], words[System.LOCKSTEP], words[System.TICK] = PERIOD_NS, lockstep, 0
@@ -48,7 +49,10 @@ def test_a_board_is_killed_once_at_its_tick_and_not_before(make_bus: MakeBus) ->
 
 
 @pytest.mark.parametrize("word", ["STATE", "LOST"])
-def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(make_bus: MakeBus, word: str) -> None:  # noqa: F811
+def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
+    make_bus: MakeBus,  # noqa: F811
+    word: str,
+) -> None:
     with forked(lambda: time.sleep(BOUND_S)) as pid:
         segment = bus(make_bus, pid)
         block, place = segment.block("level"), Block[word]
@@ -62,7 +66,9 @@ def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(make_bus: MakeBu
         assert exit_status(pid) == -9
 
 
-def test_it_looks_often_in_lockstep_and_sleeps_to_its_instant_in_real_time(make_bus: MakeBus) -> None:  # noqa: F811
+def test_it_looks_often_in_lockstep_and_sleeps_to_its_instant_in_real_time(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
     segment = bus(make_bus, os.getpid(), lockstep=False)
     assert Killer(segment, []).due_in_s() == 0.5
     near, far = Kill(board="level", tick=60, phase=0.5), Kill(board="level", tick=4000, phase=0.0)

@@ -15,7 +15,8 @@ threads = {str(number): thread for number in range(int(options["threads"]))}
 with open(options["json"], "w") as file:
     json.dump({"thread": threads}, file)
 """
-"""Late by 12 us, but for one wake at 2.5 ms and two beyond its histogram, of which the longest is known."""
+"""Late by 12 us, but for one wake at 2.5 ms and two beyond its histogram, of which the longest is
+known."""
 REFUSED = """\
 import sys
 sys.exit("Unable to change scheduling policy!")
@@ -29,7 +30,8 @@ for line in sys.stdin:
         period = int(words[3].partition("=")[2])
     if words[:3] == ["loadusr", "-w", "halsampler"]:
         early = ["0", "203155", str(period + 7)]
-        print("\\n".join([*early, *[str(period), str(period + 5000), str(period - 5000)] * (int(words[4]) // 3)]))
+        others = [str(period), str(period + 5000), str(period - 5000)] * (int(words[4]) // 3)
+        print("\\n".join([*early, *others]))
 """
 """A thread whose every third run is 5 us late, behind LinuxCNC's command line."""
 

@@ -1,4 +1,5 @@
-"""The bench of boards: a message takes as many cycles as there are boards, and costs lie on a line."""
+"""The bench of boards: a message takes as many cycles as there are boards, and costs lie on a
+line."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ def test_a_chain_of_boards_fills_the_crate() -> None:
 
 
 @pytest.mark.slow
-def test_messages_take_as_many_cycles_as_there_are_boards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_take_as_many_cycles_as_there_are_boards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure((2, 5), Runs(0.2, 1, True), ROOT, Progress())
     assert found.exact
@@ -76,7 +79,8 @@ def test_costs_on_a_line_are_found_to_be_linear() -> None:
 @pytest.mark.slow
 def test_costs_are_drawn_with_their_line(tmp_path: Path) -> None:
     chains = [
-        replace(SHORT, boards=n, processor_us=50.0 * n + 100.0, lockstep_us={"ours": 40.0 * n}) for n in (1, 5, 9)
+        replace(SHORT, boards=n, processor_us=50.0 * n + 100.0, lockstep_us={"ours": 40.0 * n})
+        for n in (1, 5, 9)
     ]
     found = Boards(tuple(chains), ("ours",), 2, None)
     assert found.document()["fit"]["board_us"] == pytest.approx(50.0)

@@ -26,7 +26,8 @@ def main():
         threading.Event().wait()
     import given
     child = "import {package}cli; print({package}cli.__file__)"
-    print(sys.argv, __file__, subprocess.run([sys.executable, "-c", child], capture_output=True).stdout.decode())
+    done = subprocess.run([sys.executable, "-c", child], capture_output=True)
+    print(sys.argv, __file__, done.stdout.decode())
 """
 
 
@@ -34,7 +35,9 @@ def tree_of(folder: Path, package: str, mapping: str = "") -> Path:
     (folder / "tools").mkdir(parents=True)
     (folder / "tools" / "__init__.py").touch()
     (folder / "tools" / "cli.py").write_text(MAIN.format(package=package))
-    (folder / "pyproject.toml").write_text(f'[project.scripts]\nrack = "{package}cli:main"\n{mapping}')
+    (folder / "pyproject.toml").write_text(
+        f'[project.scripts]\nrack = "{package}cli:main"\n{mapping}'
+    )
     return folder
 
 
@@ -56,7 +59,11 @@ def test_a_checkout_and_its_children_run_their_own_files(
         assert argv == "['rack', 'run', '3']"
         assert [Path(own).resolve(), Path(child).resolve()] == [tree / "tools" / "cli.py"] * 2
         assert (found.name, found.package) == ("other", "" if bare else "rack.")
-        links = [path for path in found.environment["PYTHONPATH"].split(os.pathsep) if "rack-bench-" in path]
+        links = [
+            path
+            for path in found.environment["PYTHONPATH"].split(os.pathsep)
+            if "rack-bench-" in path
+        ]
     assert not any(Path(link).exists() for link in links)
 
 
@@ -70,7 +77,9 @@ def test_a_command_that_fails_or_hangs_is_one_line(tmp_path: Path) -> None:
     with checkout(tree_of(tmp_path / "other", "tools.")) as found:
         with pytest.raises(Failure, match=r"^other: rack fail now: the reason$"):
             found.run("fail", "now", bound_s=BOUND_S)
-        with pytest.raises(Failure, match=r"^other: rack lack: .*no_such_package'; give the folder .* PYTHONPATH$"):
+        with pytest.raises(
+            Failure, match=r"^other: rack lack: .*no_such_package'; give the folder .* PYTHONPATH$"
+        ):
             found.run("lack", bound_s=BOUND_S)
         with pytest.raises(Failure, match=r"^other: rack wait: still running after 0.5 s$"):
             found.run("wait", bound_s=0.5)
@@ -85,7 +94,10 @@ def test_a_path_that_is_no_checkout_is_refused_in_one_line(tmp_path: Path) -> No
         (tmp_path, "[project.scripts]\nother = 'a:b'", "its pyproject.toml has no script 'rack'"),
         (
             tmp_path,
-            "[project.scripts]\nrack = 'rack.tools.cli:main'\n[tool.setuptools.package-dir]\n'rack.tools' = 'tools'",
+            (
+                "[project.scripts]\nrack ="
+                " 'rack.tools.cli:main'\n[tool.setuptools.package-dir]\n'rack.tools' = 'tools'"
+            ),
             "it has no folder tools",
         ),
     ]
@@ -103,4 +115,8 @@ def test_a_path_that_is_no_checkout_is_refused_in_one_line(tmp_path: Path) -> No
 def test_a_bench_against_no_checkout_is_a_usage_error(bench: str, tmp_path: Path) -> None:
     done = rack("bench", bench, "--against", tmp_path / "nowhere", "--json")
     reason = f"{tmp_path / 'nowhere'}: not a checkout of rack: no such folder"
-    assert (done.returncode, done.stderr.strip(), json.loads(done.stdout)["error"]) == (2, reason, [reason])
+    assert (done.returncode, done.stderr.strip(), json.loads(done.stdout)["error"]) == (
+        2,
+        reason,
+        [reason],
+    )

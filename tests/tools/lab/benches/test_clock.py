@@ -1,4 +1,5 @@
-"""The bench of the clock: every way to wake is measured next to its peers, and who is missing is named."""
+"""The bench of the clock: every way to wake is measured next to its peers, and who is missing is
+named."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ from tests.tools.lab.benches import peers
 
 @pytest.mark.slow
 @needs_fifo
-def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_boards_and_peers_are_measured_at_one_rate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
     peers.program(tmp_path, "halrun", peers.HALRUN)
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -35,7 +38,12 @@ def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: 
     both_ways = {who + ending for who in BOTH_WAYS for ending in ("", AWAKE)}
     # Where the request is refused, that is said at each rate.
     named = {who.partition(" at 400 Hz")[0] for who in named}
-    assert {*measured} | named == {*(f"board, {wake}" for wake in get_args(Wake)), BARE, LINUXCNC, *both_ways}
+    assert {*measured} | named == {
+        *(f"board, {wake}" for wake in get_args(Wake)),
+        BARE,
+        LINUXCNC,
+        *both_ways,
+    }
     assert 0 < measured["board, signal"].count <= 100
     assert min(measured["board, signal"].values) > 0.0
     assert measured[CYCLICTEST].median == 12.0
@@ -45,7 +53,9 @@ def test_boards_and_peers_are_measured_at_one_rate(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_peers_that_the_machine_lacks_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peers_that_the_machine_lacks_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure((1000,), Runs(0.1, 1, True), Progress())
     assert {CYCLICTEST, LINUXCNC} <= {one.who for one in found.absent}
@@ -64,7 +74,11 @@ def test_a_peer_that_fails_is_named_with_its_reason(monkeypatch: pytest.MonkeyPa
     found = measure((50,), Runs(0.1, 2), Progress())
     assert found.samples == ()
     (absent,) = found.absent
-    assert absent.line == "absent: cyclictest at 50 Hz, 2 of 2 rounds: cyclictest: Unable to change scheduling policy!"
+    assert (
+        absent.line
+        == "absent: cyclictest at 50 Hz, 2 of 2 rounds: cyclictest: Unable to change scheduling"
+        " policy!"
+    )
 
 
 @pytest.mark.slow
@@ -101,15 +115,22 @@ def wakes(who: str, case: str, *late_us: float) -> Sample:
 def test_the_setting_with_fewer_lost_cycles_suits_then_the_one_with_the_better_worst_wake_up(
     asleep: tuple[float, ...], awake: tuple[float, ...], suits: str
 ) -> None:
-    board_and_peer = [wakes(BOTH_WAYS[0], "400 Hz", *asleep), wakes(BOTH_WAYS[0] + AWAKE, "400 Hz", *awake)]
+    board_and_peer = [
+        wakes(BOTH_WAYS[0], "400 Hz", *asleep),
+        wakes(BOTH_WAYS[0] + AWAKE, "400 Hz", *awake),
+    ]
     board_and_peer += [wakes(who, "50 Hz", 10.0) for who in (CYCLICTEST, CYCLICTEST + AWAKE)]
     # Others, however late, decide nothing.
     others = [wakes(BARE, "400 Hz", 50_000.0), wakes("board, signal", "400 Hz", 50_000.0)]
     line = suiting([*board_and_peer, *others])
     assert line.startswith(f'clock.idle_cores that suits this machine: "{suits}", ')
     figures = {part[1:6].strip('",'): part for part in line.partition(": ")[2].split("; with ")}
-    assert f"{sum(us >= 2500.0 for us in asleep)} of 13 wake-ups late by a period" in figures["sleep"]
-    assert f"{sum(us >= 2500.0 for us in awake)} of 13 wake-ups late by a period" in figures["awake"]
+    assert (
+        f"{sum(us >= 2500.0 for us in asleep)} of 13 wake-ups late by a period" in figures["sleep"]
+    )
+    assert (
+        f"{sum(us >= 2500.0 for us in awake)} of 13 wake-ups late by a period" in figures["awake"]
+    )
     assert f"worst {max(awake):.0f} us" in figures["awake"]
     assert suiting([*board_and_peer[::2], *others]) == ""
 
@@ -122,10 +143,17 @@ def test_a_peer_is_measured_while_the_bench_holds_idle_cores_awake_and_only_then
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
 
     def look(grid: WakeGrid) -> np.ndarray:
-        held.append(device in [one.readlink() for one in Path("/proc/self/fd").iterdir() if one.is_symlink()])
+        held.append(
+            device
+            in [one.readlink() for one in Path("/proc/self/fd").iterdir() if one.is_symlink()]
+        )
         return np.array([10.0])
 
-    monkeypatch.setattr(clock, "_contestants", lambda share: ({"board, timer": look, f"board, timer{AWAKE}": look}, []))
+    monkeypatch.setattr(
+        clock,
+        "_contestants",
+        lambda share: ({"board, timer": look, f"board, timer{AWAKE}": look}, []),
+    )
     found = measure((50,), Runs(0.1, 2), Progress())
     assert sorted(held) == [False, False, True, True]
     assert found.document()["conclusion"] == found.conclusion == list(found.lines())[-1] != ""
@@ -137,7 +165,9 @@ def test_a_machine_that_refuses_to_hold_idle_cores_awake_is_named(
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
     calm = {"board, timer": lambda grid: np.array([10.0])}
     monkeypatch.setattr(
-        clock, "_contestants", lambda share: ({**calm, f"board, timer{AWAKE}": calm["board, timer"]}, [])
+        clock,
+        "_contestants",
+        lambda share: ({**calm, f"board, timer{AWAKE}": calm["board, timer"]}, []),
     )
     found = measure((50,), Runs(0.1, 1), Progress())
     (absent,) = found.absent
@@ -146,7 +176,9 @@ def test_a_machine_that_refuses_to_hold_idle_cores_awake_is_named(
     assert found.conclusion == ""
 
 
-def test_a_board_that_overslept_grid_points_is_late_from_the_first_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_board_that_overslept_grid_points_is_late_from_the_first_of_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Overslept:
         def settled(self, task: str) -> np.ndarray:
             rows = np.zeros(2, RECORD)

@@ -1,4 +1,5 @@
-"""Comparisons: figures and ratios of given samples, the table, the picture, who is absent, and taking turns."""
+"""Comparisons: figures and ratios of given samples, the table, the picture, who is absent, and
+taking turns."""
 
 from __future__ import annotations
 
@@ -67,14 +68,28 @@ def test_ratios_are_to_the_baseline_of_the_same_case() -> None:
 
 def test_the_document_has_every_figure_and_says_who_is_absent() -> None:
     missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
-    found = Comparison("pair", "Two contestants", SAMPLES, {"small": "theirs"}, (missing,)).document()
+    found = Comparison(
+        "pair", "Two contestants", SAMPLES, {"small": "theirs"}, (missing,)
+    ).document()
     assert json.loads(json.dumps(found)) == found
     names = ("case", "who", "unit", "count", "median", "best", "ratio")
-    assert [found["samples"][0][name] for name in names] == ["small", "ours", "us", 3, 2.0, 1.0, 0.5]
+    assert [found["samples"][0][name] for name in names] == [
+        "small",
+        "ours",
+        "us",
+        3,
+        2.0,
+        1.0,
+        0.5,
+    ]
     assert found["samples"][0]["p99"] == pytest.approx(2.98)
     assert found["samples"][0]["p99_ratio"] == pytest.approx(2.98 / 9.88)
     assert found["absent"] == [
-        {"who": "cyclictest", "reason": "no program 'cyclictest'", "install": "apt-get install rt-tests"}
+        {
+            "who": "cyclictest",
+            "reason": "no program 'cyclictest'",
+            "install": "apt-get install rt-tests",
+        }
     ]
 
 
@@ -93,17 +108,23 @@ def test_the_picture_is_written_as_png_and_svg(tmp_path: Path) -> None:
     paths = BOTH.plot(tmp_path)
     assert [path.name for path in paths] == ["pair.png", "pair.svg"]
     text = paths[1].read_text()
-    assert all(f"<!-- {word} -->" in text for word in ("small", "large", "ours", "theirs", "2  (0.50)"))
+    assert all(
+        f"<!-- {word} -->" in text for word in ("small", "large", "ours", "theirs", "2  (0.50)")
+    )
 
 
 def test_a_package_that_cannot_be_imported_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     assert absent_package("JSON", "json") is None
     monkeypatch.setattr(sys, "meta_path", [Hidden("iceoryx2"), *sys.meta_path])
     monkeypatch.delitem(sys.modules, "iceoryx2", raising=False)
-    assert absent_package("blackboard", "iceoryx2") == Absent("blackboard", "No module named 'iceoryx2'", EXTRA)
+    assert absent_package("blackboard", "iceoryx2") == Absent(
+        "blackboard", "No module named 'iceoryx2'", EXTRA
+    )
 
 
-def test_a_program_that_is_not_on_the_path_is_absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_program_that_is_not_on_the_path_is_absent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     assert absent_program("shell", "sh", "dash") is None
     monkeypatch.setenv("PATH", str(tmp_path))
     found = absent_program("cyclictest", "cyclictest", "rt-tests")
@@ -122,6 +143,8 @@ def test_everybody_has_one_turn_a_round_and_no_fixed_neighbour() -> None:
 
 def test_results_are_kept_by_contestant_in_the_order_of_rounds() -> None:
     calls: list[str] = []
-    contestants = {name: lambda name=name: (calls.append(name), calls.count(name))[1] for name in "xyz"}
+    contestants = {
+        name: lambda name=name: (calls.append(name), calls.count(name))[1] for name in "xyz"
+    }
     assert interleaved(contestants, 3) == {name: [1, 2, 3] for name in "xyz"}
     assert len(calls) == 9

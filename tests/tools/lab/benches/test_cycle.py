@@ -1,4 +1,5 @@
-"""The bench of cycles: real racks in a short form, the parts of given traces, and the physics of a recorded run."""
+"""The bench of cycles: real racks in a short form, the parts of given traces, and the physics of a
+recorded run."""
 
 from __future__ import annotations
 
@@ -36,7 +37,9 @@ def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:
     one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 5000
     found = parts_of(one)
     assert tuple(found) == PARTS
-    assert [times.tolist() for times in found.values()] == [[us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)]
+    assert [times.tolist() for times in found.values()] == [
+        [us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)
+    ]
 
 
 def test_bookkeeping_that_a_trace_does_not_separate_is_part_of_waking_up() -> None:
@@ -74,7 +77,9 @@ def test_a_board_is_compared_with_another_checkout_and_the_servo_with_its_physic
 
 def test_without_another_checkout_only_physics_give_a_ratio() -> None:
     found = costs(given(), None).comparison
-    assert {sample.case for sample in found.samples if found.ratio(sample)} == {"servo and its physics, real time"}
+    assert {sample.case for sample in found.samples if found.ratio(sample)} == {
+        "servo and its physics, real time"
+    }
 
 
 @pytest.mark.slow
@@ -83,16 +88,24 @@ def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> Non
     document = found.document()
     assert json.loads(json.dumps(document)) == document
     boards = ("empty", "servo", "primitive", "elemental_move", "task", "world")
-    # In so short a run the task level has no cycle beyond those that a new process spends warming up.
+    # In so short a run the task level has no cycle beyond those that a new process spends warming
+    # up.
     seen = {one.case for one in found.parts}
-    assert seen == {f"{board}, {mode}" for board in boards if board != "task" for mode in ("real time", "lockstep")}
+    assert seen == {
+        f"{board}, {mode}"
+        for board in boards
+        if board != "task"
+        for mode in ("real time", "lockstep")
+    }
     for one in found.parts:
         sample = found.comparison.sample(one.case, one.who)
         assert sample is not None
         assert set(one.parts) == set(PARTS)
         assert min(one.parts.values()) >= 0.0
         assert sample.median > one.parts["process"]
-    assert {"servo and its physics, lockstep", "servo and its physics, real time"} <= set(found.comparison.baselines)
+    assert {"servo and its physics, lockstep", "servo and its physics, real time"} <= set(
+        found.comparison.baselines
+    )
     share = next(sample for sample in found.comparison.samples if "a board" in sample.case)
     assert share.count > 100
     assert [path.name for path in found.plot(tmp_path)] == ["cycle.png", "cycle.svg"]
@@ -102,12 +115,16 @@ def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> Non
 def test_an_empty_rack_is_a_ring_of_boards_on_two_cores(tmp_path: Path) -> None:
     config = load(write_empty_rack(tmp_path, "rack."))
     assert len(config.board) == BOARDS
-    assert {board.reads["read"] for board in config.board.values()} == {(f"{name}.written",) for name in config.board}
+    assert {board.reads["read"] for board in config.board.values()} == {
+        (f"{name}.written",) for name in config.board
+    }
     assert {board.core for board in config.board.values()} == {0, 1}
 
 
 @pytest.mark.slow
-def test_replayed_physics_end_in_the_recorded_state(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_replayed_physics_end_in_the_recorded_state(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     run = nasrem_run(tmp_path_factory)
     whole = len(Replay.of(Recording(run)).controls)
     assert whole > 1000

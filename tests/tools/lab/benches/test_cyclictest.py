@@ -1,4 +1,5 @@
-"""cyclictest: its histogram as the lateness of every wake, and what it says when it is absent or refused."""
+"""cyclictest: its histogram as the lateness of every wake, and what it says when it is absent or
+refused."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 
 GRID = WakeGrid((0,), 1_000_000, 50, 80)
-needs_cyclictest = pytest.mark.skipif(shutil.which("cyclictest") is None, reason="needs cyclictest (rt-tests)")
+needs_cyclictest = pytest.mark.skipif(
+    shutil.which("cyclictest") is None, reason="needs cyclictest (rt-tests)"
+)
 
 
 @needs_fifo
@@ -26,7 +29,9 @@ def test_every_wake_has_its_lateness() -> None:
     assert (found >= 0).all()
 
 
-def test_wakes_beyond_the_histogram_count_as_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wakes_beyond_the_histogram_count_as_the_latest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)))
     found = cyclictest(GRID)
     assert np.unique(found, return_counts=True)[1].tolist() == [47, 1, 2]
@@ -37,19 +42,25 @@ def test_wakes_beyond_the_histogram_count_as_the_latest(tmp_path: Path, monkeypa
 
 def test_idle_cores_are_left_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = f"open({str(tmp_path / 'words')!r}, 'w').write(' '.join(sys.argv))"
-    monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", f"{peers.CYCLICTEST}{told}\n")))
+    monkeypatch.setenv(
+        "PATH", str(peers.program(tmp_path, "cyclictest", f"{peers.CYCLICTEST}{told}\n"))
+    )
     cyclictest(GRID)
     # Without it cyclictest itself holds every core awake.
     assert "--laptop" in (tmp_path / "words").read_text().split()
 
 
-def test_a_refusal_is_a_failure_in_its_own_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_is_a_failure_in_its_own_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.REFUSED)))
     with pytest.raises(Failure, match="cyclictest: Unable to change scheduling policy!"):
         cyclictest(GRID)
 
 
-def test_it_is_absent_without_the_program_or_the_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_absent_without_the_program_or_the_permission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     absent = absent_cyclictest()
     assert isinstance(absent, Absent)
@@ -64,6 +75,7 @@ def test_it_is_absent_without_the_program_or_the_permission(tmp_path: Path, monk
 def test_a_wake_late_by_cycles_is_overdue_at_each_point_it_passed() -> None:
     period_ns = 1_000_000
     assert overdue(np.array([0.0, 999.0]), period_ns) == 0.0
-    # The second wake came 3.2 cycles late: three points are lost, two of which had no wake of their own.
+    # The second wake came 3.2 cycles late: three points are lost, two of which had no wake of their
+    # own.
     assert overdue(np.array([0.0, 3200.0]), period_ns) == 3 / 4
     assert overdue(np.array([]), period_ns) == 0.0

@@ -1,4 +1,5 @@
-"""The comparison of the two racks of one hand: its tables, its picture, and how far pulls move the object."""
+"""The comparison of the two racks of one hand: its tables, its picture, and how far pulls move the
+object."""
 
 from __future__ import annotations
 
@@ -15,13 +16,21 @@ from rack.levels.systems.hand.messages import GraspKind
 from rack.tools.lab.benches.hand import shift_mm
 from rack.tools.lab.benches.hand_figures import HandBench, HandFigures, LinkFigures
 
-COMMANDS = LinkFigures("tension_command", "tendon", "hand", "double-buffer", 2.0, 0.0, 0.1, 1.0, 1.5, 4000, 0, 0)
-STATUSES = LinkFigures("hand_status", "hand", "joint", "double-buffer", 2.0, 0.0, 0.2, 0.5, 0.75, 4000, 0, 9)
-TABLES = HandFigures("hic", "lockstep", 1, (COMMANDS, STATUSES), 2.25, 0.5, 120.0, 300.0, 0.0, 3, 40_000, ("ab",), "")
+COMMANDS = LinkFigures(
+    "tension_command", "tendon", "hand", "double-buffer", 2.0, 0.0, 0.1, 1.0, 1.5, 4000, 0, 0
+)
+STATUSES = LinkFigures(
+    "hand_status", "hand", "joint", "double-buffer", 2.0, 0.0, 0.2, 0.5, 0.75, 4000, 0, 9
+)
+TABLES = HandFigures(
+    "hic", "lockstep", 1, (COMMANDS, STATUSES), 2.25, 0.5, 120.0, 300.0, 0.0, 3, 40_000, ("ab",), ""
+)
 INTERRUPTS = replace(
     TABLES,
     rack="condor",
-    links=(replace(COMMANDS, writers="index, middle", protocol="interrupt", age_max_ms=3.5, lost=7),),
+    links=(
+        replace(COMMANDS, writers="index, middle", protocol="interrupt", age_max_ms=3.5, lost=7),
+    ),
     handler_ms=80.0,
     failure="condor: lost its grasp",
 )
@@ -61,7 +70,8 @@ def test_it_is_drawn(tmp_path: Path) -> None:
 
 
 class Run:
-    """A recording of a hand that holds a can from 1 s to 5 s, pulled from 2 s to 3 s; a tick is 0.1 s."""
+    """A recording of a hand that holds a can from 1 s to 5 s, pulled from 2 s to 3 s; a tick is 0.1
+    s."""
 
     def __init__(self, held_until: float = 5.0) -> None:
         pull = SimpleNamespace(at=2.0, seconds=1.0, body="can")

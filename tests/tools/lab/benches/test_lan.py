@@ -1,4 +1,5 @@
-"""The bench of the network: real links in a lab, what goes wrong with one contestant, and the figures."""
+"""The bench of the network: real links in a lab, what goes wrong with one contestant, and the
+figures."""
 
 from __future__ import annotations
 
@@ -13,7 +14,13 @@ from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import lan
 from rack.tools.lab.benches.comparison import Absent
 from rack.tools.lab.benches.lan import LanRuns, measure
-from rack.tools.lab.benches.lan_ends import COORDINATOR, LEASE_MS, ORDER_BYTES, STATUS_BYTES, LanPlace
+from rack.tools.lab.benches.lan_ends import (
+    COORDINATOR,
+    LEASE_MS,
+    ORDER_BYTES,
+    STATUS_BYTES,
+    LanPlace,
+)
 from rack.tools.lab.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.lab.benches.lan_group import Group
 from rack.tools.lab.benches.lan_machine import ENDS, TLS, LanTask
@@ -28,7 +35,9 @@ RATE_HZ, CYCLES = 50.0, 15
 
 @pytest.mark.slow
 @needs_lab
-def test_racks_are_measured_next_to_others_and_who_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_racks_are_measured_next_to_others_and_who_fails_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(lan, "ENDS", {TLS: ENDS[TLS], "UDP": ENDS["UDP"], "nobody": "none"})
     monkeypatch.setattr(lan, "DEATHS", 1)
     monkeypatch.setattr(lan, "IDLE_S", 0.3)
@@ -38,16 +47,24 @@ def test_racks_are_measured_next_to_others_and_who_fails_is_named(monkeypatch: p
         # Both machines, but for what comes after their last cycle.
         assert len(found.values[Point("age", 1, RATE_HZ, who, "ms")]) >= 2 * CYCLES - 2
         assert (found.steady[who].missing, found.steady[who].false_deaths) == (0, 0)
-    (sealed,), (bare,) = (found.values[Point("on the wire", 1, RATE_HZ, who, "kB/s")] for who in (TLS, "UDP"))
+    (sealed,), (bare,) = (
+        found.values[Point("on the wire", 1, RATE_HZ, who, "kB/s")] for who in (TLS, "UDP")
+    )
     # Requests for addresses come on top.
     assert bare * 1e3 == pytest.approx(RATE_HZ * UDP_BYTES, rel=0.05)
     assert sealed > bare
-    seen = {what: found.values[Point(what, 1, 0.0, TLS, "ms")] for what in ("cable pulled", "plugged in", "killed")}
+    seen = {
+        what: found.values[Point(what, 1, 0.0, TLS, "ms")]
+        for what in ("cable pulled", "plugged in", "killed")
+    }
     assert all(len(times) == 1 for times in seen.values())
-    # The process is gone at once, and its connection with it; a cable is missed when the lease is over.
+    # The process is gone at once, and its connection with it; a cable is missed when the lease is
+    # over.
     assert seen["killed"] < (LEASE_MS,)
     (nobody,) = (one for one in found.absent if one.who.startswith("nobody"))
-    assert nobody.line.startswith("absent: nobody with 1 racks: nobody, machine 0: ended: KeyError: 'nobody'")
+    assert nobody.line.startswith(
+        "absent: nobody with 1 racks: nobody, machine 0: ended: KeyError: 'nobody'"
+    )
     assert not list(NAMESPACES.glob(f"{Lab(1)._hub.rsplit('-', 2)[0]}-*"))
 
 
@@ -78,10 +95,16 @@ def test_figures_show_ratios_deaths_that_were_none_and_a_picture(tmp_path: Path)
     found = LanFigures(values, steady, 0.01, True, (Absent("cyclonedds", "no module"),))
     lines = "\n".join(found.lines())
     assert "1 % of packets lost at every rack" in lines
-    assert f"{TLS}, undisturbed: 12 s of racks, 40 messages taken, 1 missing, 2 false deaths" in lines
+    assert (
+        f"{TLS}, undisturbed: 12 s of racks, 40 messages taken, 1 missing, 2 false deaths" in lines
+    )
     assert "absent: cyclonedds: no module" in lines
     document = found.document()
-    (sample,) = (one for one in document["samples"] if (one["case"], one["who"]) == ("round trip, 2 racks, 10 Hz", TLS))
+    (sample,) = (
+        one
+        for one in document["samples"]
+        if (one["case"], one["who"]) == ("round trip, 2 racks, 10 Hz", TLS)
+    )
     assert (sample["median"], sample["ratio"]) == (2400.0, 3.0)
     assert document["undisturbed"][TLS]["false_deaths"] == 2
     assert all(path.stat().st_size for path in found.plot(tmp_path))

@@ -38,7 +38,9 @@ def test_the_fastest_executor_is_looked_for(small: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(small: Path, tmp_path: Path) -> None:
+def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(
+    small: Path, tmp_path: Path
+) -> None:
     (tmp_path / "runs").mkdir()
     assert 0.0 < ShortRuns(tmp_path / "runs").launch_s(this_rack(), str(small)) < BOUND_S
     assert not list((tmp_path / "runs").iterdir())

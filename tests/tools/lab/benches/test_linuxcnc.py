@@ -1,4 +1,5 @@
-"""LinuxCNC's thread: its intervals as lateness on a grid, its scheduling, and what it says when it is absent."""
+"""LinuxCNC's thread: its intervals as lateness on a grid, its scheduling, and what it says when it
+is absent."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from rack.tools.lab.benches.linuxcnc import absent_linuxcnc, lateness_us, linuxc
 from tests.tools.lab.benches import peers
 
 GRID = WakeGrid((min(os.sched_getaffinity(0)),), 1_000_000, 60, 80 if permits_fifo() else 0)
-needs_linuxcnc = pytest.mark.skipif(shutil.which("halrun") is None, reason="needs LinuxCNC (linuxcnc-uspace)")
+needs_linuxcnc = pytest.mark.skipif(
+    shutil.which("halrun") is None, reason="needs LinuxCNC (linuxcnc-uspace)"
+)
 
 
 def with_halrun(folder: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,7 +51,9 @@ def test_what_the_thread_prints_before_its_first_interval_is_left_out(
 def test_a_thread_that_never_runs_is_a_failure_in_its_own_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_halrun(tmp_path, "import sys\nsys.exit('insmod for threads failed, returned -1')\n", monkeypatch)
+    with_halrun(
+        tmp_path, "import sys\nsys.exit('insmod for threads failed, returned -1')\n", monkeypatch
+    )
     with pytest.raises(Failure, match="LinuxCNC thread: insmod for threads failed"):
         linuxcnc(GRID)
 

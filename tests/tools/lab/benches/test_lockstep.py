@@ -1,4 +1,5 @@
-"""The bench of lockstep: the levels alone do the work of a rack, bit for bit, and speeds follow from given times."""
+"""The bench of lockstep: the levels alone do the work of a rack, bit for bit, and speeds follow
+from given times."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ from tests.shared_runs import nasrem_run
 
 
 @pytest.mark.slow
-def test_levels_without_a_rack_write_what_they_write_in_one(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_levels_without_a_rack_write_what_they_write_in_one(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     recording = Recording(nasrem_run(tmp_path_factory))
     resolved = resolve(load("nasrem", ["clock.mode=lockstep"]))
     bare = apart(run_bare, resolved.layout, resolved.tasks, recording.ended["outcome"]["ticks"])
@@ -36,9 +39,17 @@ def test_levels_without_a_rack_write_what_they_write_in_one(tmp_path_factory: py
 
 
 def test_speeds_are_ratios_to_the_other_checkout_and_to_the_limit() -> None:
-    times = {("nasrem", "this tree"): [200.0, 240.0, 250.0], ("nasrem", "base"): [500.0], ("nasrem", BARE): [160.0]}
+    times = {
+        ("nasrem", "this tree"): [200.0, 240.0, 250.0],
+        ("nasrem", "base"): [500.0],
+        ("nasrem", BARE): [160.0],
+    }
     found = speeds(times, ["this tree", "base"])
-    assert found.speeds == {("nasrem", "this tree"): 1000 / 240, ("nasrem", "base"): 2.0, ("nasrem", BARE): 6.25}
+    assert found.speeds == {
+        ("nasrem", "this tree"): 1000 / 240,
+        ("nasrem", "base"): 2.0,
+        ("nasrem", BARE): 6.25,
+    }
     own = [sample for sample in found.comparison.samples if sample.who == "this tree"]
     assert [found.comparison.ratio(sample) for sample in own] == [0.48, 1.5]
     assert found.comparison.cases == ["nasrem", "nasrem and its limit"]
@@ -50,7 +61,10 @@ def test_speeds_are_ratios_to_the_other_checkout_and_to_the_limit() -> None:
 @pytest.mark.slow
 def test_a_short_bench_runs_a_rack_and_its_levels_alone(tmp_path: Path) -> None:
     found = measure(None, {"fig4": 0.5}, 1, Progress())
-    assert {(sample.who, sample.count) for sample in found.comparison.samples} == {("this tree", 1), (BARE, 1)}
+    assert {(sample.who, sample.count) for sample in found.comparison.samples} == {
+        ("this tree", 1),
+        (BARE, 1),
+    }
     assert json.loads(json.dumps(found.document())) == found.document()
     assert all(one["value"] > 0.0 for one in found.document()["simulated_seconds_a_second"])
     assert [path.name for path in found.plot(tmp_path)] == ["lockstep.png", "lockstep.svg"]
@@ -74,5 +88,7 @@ def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
 
 def test_a_rack_whose_boards_interrupt_each_other_does_not_run_bare(small: Path) -> None:
     resolved = resolve(load(small, ["protocol.default=interrupt"]))
-    with pytest.raises(Failure, match="interrupts its readers; only racks without any run without boards"):
+    with pytest.raises(
+        Failure, match="interrupts its readers; only racks without any run without boards"
+    ):
         run_bare(resolved.layout, resolved.tasks, 1)

@@ -1,4 +1,5 @@
-"""The bench of mailboxes: real transports, every message received as sent, nothing left, the best peer as baseline."""
+"""The bench of mailboxes: real transports, every message received as sent, nothing left, the best
+peer as baseline."""
 
 from __future__ import annotations
 
@@ -32,12 +33,20 @@ NET = ("tcp", "tcp6", "udp", "udp6")
 
 
 def left_by(pid: int) -> list[str]:
-    return [path.name for path in SHM_FOLDER.iterdir() if str(pid) in path.name or path.name.endswith(".zenoh")]
+    return [
+        path.name
+        for path in SHM_FOLDER.iterdir()
+        if str(pid) in path.name or path.name.endswith(".zenoh")
+    ]
 
 
 def network_sockets() -> set[str]:
     """Return the sockets of this process that are on a network, by inode."""
-    known = {line.split()[9] for name in NET for line in Path("/proc/self/net", name).read_text().splitlines()[1:]}
+    known = {
+        line.split()[9]
+        for name in NET
+        for line in Path("/proc/self/net", name).read_text().splitlines()[1:]
+    }
     links = [str(fd.readlink()) for fd in Path("/proc/self/fd").iterdir() if fd.is_symlink()]
     return known & {link.removeprefix("socket:[").removesuffix("]") for link in links}
 
@@ -49,10 +58,13 @@ def test_messages_have_the_sizes_that_the_cases_name() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("peer", [*REFERENCES, *PEERS], ids=lambda peer: peer.name)
-def test_every_reader_receives_every_message_and_nothing_is_left(peer: Peer, tmp_path: Path) -> None:
+def test_every_reader_receives_every_message_and_nothing_is_left(
+    peer: Peer, tmp_path: Path
+) -> None:
     if absent_package(peer.name, peer.module) is not None:
         pytest.skip(f"{peer.module} is not installed")
-    # In a new process: threads of zenoh outlive its sessions, and do not start in a fork of a process with threads.
+    # In a new process: threads of zenoh outlive its sessions, and do not start in a fork of a
+    # process with threads.
     user = get_context("spawn").Process(target=use, args=(peer, tmp_path))
     user.start()
     try:
@@ -76,7 +88,9 @@ def use(peer: Peer, folder: Path) -> None:
             transport.message.position[:] = np.arange(case.lengths["joints"]) + serial
             transport.send(serial)
             received = [read(serial) for read in transport.readers]
-            assert [bytes(message.raw) for message in received] == [bytes(transport.message.raw)] * 3
+            assert [bytes(message.raw) for message in received] == [
+                bytes(transport.message.raw)
+            ] * 3
         assert not network_sockets()
     assert not list(folder.iterdir())
     assert not left_by(os.getpid())
@@ -91,12 +105,21 @@ def test_a_transport_that_loses_messages_is_noticed() -> None:
             stale = Message(MESSAGE.dtype(case.lengths))
             yield transport._replace(readers=[*transport.readers, lambda tick: stale])
 
-    with lossy() as transport, pytest.raises(Failure, match=r"^lossy: a reader received another message"):
+    with (
+        lossy() as transport,
+        pytest.raises(Failure, match=r"^lossy: a reader received another message"),
+    ):
         Exchange("lossy", transport, case.lengths).batch()
 
 
 def test_the_baseline_of_a_case_is_its_best_peer() -> None:
-    medians = {"raw copy": 1.0, "zenoh, one session": 2.0, "time-slice": 3.0, "iceoryx2 blackboard": 5.0, "zenoh": 4.0}
+    medians = {
+        "raw copy": 1.0,
+        "zenoh, one session": 2.0,
+        "time-slice": 3.0,
+        "iceoryx2 blackboard": 5.0,
+        "zenoh": 4.0,
+    }
     samples = [Sample("64 B", who, (value,), "us") for who, value in medians.items()]
     samples += [Sample("200 B", "time-slice", (3.0,), "us")]
     found = compare(samples, ())
@@ -104,14 +127,21 @@ def test_the_baseline_of_a_case_is_its_best_peer() -> None:
     assert [found.ratio(sample) for sample in samples] == [0.25, 0.5, 0.75, 1.25, 1.0, None]
 
 
-def test_a_bench_measures_every_protocol_and_names_who_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bench_measures_every_protocol_and_names_who_is_absent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(sys, "meta_path", [Hidden("zenoh"), *sys.meta_path])
     for name in [name for name in sys.modules if name.partition(".")[0] == "zenoh"]:
         monkeypatch.delitem(sys.modules, name)
     cases = (Case("200 B", 1), Case("200 B", 4))
     found = measure(cases, 3, Progress())
     assert found.cases == ["200 B, 1 reader", "200 B, 4 readers"]
-    assert set(found.contestants) >= {*PROTOCOLS, "raw copy", "multiprocessing pipe", "multiprocessing queue"}
+    assert set(found.contestants) >= {
+        *PROTOCOLS,
+        "raw copy",
+        "multiprocessing pipe",
+        "multiprocessing queue",
+    }
     assert all(sample.count == 3 and sample.best > 0 for sample in found.samples)
     named = {"zenoh", "zenoh, one session"}
     assert {one for one in found.absent if one.who in named} == {
@@ -125,13 +155,25 @@ def test_a_bench_measures_every_protocol_and_names_who_is_absent(monkeypatch: py
 
 @pytest.mark.slow
 def test_the_command_prints_one_document_and_writes_its_pictures(tmp_path: Path) -> None:
-    command = [*RACK, "bench", "mailbox", "--rounds", "1", "--json", "--plot", tmp_path / "pictures"]
+    command = [
+        *RACK,
+        "bench",
+        "mailbox",
+        "--rounds",
+        "1",
+        "--json",
+        "--plot",
+        tmp_path / "pictures",
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, timeout=3 * BOUND_S)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document["bench"] == "mailbox"
     assert {sample["case"] for sample in document["samples"]} == {case.name for case in CASES}
-    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == ["mailbox.png", "mailbox.svg"]
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
+        "mailbox.png",
+        "mailbox.svg",
+    ]
 
 
 @pytest.mark.slow
@@ -145,7 +187,10 @@ def test_an_interrupted_bench_leaves_nothing(tmp_path: Path) -> None:
     )
     try:
         assert process.stdout is not None
-        assert process.stdout.readline() + process.stdout.readline() == b"about 1 minutes\n64 B, 1 reader\n"
+        assert (
+            process.stdout.readline() + process.stdout.readline()
+            == b"about 1 minutes\n64 B, 1 reader\n"
+        )
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=BOUND_S)
     finally:

@@ -1,4 +1,5 @@
-"""The lab of machines: what passes between them, gets lost, is cut off, and that nothing of it is left."""
+"""The lab of machines: what passes between them, gets lost, is cut off, and that nothing of it is
+left."""
 
 from __future__ import annotations
 
@@ -53,14 +54,17 @@ with Lab(2) as lab:
 def say(lab: Lab, speaker: int, listener: int) -> str:
     """Say a word on one machine to another; return what arrives there."""
     place = lab.address(listener), str(PORT)
-    with lab.popen(listener, [sys.executable, "-c", LISTEN, *place], stdout=subprocess.PIPE, text=True) as ear:
+    with lab.popen(
+        listener, [sys.executable, "-c", LISTEN, *place], stdout=subprocess.PIPE, text=True
+    ) as ear:
         assert ear.stdout.readline() == "up\n"
         assert lab.popen(speaker, [sys.executable, "-c", SAY, *place]).wait(BOUND_S) == 0
         return ear.communicate(timeout=BOUND_S)[0].strip()
 
 
 STRAY = 20
-"""Packets that the kernels of the machines send on their own while a test counts: ARP, neighbour discovery."""
+"""Packets that the kernels of the machines send on their own while a test counts: ARP, neighbour
+discovery."""
 
 
 def lost_of(lab: Lab, packets: int) -> int:
@@ -69,14 +73,19 @@ def lost_of(lab: Lab, packets: int) -> int:
     flood = [sys.executable, "-c", FLOOD, lab.address(1), str(PORT), str(packets)]
     assert lab.popen(0, flood).wait(BOUND_S) == 0
     now = lab.traffic()
-    sent, received = now[0].sent_packets - before[0].sent_packets, now[1].received_packets - before[1].received_packets
+    sent, received = (
+        now[0].sent_packets - before[0].sent_packets,
+        now[1].received_packets - before[1].received_packets,
+    )
     assert sent >= packets
     return sent - received
 
 
 def has_carrier(lab: Lab, machine: int) -> bool:
     """Say whether a machine's own end of its cable is up."""
-    with lab.popen(machine, ["cat", f"/sys/class/net/{network.LINK}/carrier"], stdout=subprocess.PIPE) as shown:
+    with lab.popen(
+        machine, ["cat", f"/sys/class/net/{network.LINK}/carrier"], stdout=subprocess.PIPE
+    ) as shown:
         return shown.communicate(timeout=BOUND_S)[0] == b"1\n"
 
 
@@ -86,7 +95,9 @@ def test_machines_reach_each_other_and_nobody_else() -> None:
         assert say(lab, 0, 2) == say(lab, 2, 1) == "word"
         assert [traffic.sent_packets > 0 for traffic in lab.traffic()] == [True] * 3
         routes = lab.popen(0, ["ip", "-4", "route"], stdout=subprocess.PIPE, text=True)
-        assert [line.split()[0] for line in routes.communicate(timeout=BOUND_S)[0].splitlines()] == ["10.77.0.0/24"]
+        assert [
+            line.split()[0] for line in routes.communicate(timeout=BOUND_S)[0].splitlines()
+        ] == ["10.77.0.0/24"]
 
 
 @pytest.mark.slow
@@ -116,7 +127,9 @@ def test_a_machine_without_its_cable_knows_it_and_is_back_with_it() -> None:
 
 
 @needs_lab
-def test_what_still_runs_at_the_end_is_ended_and_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_still_runs_at_the_end_is_ended_and_nothing_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(network, "ENDING", ((signal.SIGTERM, 0.2), (signal.SIGKILL, BOUND_S)))
     with Lab(2) as lab:
         names = [*lab._names, lab._hub]
@@ -133,10 +146,14 @@ def test_what_still_runs_at_the_end_is_ended_and_nothing_is_left(monkeypatch: py
 def test_the_lab_of_a_killed_process_is_removed_by_the_next_one() -> None:
     with (
         Lab(1) as other,
-        subprocess.Popen([sys.executable, "-c", ABANDONED], stdout=subprocess.PIPE, text=True) as maker,
+        subprocess.Popen(
+            [sys.executable, "-c", ABANDONED], stdout=subprocess.PIPE, text=True
+        ) as maker,
     ):
         sleeper, *names = maker.stdout.readline().split()
-        wait_until(lambda: Path(f"/proc/{sleeper}/comm").read_text() == "sleep\n")  # `ip netns exec` has entered
+        wait_until(
+            lambda: Path(f"/proc/{sleeper}/comm").read_text() == "sleep\n"
+        )  # `ip netns exec` has entered
         maker.kill()
         maker.wait(BOUND_S)
         assert runs(int(sleeper))
@@ -150,7 +167,12 @@ def test_the_lab_of_a_killed_process_is_removed_by_the_next_one() -> None:
 @needs_lab
 def test_a_command_that_fails_says_which_and_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network, "NET", "10.77.999")
-    with pytest.raises(Failure, match=r"network lab: ip -netns rack-lab-\S+ -batch -: .*10\.77\.999\.1/24"), Lab(1):
+    with (
+        pytest.raises(
+            Failure, match=r"network lab: ip -netns rack-lab-\S+ -batch -: .*10\.77\.999\.1/24"
+        ),
+        Lab(1),
+    ):
         pass
     assert not list(NAMESPACES.glob(f"rack-lab-{os.getpid()}-*"))
 

@@ -1,4 +1,5 @@
-"""A rack observed by its rings: its cycles are counted against the clock's grid, not against the records it left."""
+"""A rack observed by its rings: its cycles are counted against the clock's grid, not against the
+records it left."""
 
 from __future__ import annotations
 

@@ -25,7 +25,12 @@ def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
         cores = {board.core for board in rack.board.values()} | {rack.clock.core}
         cores |= {board.planner_core for board in planned if board.planner_core is not None}
         assert cores == set(range(int(name[7])))
-        slots = [slot for board in rack.board.values() for slot in (board.slot, board.planner_slot) if slot]
+        slots = [
+            slot
+            for board in rack.board.values()
+            for slot in (board.slot, board.planner_slot)
+            if slot
+        ]
         assert len(slots) == len(set(slots)) == len(rack.board) + 4 * name.startswith("loose")
     assert found["loose, 2 cores"].board["servo"].planner_core == 0
     assert found["tight, 2 cores"].board["world"].coupling == "none"
@@ -83,8 +88,8 @@ def test_predictions_from_budgets_agree_with_measurements() -> None:
     assert tight is not None
     assert loose is not None
     assert (tight.fits, loose.fits) == (False, True)
-    # On its executor's core the planner needs more than three cycles: every plan is late, but for one that the executor
-    # did not disturb, at the beginning. On its own core hardly one is.
+    # On its executor's core the planner needs more than three cycles: every plan is late, but for
+    # one that the executor did not disturb, at the beginning. On its own core hardly one is.
     assert tight.cycles > 5
     assert tight.missed >= tight.cycles - 1
     assert loose.missed < loose.cycles / 2

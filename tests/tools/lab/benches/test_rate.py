@@ -1,4 +1,5 @@
-"""The bench of rates: a rack at another rate, and which rates it holds beyond what the machine breaks."""
+"""The bench of rates: a rack at another rate, and which rates it holds beyond what the machine
+breaks."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ def test_only_the_servo_level_changes_its_rate(rate_hz: int) -> None:
     # Of the rates, 1250 Hz alone is no multiple of 4 Hz.
     for name in config.board:
         before = config.every(name) * config.clock.period_ms
-        assert name == "servo" or found.every(name) * found.clock.period_ms == pytest.approx(before, rel=0.002)
+        assert name == "servo" or found.every(name) * found.clock.period_ms == pytest.approx(
+            before, rel=0.002
+        )
     assert tasks["servo.planner"].within_cycles * found.clock.period_ms == pytest.approx(20.0)
     assert found.robot is not None
     step_ms = found.clock.period_ms / found.robot.substeps
@@ -76,7 +79,9 @@ def test_a_rack_is_run_at_every_rate(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_late_wakes_of_cyclictest_are_a_share_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_wakes_of_cyclictest_are_a_share_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)))

@@ -1,4 +1,5 @@
-"""The bench of responses: commands drawn at random ticks, and twins of a run that prove its serials."""
+"""The bench of responses: commands drawn at random ticks, and twins of a run that prove its
+serials."""
 
 from __future__ import annotations
 
@@ -45,7 +46,11 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(
     rack_name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep"])
-    told = [("primitive", "hold", 2243), ("primitive", "resume", 2330), ("elemental_move", "hold", 2500)]
+    told = [
+        ("primitive", "hold", 2243),
+        ("primitive", "resume", 2330),
+        ("elemental_move", "hold", 2500),
+    ]
     given = [CommandConfig(level=level, what=what, tick=tick) for level, what, tick in told]
     recording = run_commands(config, given, tmp_path / "run", 6.9)
     response = response_of(recording)
@@ -54,10 +59,15 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(
     moving = holds_of_moving_arm(recording, response)
     assert [command.level for command in moving] == ["primitive", "elemental_move"]
     assert first_difference(recording, recording, "servo.status") is None
-    # 2243 is read at 2248, and at 2256; 2500 at 2600, 2704 and 2712. Without the first there is no command at all.
+    # 2243 is read at 2248, and at 2256; 2500 at 2600, 2704 and 2712. Without the first there is no
+    # command at all.
     assert [command.predicted for command in moving] == [2256, 2712]
-    assert first_difference(recording, Recording(nasrem_run(tmp_path_factory)), "servo.status") == 2256
-    twin = compare(config, CommandedRun(given, recording), moving[1], "servo.status", tmp_path / "twin")
+    assert (
+        first_difference(recording, Recording(nasrem_run(tmp_path_factory)), "servo.status") == 2256
+    )
+    twin = compare(
+        config, CommandedRun(given, recording), moving[1], "servo.status", tmp_path / "twin"
+    )
     assert (twin.differs, twin.agrees) == (2712, True)
 
 

@@ -29,10 +29,17 @@ def row(start: str) -> list[float]:
 
 
 def expected(connections: int, links: int, exchanging: int) -> list[float]:
-    """Return a row's numbers: of the busiest rack, that has so many links and exchanges with so many racks."""
+    """Return a row's numbers: of the busiest rack, that has so many links and exchanges with so
+    many racks."""
     traffic_kb = links * IDLE_KB + exchanging * RATE_HZ * EXCHANGE_KB
     cores = (links * LINK_MS + exchanging * RATE_HZ * EXCHANGE_MS) * 1e-3
-    return [connections, links, round(links * IDLE_KB, 1), round(traffic_kb * 8e-3, 1), round(cores, 2)]
+    return [
+        connections,
+        links,
+        round(links * IDLE_KB, 1),
+        round(traffic_kb * 8e-3, 1),
+        round(cores, 2),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -46,7 +53,9 @@ def expected(connections: int, links: int, exchanging: int) -> list[float]:
         ("tree", RACKS - 1, BELOW + 1, BELOW + 1),
     ],
 )
-def test_a_row_follows_from_the_constants(start: str, connections: int, links: int, exchanging: int) -> None:
+def test_a_row_follows_from_the_constants(
+    start: str, connections: int, links: int, exchanging: int
+) -> None:
     assert row(start) == expected(connections, links, exchanging)
 
 

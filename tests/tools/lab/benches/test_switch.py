@@ -38,4 +38,8 @@ def test_a_switch_is_measured_with_real_processes_and_nothing_is_left() -> None:
     assert 0 < cost.wakes <= WAKES
     assert 0 < cost.switch_us["min"] <= cost.switch_us["p50"] <= cost.switch_us["max"]
     assert f"{PAPER_US:g}" in "\n".join(cost.lines())
-    assert not [name for name in {path.name for path in SHM_FOLDER.iterdir()} - before if "posix_ipc" in name]
+    assert not [
+        name
+        for name in {path.name for path in SHM_FOLDER.iterdir()} - before
+        if "posix_ipc" in name
+    ]

@@ -1,4 +1,5 @@
-"""The page as a whole: every section, equation and figure of the paper is on it, and every ruling has its reason."""
+"""The page as a whole: every section, equation and figure of the paper is on it, and every ruling
+has its reason."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_or
     assert [chapter.name for chapter in CHAPTERS] == SECTIONS
     names = [statement.name for chapter in CHAPTERS for statement in chapter.statements]
     assert len(names) == len(set(names))
-    assert [name for name in names if name.startswith("equation-")] == [f"equation-3.{n}" for n in range(1, 11)]
+    assert [name for name in names if name.startswith("equation-")] == [
+        f"equation-3.{n}" for n in range(1, 11)
+    ]
     assert {f"figure-{n}" for n in range(1, 6)} <= set(names)
 
 
@@ -43,7 +46,9 @@ def judged(chapter: Chapter, name: str, found: dict[str, Any]) -> Assessment:
     return statement.tested(Findings(found, NOWHERE))
 
 
-def run(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> dict[str, Any]:
+def run(
+    mode: str, digest: str, miss: int | None = None, differs: int | None = None
+) -> dict[str, Any]:
     """Return what a run leaves of which the digest counts."""
     difference = None if differs is None else {"tick": differs, "mailbox": "servo.status"}
     head = {"run": mode, "mode": mode, "digest": digest, "ticks": 10, "wall_s": 1.0, "messages": 5}
@@ -61,11 +66,23 @@ LOCKSTEP = [run("lockstep", "a"), run("lockstep", "a")]
         ([*LOCKSTEP, run("realtime", "b", miss=4, differs=5)], Ruling.BOUNDED),
         ([*LOCKSTEP, run("realtime", "b", miss=6, differs=5)], Ruling.FAILS),
         ([*LOCKSTEP, run("realtime", "b", differs=5)], Ruling.FAILS),
-        ([run("lockstep", "a"), run("lockstep", "b", differs=1), run("realtime", "a")], Ruling.FAILS),
+        (
+            [run("lockstep", "a"), run("lockstep", "b", differs=1), run("realtime", "a")],
+            Ruling.FAILS,
+        ),
     ],
-    ids=["equal", "equal at last", "after a miss", "before a miss", "without a miss", "lockstep differs"],
+    ids=[
+        "equal",
+        "equal at last",
+        "after a miss",
+        "before a miss",
+        "without a miss",
+        "lockstep differs",
+    ],
 )
-def test_determinism_is_judged_by_digests_and_by_the_first_miss(runs: list[dict[str, Any]], ruling: Ruling) -> None:
+def test_determinism_is_judged_by_digests_and_by_the_first_miss(
+    runs: list[dict[str, Any]], ruling: Ruling
+) -> None:
     assert judged(opening.ABSTRACT, "determinism", {"determinism": {"runs": runs}}).ruling is ruling
 
 
@@ -79,7 +96,9 @@ def test_determinism_is_judged_by_digests_and_by_the_first_miss(runs: list[dict[
     ],
     ids=["exact", "late in real time", "late in lockstep", "too early"],
 )
-def test_five_levels_take_five_cycles(lockstep: dict[str, int], realtime: dict[str, int], ruling: Ruling) -> None:
+def test_five_levels_take_five_cycles(
+    lockstep: dict[str, int], realtime: dict[str, int], ruling: Ruling
+) -> None:
     found = {"pipeline": {"predicted": 5, "cycles": {"lockstep": lockstep, "realtime": realtime}}}
     assert judged(model.CHAPTER, "pipeline", found).ruling is ruling
 
@@ -93,7 +112,12 @@ def test_a_time_is_refused_or_met(refused: bool, done_s: float, ruling: Ruling) 
     end = {"cause": "task done", "reason": "", "moved": True}
     early = {**end, "by_s": 4.0, "done_s": None if refused else 5.0, "moved": not refused}
     runs = [{**end, "by_s": None, "done_s": 9.0}, early, {**end, "by_s": 10.0, "done_s": done_s}]
-    assert judged(time.CHAPTER, "soft-and-real-time", {"goto": {"runs": runs, "place": [0, 0, 0]}}).ruling is ruling
+    assert (
+        judged(
+            time.CHAPTER, "soft-and-real-time", {"goto": {"runs": runs, "place": [0, 0, 0]}}
+        ).ruling
+        is ruling
+    )
 
 
 def test_state_tables_must_answer_the_disturbance() -> None:
@@ -101,7 +125,9 @@ def test_state_tables_must_answer_the_disturbance() -> None:
         fired = [{"name": name, "cycles": 1, "first_s": 1.0} for name in rows]
         return {"rows": {"elemental_move": fired}, "outcome": {"worked": True}}
 
-    answered = {"nist-state-table": {"disturbed": task("pick", "aim again"), "undisturbed": task("pick")}}
+    answered = {
+        "nist-state-table": {"disturbed": task("pick", "aim again"), "undisturbed": task("pick")}
+    }
     ignored = {"nist-state-table": {"disturbed": task("pick"), "undisturbed": task("pick")}}
     assert judged(application.CHAPTER, "state-tables", answered).ruling is Ruling.HOLDS
     assert judged(application.CHAPTER, "state-tables", ignored).ruling is Ruling.FAILS
@@ -115,7 +141,9 @@ def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None
     (statement,) = time.CHAPTER.statements
     unmade = statement.claim(workshop, {})
     failed = statement.claim(workshop, {"goto": "the rack did not run"})
-    lacking = statement.claim(workshop, {"goto": Kept({}, 1.0, "now", "this machine has one processor")})
+    lacking = statement.claim(
+        workshop, {"goto": Kept({}, 1.0, "now", "this machine has one processor")}
+    )
     assert (unmade.tested.ruling, failed.tested.ruling) == (Ruling.UNMADE, Ruling.UNMADE)
     assert "the rack did not run" in failed.tested.why
     assert lacking.tested.ruling is Ruling.UNTESTABLE

@@ -21,8 +21,12 @@ NOWHERE = Workshop(Path("nowhere"), share=True)
 
 def test_all_ten_equations_are_there_in_their_order() -> None:
     assert [one.number for one in EQUATIONS] == [f"3.{number}" for number in range(1, 11)]
-    named = [s.name for chapter in (timing.RESPONSE, timing.LOW, timing.HIGH) for s in chapter.statements]
-    assert [name for name in named if name.startswith("equation")] == [f"equation-{one.number}" for one in EQUATIONS]
+    named = [
+        s.name for chapter in (timing.RESPONSE, timing.LOW, timing.HIGH) for s in chapter.statements
+    ]
+    assert [name for name in named if name.startswith("equation")] == [
+        f"equation-{one.number}" for one in EQUATIONS
+    ]
 
 
 @pytest.mark.parametrize("equation", EQUATIONS, ids=lambda one: one.number)
@@ -37,9 +41,27 @@ def test_each_fails_in_the_rack_that_is_to_show_it(equation: PaperEquation) -> N
 
 def verdict(holds: bool, mostly: bool) -> dict[str, object]:
     """Return a pair as a run keeps it: one equation, measured for one level."""
-    sides = {"left": 3e6 if not holds else 1e6, "sign": "<=", "right": 2.5e6, "margin": 1.5e6 if holds else -0.5e6}
-    measured = {"equation": "3.1", "subject": "servo", **sides, "holds": holds, "meaning": "", "unit": "ns"}
-    return {"equation": "3.1", "subject": "servo", "predicted": None, "measured": measured, "mostly": mostly}
+    sides = {
+        "left": 3e6 if not holds else 1e6,
+        "sign": "<=",
+        "right": 2.5e6,
+        "margin": 1.5e6 if holds else -0.5e6,
+    }
+    measured = {
+        "equation": "3.1",
+        "subject": "servo",
+        **sides,
+        "holds": holds,
+        "meaning": "",
+        "unit": "ns",
+    }
+    return {
+        "equation": "3.1",
+        "subject": "servo",
+        "predicted": None,
+        "measured": measured,
+        "mostly": mostly,
+    }
 
 
 @pytest.mark.parametrize(
@@ -47,6 +69,10 @@ def verdict(holds: bool, mostly: bool) -> dict[str, object]:
     [(True, True, Ruling.HOLDS), (False, True, Ruling.BOUNDED), (False, False, Ruling.FAILS)],
     ids=["always", "mostly", "seldom"],
 )
-def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(holds: bool, mostly: bool, ruling: Ruling) -> None:
-    found = judged(timing.FITS, Findings({"nasrem": {**RUN, "pairs": [verdict(holds, mostly)]}}, NOWHERE))
+def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(
+    holds: bool, mostly: bool, ruling: Ruling
+) -> None:
+    found = judged(
+        timing.FITS, Findings({"nasrem": {**RUN, "pairs": [verdict(holds, mostly)]}}, NOWHERE)
+    )
     assert found.ruling is ruling

@@ -9,7 +9,15 @@ from typing import Any
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.reproduction.experiments.experiment import KEPT, Experiment, Kept, Lacking, Workshop, kept, made
+from rack.tools.lab.reproduction.experiments.experiment import (
+    KEPT,
+    Experiment,
+    Kept,
+    Lacking,
+    Workshop,
+    kept,
+    made,
+)
 
 
 class Counted:
@@ -53,13 +61,17 @@ def test_a_result_whose_picture_is_gone_is_made_again(workshop: Workshop) -> Non
     assert kept(one, workshop.folder) is None
 
 
-@pytest.mark.parametrize("rest", ['{"found": ', "[]", "{}", '{"found": 1, "took_s": 1, "made_at": "", "lacking": ""}'])
+@pytest.mark.parametrize(
+    "rest", ['{"found": ', "[]", "{}", '{"found": 1, "took_s": 1, "made_at": "", "lacking": ""}']
+)
 def test_a_file_that_is_no_result_is_made_again(rest: str, workshop: Workshop) -> None:
     (workshop.folder / KEPT / "counted.json").write_text(rest)
     assert kept(Counted().experiment(), workshop.folder) is None
 
 
-def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(workshop: Workshop) -> None:
+def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(
+    workshop: Workshop,
+) -> None:
     def lack(workshop: Workshop) -> dict[str, Any]:
         raise Lacking("no second processor")
 

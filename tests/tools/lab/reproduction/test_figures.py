@@ -1,4 +1,5 @@
-"""Section 3.4 of the paper by computation: where figures 2 to 4 are what it says, and where they are not."""
+"""Section 3.4 of the paper by computation: where figures 2 to 4 are what it says, and where they
+are not."""
 
 from __future__ import annotations
 
@@ -18,7 +19,13 @@ NOWHERE = Workshop(Path("nowhere"), share=True)
 def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
     rows = {one.process_ms: one for one in sweep("fig2", gantt.PAPER_X)}
     # R X W P U in 8 ms: P has 5 - X ms a cycle, 2 ms with the longest X, not "at least 3 ms".
-    assert {x: one.each_ms for x, one in rows.items()} == {1.0: 4.0, 1.5: 3.5, 2.0: 3.0, 2.5: 2.5, 3.0: 2.0}
+    assert {x: one.each_ms for x, one in rows.items()} == {
+        1.0: 4.0,
+        1.5: 3.5,
+        2.0: 3.0,
+        2.5: 2.5,
+        3.0: 2.0,
+    }
     assert [one.process_ms for one in gantt.contradicting(list(rows.values()))] == [2.5, 3.0]
     # With one U for each plan: 2 x 3 ms for P and U, which need 7.
     assert (rows[3.0].once_ms, rows[3.0].cycles_once, rows[3.0].permitted) == (3.0, 3, 2)
@@ -49,11 +56,18 @@ def document(late: int, jobs: int = 100) -> dict[str, object]:
         "level.planner": {"jobs": jobs, "late": late, "skipped": 0},
     }
     patterns = {"level": [[["R X W P | R X W P U -", jobs]], []]}
-    return {"tasks": counts, "patterns": patterns, "steal": {}, "pictures": {"measured": "pictures/x.svg"}}
+    return {
+        "tasks": counts,
+        "patterns": patterns,
+        "steal": {},
+        "pictures": {"measured": "pictures/x.svg"},
+    }
 
 
 @pytest.mark.parametrize(
-    ("late", "ruling"), [(0, Ruling.HOLDS), (3, Ruling.BOUNDED), (97, Ruling.FAILS)], ids=["in time", "stray", "late"]
+    ("late", "ruling"),
+    [(0, Ruling.HOLDS), (3, Ruling.BOUNDED), (97, Ruling.FAILS)],
+    ids=["in time", "stray", "late"],
 )
 def test_a_figure_that_works_is_judged_by_its_run(late: int, ruling: Ruling) -> None:
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2"]
@@ -64,7 +78,10 @@ def test_runs_that_do_not_confirm_the_contradiction_make_it_no_finding() -> None
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2-x"]
     confirmed = {gantt.SHORT_2.label: document(0), gantt.LONG_2.label: document(100)}
     assert statement.tested(Findings(confirmed, NOWHERE)).ruling is Ruling.CONTRADICTS
-    assert statement.tested(Findings({**confirmed, gantt.LONG_2.label: document(0)}, NOWHERE)).ruling is Ruling.FAILS
+    assert (
+        statement.tested(Findings({**confirmed, gantt.LONG_2.label: document(0)}, NOWHERE)).ruling
+        is Ruling.FAILS
+    )
 
 
 def test_a_schedule_is_drawn_as_the_paper_draws_it(tmp_path: Path) -> None:

@@ -50,7 +50,8 @@ def page(tmp_path: Path) -> Page:
 
 
 class Links(HTMLParser):
-    """Collects everything that a browser would fetch or follow, anchors, and tags that are not closed."""
+    """Collects everything that a browser would fetch or follow, anchors, and tags that are not
+    closed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -81,7 +82,9 @@ def test_html_fetches_nothing_and_every_link_leads_into_it(page: Page, tmp_path:
     links = links_of(html(page, tmp_path))
     assert not links.open
     assert [target for target in links.targets if target.startswith("data:image/svg+xml;base64,")]
-    assert {target[1:] for target in links.targets if not target.startswith("data:")} <= links.anchors
+    assert {
+        target[1:] for target in links.targets if not target.startswith("data:")
+    } <= links.anchors
     assert "<script" not in html(page, tmp_path)
     assert not re.search(r"url\(|@import", html(page, tmp_path))
 
@@ -92,19 +95,29 @@ def test_html_is_made_for_paper_and_for_the_dark(page: Page, tmp_path: Path) -> 
     assert "prefers-color-scheme: dark" in document
 
 
-def test_markdown_shows_pictures_next_to_it_and_keeps_tables_whole(page: Page, tmp_path: Path) -> None:
+def test_markdown_shows_pictures_next_to_it_and_keeps_tables_whole(
+    page: Page, tmp_path: Path
+) -> None:
     document = markdown(page)
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", document)
     assert pictures == ["pictures/one.svg"]
     rows = [
-        line for line in document.splitlines() if line.startswith("| ") and ("servo" in line or "a &#124; b" in line)
+        line
+        for line in document.splitlines()
+        if line.startswith("| ") and ("servo" in line or "a &#124; b" in line)
     ]
     assert len(rows) == 2
     assert all(row.count("|") == 3 for row in rows)
 
 
 def test_both_forms_hold_the_same_words(page: Page, tmp_path: Path) -> None:
-    for words in ("A plan must finish.", "So it is.", "Both cannot be.", "&lt;limit&gt;", Ruling.CONTRADICTS.value):
+    for words in (
+        "A plan must finish.",
+        "So it is.",
+        "Both cannot be.",
+        "&lt;limit&gt;",
+        Ruling.CONTRADICTS.value,
+    ):
         assert words in html(page, tmp_path)
         assert words in markdown(page)
 

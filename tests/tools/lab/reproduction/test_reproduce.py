@@ -25,7 +25,17 @@ SECTION = "3"
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a page whose command was killed in the middle of a run."""
     folder = tmp_path_factory.mktemp("page") / "paper"
-    command = [sys.executable, "-m", "rack.tools.cli", "reproduce", "--out", str(folder), "--only", SECTION, "--share"]
+    command = [
+        sys.executable,
+        "-m",
+        "rack.tools.cli",
+        "reproduce",
+        "--out",
+        str(folder),
+        "--only",
+        SECTION,
+        "--share",
+    ]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     begun = folder / "runs" / "goto" / "events.jsonl"
     wait_until(lambda: begun.exists() or process.poll() is not None, BOUND_S)
@@ -46,7 +56,9 @@ def test_a_killed_command_leaves_no_half_result_and_goes_on(killed: Path) -> Non
     assert kept(DEADLINE, killed) is not None
     page, text = ((killed / name).read_text() for name in ("index.html", "README.md"))
     assert not [
-        target for target in re.findall(r'(?:src|href)="([^"]+)"', page) if target[:1] != "#" and target[:5] != "data:"
+        target
+        for target in re.findall(r'(?:src|href)="([^"]+)"', page)
+        if target[:1] != "#" and target[:5] != "data:"
     ]
     assert all((killed / path).is_file() for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text))
 
@@ -54,4 +66,7 @@ def test_a_killed_command_leaves_no_half_result_and_goes_on(killed: Path) -> Non
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = rack("reproduce", "--out", tmp_path / "file")
-    assert (done.returncode, done.stderr) == (2, f"--out {tmp_path / 'file'}: exists, and is not a folder\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"--out {tmp_path / 'file'}: exists, and is not a folder\n",
+    )

@@ -1,4 +1,5 @@
-"""Which cycle broke which equation, and who had its core: on traces that are made up to break them."""
+"""Which cycle broke which equation, and who had its core: on traces that are made up to break
+them."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ PLAIN = (0.0, 0.1, 1.0, 0.1)
 
 @pytest.fixture
 def config(small: Path) -> RackConfig:
-    """Two levels on one core: the upper every 20 ms, the lower every 2.5 ms with a planner that has 4 of its cycles."""
+    """Two levels on one core: the upper every 20 ms, the lower every 2.5 ms with a planner that has
+    4 of its cycles."""
     settings = ["clock.mode=realtime", "board.lower.priority=80", "board.upper.priority=70"]
     return load(small, [*settings, "timing.context_switch_ms=0.1"])
 
@@ -43,7 +45,9 @@ def test_a_run_that_fits_breaks_nothing(config: RackConfig, tmp_path: Path) -> N
     assert not found_in(tmp_path / "run", config, {"lower": lower(), "lower.planner": [plan]})
 
 
-def test_a_cycle_that_computes_beyond_its_cycle_breaks_what_it_breaks(config: RackConfig, tmp_path: Path) -> None:
+def test_a_cycle_that_computes_beyond_its_cycle_breaks_what_it_breaks(
+    config: RackConfig, tmp_path: Path
+) -> None:
     trace = [*lower(), Cycle(SETTLED + 8, (0.0, 0.1, 3.0, 0.1), flags=MISSED)]
     (breach,) = found_in(tmp_path / "run", config, {"lower": trace})
     assert (breach.task, breach.tick, breach.is_judged) == ("lower", SETTLED + 8, True)
@@ -56,14 +60,23 @@ def test_a_cycle_that_computes_beyond_its_cycle_breaks_what_it_breaks(config: Ra
     assert breach.sharing.text() == "computed 3.2 ms, usually 1.2 ms"
 
 
-def test_the_worst_come_first_and_the_start_up_is_told_apart(config: RackConfig, tmp_path: Path) -> None:
+def test_the_worst_come_first_and_the_start_up_is_told_apart(
+    config: RackConfig, tmp_path: Path
+) -> None:
     bad = [Cycle(tick, (0.0, 0.1, ms, 0.1)) for tick, ms in ((3, 9.0), (50, 4.0), (60, 7.0))]
     found = found_in(tmp_path / "run", config, {"lower": [bad[0], *lower(), *bad[1:]]})
-    assert [(breach.tick, breach.is_judged) for breach in found] == [(3, False), (60, True), (50, True)]
+    assert [(breach.tick, breach.is_judged) for breach in found] == [
+        (3, False),
+        (60, True),
+        (50, True),
+    ]
 
 
-def test_a_level_that_others_kept_from_its_core_keeps_its_own_equations(config: RackConfig, tmp_path: Path) -> None:
-    # Cycles of the lower level, of higher priority, follow one another for 21 ms: the upper one ends too late.
+def test_a_level_that_others_kept_from_its_core_keeps_its_own_equations(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    # Cycles of the lower level, of higher priority, follow one another for 21 ms: the upper one
+    # ends too late.
     busy = [Cycle(SETTLED + k, (0.0, 0.1, 2.2, 0.1)) for k in range(9)]
     upper = Cycle(SETTLED, (0.0, 0.1, 20.9, 0.1), late=2.4, processor=1.2, flags=MISSED)
     found = found_in(tmp_path / "run", config, {"upper": [upper], "lower": busy})
@@ -82,16 +95,24 @@ def test_time_that_no_trace_accounts_for_is_nobodys(config: RackConfig, tmp_path
     assert breach.sharing.text() == "no task of the rack had the core for 9 ms"
 
 
-def test_a_cycle_that_is_late_since_the_one_before_still_lasted_says_so(config: RackConfig, tmp_path: Path) -> None:
+def test_a_cycle_that_is_late_since_the_one_before_still_lasted_says_so(
+    config: RackConfig, tmp_path: Path
+) -> None:
     long, late = Cycle(SETTLED + 8, (0.0, 0.1, 4.0, 0.1)), Cycle(SETTLED + 9, PLAIN, late=1.7)
-    found = {b.tick: b for b in found_in(tmp_path / "run", config, {"lower": [*lower(), long, late]})}
+    found = {
+        b.tick: b for b in found_in(tmp_path / "run", config, {"lower": [*lower(), long, late]})
+    }
     assert equations(found[SETTLED + 9]) == ["response time"]
     assert found[SETTLED + 9].sharing.others_ns == {BEFORE: 1.7 * MS}
 
 
 def test_skipped_releases_are_steps_off_the_grid(config: RackConfig, tmp_path: Path) -> None:
     flags = SKIPPED | 3 << SKIPPED_SHIFT
-    trace = [*lower(), Cycle(SETTLED + 11, PLAIN, late=0.2, flags=flags), Cycle(SETTLED + 15, PLAIN)]
+    trace = [
+        *lower(),
+        Cycle(SETTLED + 11, PLAIN, late=0.2, flags=flags),
+        Cycle(SETTLED + 15, PLAIN),
+    ]
     (breach,) = found_in(tmp_path / "run", config, {"lower": trace})
     # Before the last one rows were lost, but no cycle was.
     assert (breach.tick, equations(breach)) == (SETTLED + 11, ["3.7"])
@@ -99,17 +120,23 @@ def test_skipped_releases_are_steps_off_the_grid(config: RackConfig, tmp_path: P
     assert breach.sharing.lasted_ns == (3 * 2.5 + 0.2 + 1.2) * MS
 
 
-def test_a_plan_is_held_against_what_its_own_cycles_left(config: RackConfig, tmp_path: Path) -> None:
+def test_a_plan_is_held_against_what_its_own_cycles_left(
+    config: RackConfig, tmp_path: Path
+) -> None:
     # 2.5 - 1.2 - 2 t_cs leaves 1.1 ms a cycle, 4.4 ms in four.
     fits = Cycle(SETTLED, (0.0, 0.0, 8.0, 0.1), late=1.2, processor=4.3, flags=PLANNED)
     too_long = Cycle(SETTLED + 4, (0.0, 0.0, 8.0, 0.1), late=1.2, processor=4.6, flags=PLANNED)
-    found = found_in(tmp_path / "run", config, {"lower": lower(), "lower.planner": [fits, too_long]})
+    found = found_in(
+        tmp_path / "run", config, {"lower": lower(), "lower.planner": [fits, too_long]}
+    )
     (breach,) = [breach for breach in found if breach.task == "lower.planner"]
     assert (breach.tick, equations(breach)) == (SETTLED + 4, ["3.8"])
     assert breach.broken[0].right == pytest.approx(1.1 * MS)
 
 
-def test_the_update_of_a_plan_counts_in_the_cycle_in_which_it_came(config: RackConfig, tmp_path: Path) -> None:
+def test_the_update_of_a_plan_counts_in_the_cycle_in_which_it_came(
+    config: RackConfig, tmp_path: Path
+) -> None:
     plan = Cycle(SETTLED, (0.0, 0.0, 2.6, 0.5), late=1.2, processor=1.9, flags=PLANNED)
     found = found_in(tmp_path / "run", config, {"lower": lower(), "lower.planner": [plan]})
     (breach,) = [breach for breach in found if breach.task == "lower"]

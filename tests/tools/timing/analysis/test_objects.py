@@ -77,13 +77,16 @@ def test_a_task_of_transfers_states_the_last_place_of_each_object(rack_name: str
 
 def test_a_goal_of_what_is_not_in_the_scene_is_a_mistake() -> None:
     with pytest.raises(
-        ConfigError, match=r"scene.goal\[0\].object = \"block9\": no such object; scene.objects: block1"
+        ConfigError,
+        match=r"scene.goal\[0\].object = \"block9\": no such object; scene.objects: block1",
     ):
         resolve(load("nasrem", [GOAL.replace("block1", "block9")]))
 
 
 @pytest.mark.slow
-def test_the_objects_of_the_nasrem_task_end_within_tolerance_and_none_falls(rack_name: str, tmp_path: Path) -> None:
+def test_the_objects_of_the_nasrem_task_end_within_tolerance_and_none_falls(
+    rack_name: str, tmp_path: Path
+) -> None:
     config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep"])
     assert run_rack(config, None, tmp_path / "run", Display()).worked
     report, text = write_report(tmp_path / "run")
@@ -91,11 +94,16 @@ def test_the_objects_of_the_nasrem_task_end_within_tolerance_and_none_falls(rack
     for end in report["objects"]:
         assert end["off_mm"] < end["tolerance_mm"]
         assert end["drops"] == []
-        assert f"Object {end['object']} ended {end['off_mm']:.1f} mm from its goal (tolerance 10 mm)." in text
+        assert (
+            f"Object {end['object']} ended {end['off_mm']:.1f} mm from its goal (tolerance 10 mm)."
+            in text
+        )
 
 
 @pytest.mark.slow
-def test_what_is_let_go_in_the_air_is_a_finding_with_its_fall(rack_name: str, tmp_path: Path) -> None:
+def test_what_is_let_go_in_the_air_is_a_finding_with_its_fall(
+    rack_name: str, tmp_path: Path
+) -> None:
     (tmp_path / "drop.py").write_text(DROP)
     own = ["host.command.params.script=drop.py", f'python_path=["{tmp_path}"]', GOAL]
     config = load("chimera", [f"name={rack_name}", "clock.mode=lockstep", *own])
@@ -105,4 +113,7 @@ def test_what_is_let_go_in_the_air_is_a_finding_with_its_fall(rack_name: str, tm
     (end,) = report["objects"]
     (drop,) = end["drops"]
     assert drop["mm"] == pytest.approx(100.0, abs=5.0)
-    assert f"Object block1 was let go {drop['mm']:.0f} mm above what it landed on, at tick {drop['tick']}." in text
+    assert (
+        f"Object block1 was let go {drop['mm']:.0f} mm above what it landed on, at tick"
+        f" {drop['tick']}." in text
+    )

@@ -53,7 +53,9 @@ def cycle(tick: int, late: float, read: float, process: float, write: float) -> 
 
 
 def test_times_of_a_task_are_those_of_equation_3_5() -> None:
-    cycles = np.array([cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD)
+    cycles = np.array(
+        [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
+    )
     times = task_times(TASK, cycles, 10 * MS)
     assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
     assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
@@ -78,7 +80,9 @@ def test_a_task_that_never_ran_has_no_times() -> None:
         ([1, 8, 100, 400], 509 + 7 + 96 + 300),
     ],
 )
-def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(cycles: list[int], ticks: int) -> None:
+def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(
+    cycles: list[int], ticks: int
+) -> None:
     assert response_ticks(cycles) == ticks
 
 
@@ -127,12 +131,18 @@ def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(fol
 
 def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
     recording = Silent(folder)
-    recording.ended["faults"] = [{"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}]
+    recording.ended["faults"] = [
+        {"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}
+    ]
     response = system_response(recording)
     assert response is not None
     (beyond,) = response["command"]["beyond"]
     assert response["command"]["holds"] is False
-    assert beyond == {"tick": 19 * 40, "ms": (45 + 10 * 40) * 2.5, "delayed_by": ["fault: mute of upper"]}
+    assert beyond == {
+        "tick": 19 * 40,
+        "ms": (45 + 10 * 40) * 2.5,
+        "delayed_by": ["fault: mute of upper"],
+    }
     text = markdown(write_report(folder)[0] | {"system_response": response})
     assert "FAILS" in next(line for line in text.splitlines() if line.startswith("| command, down"))
     assert "- 1112.5 ms from tick 760: fault: mute of upper" in text.splitlines()
@@ -151,7 +161,14 @@ def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -
 
 
 def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folder: Path) -> None:
-    late = {"task": "lower", "tick": 5, "what": "late", "count": 1, "started_ms": 0.1, "took_ms": 3.0}
+    late = {
+        "task": "lower",
+        "tick": 5,
+        "what": "late",
+        "count": 1,
+        "started_ms": 0.1,
+        "took_ms": 3.0,
+    }
     skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
     report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
     lines = markdown(report).splitlines()
@@ -167,7 +184,10 @@ def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folde
 @pytest.mark.parametrize("width", [80, 120])
 def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: int) -> None:
     report = {**write_report(folder)[0], "mode": "realtime"}
-    task = {**report["tasks"]["lower"], **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567))}
+    task = {
+        **report["tasks"]["lower"],
+        **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567)),
+    }
     report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
     terminal = Console(width=width, record=True, file=io.StringIO())
     show(report, terminal)
@@ -182,31 +202,58 @@ def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: i
 
 
 @pytest.mark.slow
-def test_a_report_shows_who_held_a_level_and_what_is_still_held(rack_name: str, tmp_path: Path) -> None:
+def test_a_report_shows_who_held_a_level_and_what_is_still_held(
+    rack_name: str, tmp_path: Path
+) -> None:
     (tmp_path / "commanded.toml").write_text(COMMANDED)
     given = commands(
         "level='upper', what='hold', tick=101",
         "level='upper', what='resume', tick=203",
         "level='lower', what='hold', tick=301",
     )
-    run_rack(load(tmp_path / "commanded.toml", [f"name={rack_name}", given]), 12.0, tmp_path / "run", Watchful())
+    run_rack(
+        load(tmp_path / "commanded.toml", [f"name={rack_name}", given]),
+        12.0,
+        tmp_path / "run",
+        Watchful(),
+    )
     report, text = write_report(tmp_path / "run")
     assert report["holds"] == [
-        {"level": "upper", "by": "operator", "why": "hold", "since_s": 0.26, "until_s": 0.52, "lasted_s": 0.26},
-        {"level": "lower", "by": "operator", "why": "hold", "since_s": 0.755, "until_s": None, "lasted_s": 11.2425},
+        {
+            "level": "upper",
+            "by": "operator",
+            "why": "hold",
+            "since_s": 0.26,
+            "until_s": 0.52,
+            "lasted_s": 0.26,
+        },
+        {
+            "level": "lower",
+            "by": "operator",
+            "why": "hold",
+            "since_s": 0.755,
+            "until_s": None,
+            "lasted_s": 11.2425,
+        },
     ]
     assert "## Holds: 2" in text.splitlines()
-    assert f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it." in text.splitlines()
+    assert (
+        f"Still held at the end: lower; `rack command {rack_name} lower resume` releases it."
+        in text.splitlines()
+    )
     (standstill,) = standstills(tmp_path / "run")
     assert standstill.startswith("nothing has moved for ")
     assert standstill.endswith(
-        f": lower held by the operator (hold), since 0.75 s; to release: rack command {rack_name} lower resume"
+        f": lower held by the operator (hold), since 0.75 s; to release: rack command {rack_name}"
+        " lower resume"
     )
 
 
 def standstills(folder: Path) -> list[str]:
     """Return what the events say of a rack that is held and stands still."""
-    return [event["text"] for event in Recording(folder).events if event.get("code") == "standstill"]
+    return [
+        event["text"] for event in Recording(folder).events if event.get("code") == "standstill"
+    ]
 
 
 HELD = "nothing has moved for 30 s: elemental_move holds"
@@ -228,13 +275,23 @@ def test_what_ended_a_run_or_is_latched_is_its_headline(
 
 
 def test_limits_that_a_push_broke_stand_beside_those_that_the_arm_broke(folder: Path) -> None:
-    motion = {"tracking_rms_mrad": 0.1, "tracking_peak_mrad": 0.5, "touches": 4, "clipped_cycles": 0}
+    motion = {
+        "tracking_rms_mrad": 0.1,
+        "tracking_peak_mrad": 0.5,
+        "touches": 4,
+        "clipped_cycles": 0,
+    }
     text = markdown(write_report(folder)[0] | {"motion": motion | {"violations": 0, "pushed": 7}})
     assert "limits exceeded in 0 substeps, by a push from outside in 7." in text
 
 
 def test_contacts_stand_with_the_arms_limits_and_the_forces_wanted(folder: Path) -> None:
-    force = {"largest_force_n": 23.14, "largest_torque_nm": 0.4, "exceeded_cycles": 2, "force_rms_n": None}
+    force = {
+        "largest_force_n": 23.14,
+        "largest_torque_nm": 0.4,
+        "exceeded_cycles": 2,
+        "force_rms_n": None,
+    }
     text = markdown(write_report(folder)[0] | {"force": force})
     assert "Contact: at most 23.1 N and 0.40 N m, beyond the arm's limits in 2 cycles." in text
     text = markdown(write_report(folder)[0] | {"force": force | {"force_rms_n": 1.5}})

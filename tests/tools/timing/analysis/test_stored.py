@@ -1,4 +1,5 @@
-"""The report in a run's folder: shown as it is while it is newer than the recording and the program."""
+"""The report in a run's folder: shown as it is while it is newer than the recording and the
+program."""
 
 from __future__ import annotations
 

@@ -28,7 +28,9 @@ def test_the_levels_of_nasrem_fall_where_the_paper_has_them() -> None:
     found = {level.level: level for level in placed(load("nasrem"))}
     assert list(found) == ["servo", "primitive", "world", "elemental_move", "task"]
     assert {name: level.region for name, level in found.items()} == {
-        **dict.fromkeys(("servo", "primitive", "world", "elemental_move"), "asynchronous multiprocessing"),
+        **dict.fromkeys(
+            ("servo", "primitive", "world", "elemental_move"), "asynchronous multiprocessing"
+        ),
         "task": "multitasking",
     }
     assert "coupled loosely, as in the figure" in found["elemental_move"].remark
@@ -39,13 +41,19 @@ def test_the_levels_of_nasrem_fall_where_the_paper_has_them() -> None:
 
 def test_a_rack_that_runs_faster_than_real_time_asks_for_more() -> None:
     servo = placed(load("nasrem", ["clock.speed=4"]))[0]
-    assert (servo.cycle_s, servo.region) == (0.000625, "fine-grained multiprocessing or dedicated hardware")
+    assert (servo.cycle_s, servo.region) == (
+        0.000625,
+        "fine-grained multiprocessing or dedicated hardware",
+    )
 
 
 def test_every_level_stands_in_its_region_on_the_axis() -> None:
     text = list(lines(load("nasrem")))
     names = next(line for line in text if "fine-grained" in line)
-    starts = [names.index(name) for name in ("fine-grained", "asynchronous", "multitasking", "distributed")]
+    starts = [
+        names.index(name)
+        for name in ("fine-grained", "asynchronous", "multitasking", "distributed")
+    ]
     for level, region in (("servo", 1), ("primitive", 1), ("elemental_move", 1), ("task", 2)):
         row = next(line for line in text if line.startswith(level))
         assert starts[region] <= row.rindex("o") < starts[region + 1]

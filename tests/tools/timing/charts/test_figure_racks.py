@@ -1,6 +1,7 @@
 """Figures 2 to 4 by real processes in real time: the runs agree with the predictions.
 
-The machine takes cores away for some milliseconds now and then: these tests judge by majorities, without time limits.
+The machine takes cores away for some milliseconds now and then: these tests judge by majorities,
+without time limits.
 """
 
 from __future__ import annotations
@@ -60,7 +61,9 @@ def test_figure_3_misses_every_plan_and_no_cycle(panels: dict[str, Panel]) -> No
     assert late(panels["fig3"], "level") < 1 - MOSTLY
 
 
-def test_figure_4_has_an_idle_executor_beside_a_planner_that_is_in_time(panels: dict[str, Panel]) -> None:
+def test_figure_4_has_an_idle_executor_beside_a_planner_that_is_in_time(
+    panels: dict[str, Panel],
+) -> None:
     panel = panels["fig4"]
     assert [(lane.core, lane.name) for lane in panel.lanes] == [(0, "level.planner"), (1, "level")]
     assert usual(panel.patterns["level"].cycles) == "C R X W -"
@@ -68,7 +71,9 @@ def test_figure_4_has_an_idle_executor_beside_a_planner_that_is_in_time(panels: 
     assert max(late(panel, "level"), late(panel, "level.planner")) < 1 - MOSTLY
 
 
-def test_figure_4_with_a_longer_executor_misses_cycles_though_its_planner_is_in_time(panels: dict[str, Panel]) -> None:
+def test_figure_4_with_a_longer_executor_misses_cycles_though_its_planner_is_in_time(
+    panels: dict[str, Panel],
+) -> None:
     panel = panels["fig4-overload"]
     assert late(panel, "level") > MOSTLY
     assert panel.counts["level"].skipped > 0
@@ -76,7 +81,9 @@ def test_figure_4_with_a_longer_executor_misses_cycles_though_its_planner_is_in_
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_what_is_predicted_to_fail_fails_in_the_run_and_nothing_else(name: str, panels: dict[str, Panel]) -> None:
+def test_what_is_predicted_to_fail_fails_in_the_run_and_nothing_else(
+    name: str, panels: dict[str, Panel]
+) -> None:
     config = load(name)
     layout = wire(config)
     predicted = all(verdict.holds for verdict in verdicts(rack_timing(config, layout)))
@@ -97,7 +104,8 @@ def test_the_run_has_the_patterns_of_its_schedule(name: str, panels: dict[str, P
 
 
 def updates_met(found: TracedRun) -> tuple[int, int]:
-    """Return how many plan updates their executor was released in, and how many of them it cut in two.
+    """Return how many plan updates their executor was released in, and how many of them it cut in
+    two.
 
     An executor that begins later than an update takes began after it.
     """
@@ -111,11 +119,15 @@ def updates_met(found: TracedRun) -> tuple[int, int]:
     return met, cut
 
 
-# P ends 1 ms or less before the third cycle begins, however slow the machine is: U, of 2 ms, reaches into that.
+# P ends 1 ms or less before the third cycle begins, however slow the machine is: U, of 2 ms,
+# reaches into that.
 STRADDLING = (
     f"board.level.params.process_ms={SLOWER * 2.0}",
     f"board.level.params.plan_ms={SLOWER * 6.4}",
-    f"board.level.transfer={{ read_ms = {SLOWER}, write_ms = {SLOWER}, update_ms = {SLOWER * 2.0} }}",
+    (
+        f"board.level.transfer={{ read_ms = {SLOWER}, write_ms = {SLOWER}, update_ms ="
+        f" {SLOWER * 2.0} }}"
+    ),
     "board.level.within_cycles=3",
 )
 UPDATE_NS = SLOWER * 1_900_000
@@ -145,11 +157,16 @@ def test_an_update_that_is_no_critical_section_is_preempted(tmp_path: Path) -> N
 @pytest.mark.parametrize("name", ["fig2", "fig4-overload"])
 def test_in_lockstep_a_figure_misses_nothing_and_repeats_itself(name: str, tmp_path: Path) -> None:
     lockstep = "clock.mode=lockstep"
-    first, second = (run(name, tmp_path / turn, lockstep, seconds=0.1) for turn in ("first", "second"))
+    first, second = (
+        run(name, tmp_path / turn, lockstep, seconds=0.1) for turn in ("first", "second")
+    )
     outcomes = [found.recording.ended["outcome"] for found in (first, second)]
     assert outcomes[0]["digest"] == outcomes[1]["digest"]
     assert not any((rows["flags"] & Flag.MISSED).any() for rows in first.recording.cycles.values())
-    made, level = first.recording.signal("level.plan", "made_at").tolist(), first.config.board["level"]
+    made, level = (
+        first.recording.signal("level.plan", "made_at").tolist(),
+        first.config.board["level"],
+    )
     slices = list(range(0, outcomes[0]["ticks"], first.config.every("level") * level.within_cycles))
     # The last plan may be one that the end of the run cut off.
     assert made in (slices, slices[:-1])

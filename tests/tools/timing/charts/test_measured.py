@@ -1,4 +1,5 @@
-"""The chart of a run: spans cut where a higher priority had the core, jobs, and what was skipped."""
+"""The chart of a run: spans cut where a higher priority had the core, jobs, and what was
+skipped."""
 
 from __future__ import annotations
 
@@ -38,14 +39,23 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def fig2(folder: Path, executor_rows: list[tuple[int, ...]], plans: list[tuple[int, ...]], *settings: str) -> TracedRun:
-    return TracedRun(recorded(folder, load("fig2", settings), {"level": executor_rows, "level.planner": plans}))
+def fig2(
+    folder: Path, executor_rows: list[tuple[int, ...]], plans: list[tuple[int, ...]], *settings: str
+) -> TracedRun:
+    return TracedRun(
+        recorded(folder, load("fig2", settings), {"level": executor_rows, "level.planner": plans})
+    )
 
 
 def test_a_cycle_becomes_its_unit_functions_at_their_times_on_the_grid(folder: Path) -> None:
     run = fig2(folder, [executor(1, 8100, 8200, 9200, 11_200, 12_200)], [])
     chart = run.chart(0, run.end_ns)
-    assert spans(chart) == [("C", 8100, 8200), ("R", 8200, 9200), ("X", 9200, 11_200), ("W", 11_200, 12_200)]
+    assert spans(chart) == [
+        ("C", 8100, 8200),
+        ("R", 8200, 9200),
+        ("X", 9200, 11_200),
+        ("W", 11_200, 12_200),
+    ]
     assert [(job.release_ns, job.deadline_ns, job.end_ns) for job in chart.jobs] == [
         (8_000_000, 16_000_000, 12_200_000)
     ]
@@ -68,18 +78,33 @@ def test_what_an_executor_needs_to_wake_up_is_not_its_planners(folder: Path) -> 
     # It cannot have woken up before its release.
     cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=5000)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
-    assert next(found for found in spans(run.chart(0, run.end_ns)) if found[0] == "P") == ("P", 500, 8000)
+    assert next(found for found in spans(run.chart(0, run.end_ns)) if found[0] == "P") == (
+        "P",
+        500,
+        8000,
+    )
 
 
 def test_a_planner_on_another_core_is_preempted_by_nobody(folder: Path) -> None:
-    loose = ("board.level.coupling=loose", "board.level.planner_slot=3", "board.level.planner_core=0")
-    run = fig2(folder, [executor(1, 8100, 8100, 8200, 8300, 8400)], [plan(0, 500, 9000, 9500)], *loose)
+    loose = (
+        "board.level.coupling=loose",
+        "board.level.planner_slot=3",
+        "board.level.planner_core=0",
+    )
+    run = fig2(
+        folder, [executor(1, 8100, 8100, 8200, 8300, 8400)], [plan(0, 500, 9000, 9500)], *loose
+    )
     assert ("P", 500, 9000) in spans(run.chart(0, run.end_ns))
 
 
 def test_releases_that_were_skipped_are_jobs_that_were_never_done(folder: Path) -> None:
     run = fig2(
-        folder, [executor(0, 0, 0, 0, 0, 21_000), executor(3, 24_000, 24_000, 24_000, 24_000, 25_000, skipped=2)], []
+        folder,
+        [
+            executor(0, 0, 0, 0, 0, 21_000),
+            executor(3, 24_000, 24_000, 24_000, 24_000, 25_000, skipped=2),
+        ],
+        [],
     )
     chart = run.chart(0, run.end_ns)
     assert [(job.release_ns, job.end_ns) for job in chart.jobs if job.end_ns is None] == [
@@ -113,7 +138,9 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [executor(n, *(n * 8000 + at for at in (0, 10, 1000, 3000, 4000))) for n in range(60)]
-    plans = [plan(n, n * 8000 + 4000, n * 8000 + 14_000, n * 8000 + 15_000) for n in range(0, 60, 2)]
+    plans = [
+        plan(n, n * 8000 + 4000, n * 8000 + 14_000, n * 8000 + 15_000) for n in range(0, 60, 2)
+    ]
     run = fig2(folder, rows, plans)
     at_once = run.panel(0, 1, lambda part: None)
     parts: list[float] = []
@@ -129,7 +156,10 @@ def test_a_trace_without_the_newer_columns_is_refused(folder: Path) -> None:
     fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
     table = pq.read_table(folder / "cycles.parquet").drop_columns(["plan_ns"])
     pq.write_table(table.replace_schema_metadata({"lost": "{}"}), folder / "cycles.parquet")
-    with pytest.raises(Failure, match="no column plan_ns: it was recorded by an earlier version; run the rack again"):
+    with pytest.raises(
+        Failure,
+        match="no column plan_ns: it was recorded by an earlier version; run the rack again",
+    ):
         TracedRun(Recording(folder))
 
 
@@ -154,7 +184,11 @@ def test_what_is_left_of_a_stretch_lies_between_what_was_taken() -> None:
 def test_every_moment_is_either_taken_or_left() -> None:
     chance = random.Random(5)
     for _ in range(200):
-        taken = union((a, a + chance.randint(1, 9)) for a in (chance.randint(0, 60) for _ in range(5)))
+        taken = union(
+            (a, a + chance.randint(1, 9)) for a in (chance.randint(0, 60) for _ in range(5))
+        )
         left = list(without((10, 50), taken))
-        moments = sorted(at for start, end in [*taken, *left] for at in range(start, end) if 10 <= at < 50)
+        moments = sorted(
+            at for start, end in [*taken, *left] for at in range(start, end) if 10 <= at < 50
+        )
         assert moments == list(range(10, 50))

@@ -11,7 +11,9 @@ from rack.levels.timing.tasks import Part, TimedTask, Unit
 from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, lanes_of, patterns
 
 
-def task(name: str, text: str, every: int, cycles: int = 1, core: int = 1, priority: int = 80) -> TimedTask:
+def task(
+    name: str, text: str, every: int, cycles: int = 1, core: int = 1, priority: int = 80
+) -> TimedTask:
     parts = tuple(Part(Unit(part[0]), int(part[1:])) for part in text.split())
     role = "planner" if name.endswith("planner") else "executor"
     return TimedTask(name, name.partition(".")[0], role, core, priority, every, parts, cycles)
@@ -45,7 +47,9 @@ def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
     # Of five plans the last three are taken away, jobs and spans.
     kept = tuple(job for job in chart.jobs if job.task == "a" or job.release_ns < 3200)
     spans = tuple(span for span in chart.spans if span.task == "a" or span.release_ns < 3200)
-    found = patterns(Chart(0, 8000, spans, kept), lanes_of([EXECUTOR, PLANNER])[0], (0, 6400), Detail())
+    found = patterns(
+        Chart(0, 8000, spans, kept), lanes_of([EXECUTOR, PLANNER])[0], (0, 6400), Detail()
+    )
     assert dict(found.plans) == {"R X W P | R X W P U -": 2}
     assert dict(found.cycles) == {"R X W -": 4}
 

@@ -13,7 +13,9 @@ MS = 1_000_000
 
 def task(name: str, every_ms: float, cycles: int = 1, core: int = 0, board: str = "") -> TimedTask:
     role = "planner" if name.endswith("planner") else "executor"
-    return TimedTask(name, board or name.partition(".")[0], role, core, 0, round(every_ms * MS), (), cycles)
+    return TimedTask(
+        name, board or name.partition(".")[0], role, core, 0, round(every_ms * MS), (), cycles
+    )
 
 
 NASREM = [
@@ -34,18 +36,29 @@ def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_stil
 
 
 def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
-    tasks = [task("a", 10), task("a.planner", 10, 2), task("b", 10, core=1), task("b.planner", 10, 4, core=0)]
+    tasks = [
+        task("a", 10),
+        task("a.planner", 10, 2),
+        task("b", 10, core=1),
+        task("b.planner", 10, 4, core=0),
+    ]
     assert window_options(None, None, None, None).task(tasks).name == "a.planner"
 
 
 def test_cycles_are_those_of_the_level_that_is_named() -> None:
     asked = window_options(None, None, "3-5", "servo")
     assert asked.window(asked.task(NASREM), None, 0) == (7_500_000, 15 * MS)
-    assert window_options(None, None, "7", None).window(asked.task(NASREM), None, 0) == (17_500_000, 20 * MS)
+    assert window_options(None, None, "7", None).window(asked.task(NASREM), None, 0) == (
+        17_500_000,
+        20 * MS,
+    )
 
 
 def test_begin_and_end_are_as_they_are_asked_for() -> None:
-    assert window_options(3.5, 9.25, None, None).window(NASREM[0], None, 0) == (3_500_000, 9_250_000)
+    assert window_options(3.5, 9.25, None, None).window(NASREM[0], None, 0) == (
+        3_500_000,
+        9_250_000,
+    )
     assert window_options(3, None, None, None).window(NASREM[0], None, 0) == (3 * MS, 8 * MS)
     # A default end is cut at the end of the run.
     assert window_options(3, None, None, None).window(NASREM[0], 5 * MS, 0) == (3 * MS, 5 * MS)
@@ -62,7 +75,10 @@ def seen(asked: WindowOptions) -> tuple[int, int]:
         ((70.0, 81.0, None, None), "70 to 81 ms: outside the run"),
         ((None, None, "31-32", "servo"), "77.5 to 82.5 ms: outside the run"),
         ((9.0, 9.0, None, None), "9 to 9 ms: --to-ms must be later than --from-ms"),
-        ((None, None, None, "arm"), "--level arm: no such level in the chart; levels: servo, primitive, task"),
+        (
+            (None, None, None, "arm"),
+            "--level arm: no such level in the chart; levels: servo, primitive, task",
+        ),
     ],
 )
 def test_a_bad_window_is_refused(asked: tuple[float, float, str, str], message: str) -> None:
@@ -92,7 +108,9 @@ def test_times_of_x_are_read_by_level() -> None:
     assert times_of(["level=3,2", "servo=0.5"]) == {"level": [3 * MS, 2 * MS], "servo": [500_000]}
 
 
-@pytest.mark.parametrize("text", ["level", "level=", "level=a", "level=1,-1", "level=nan", "level=inf", "level=1,,2"])
+@pytest.mark.parametrize(
+    "text", ["level", "level=", "level=a", "level=1,-1", "level=nan", "level=inf", "level=1,,2"]
+)
 def test_bad_times_are_refused(text: str) -> None:
     with pytest.raises(Failure, match=f"--process {text}: give a level and its times"):
         times_of([text])

@@ -1,7 +1,7 @@
 """Racks compared with each other: what their configs promise, and what their runs show.
 
-Nothing is known of a rack in advance: levels, rates and bounds are read from its config, ages and responses from its
-messages, by what each of them rests on.
+Nothing is known of a rack in advance: levels, rates and bounds are read from its config, ages and
+responses from its messages, by what each of them rests on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,13 @@ from rack.tools.lab.benches.systems.hold import held, hold_for
 from rack.tools.lab.benches.systems.kills import kill_each, kills_s
 from rack.tools.lab.benches.systems.motion import LONGEST_S, PosesBench, poses_config
 from rack.tools.lab.benches.systems.prediction import prediction
-from rack.tools.lab.benches.systems.realtime import ages_ms, board_loads, bus_traffic, cycles_in, plan_latencies
+from rack.tools.lab.benches.systems.realtime import (
+    ages_ms,
+    board_loads,
+    bus_traffic,
+    cycles_in,
+    plan_latencies,
+)
 from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.live.launch import RunResult
 from rack.tools.recording.cycles import cycles_of
@@ -38,7 +44,8 @@ LOCKSTEP_SPEED = 2.5
 
 
 def systems() -> list[str]:
-    """Return the bundled racks to compare: the default rack, and those that have a folder of their own.
+    """Return the bundled racks to compare: the default rack, and those that have a folder of their
+    own.
 
     Racks of a network are not among them: they need others to work with.
     """
@@ -47,7 +54,8 @@ def systems() -> list[str]:
 
 
 def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
-    """Run every rack in real time and in lockstep, and `cyclictest` at the rate of its fastest boards, by turns.
+    """Run every rack in real time and in lockstep, and `cyclictest` at the rate of its fastest
+    boards, by turns.
 
     Raises `ConfigError` for a config with mistakes, before any rack runs.
     """

@@ -18,11 +18,12 @@ from rack.tools.lab.benches.systems.realtime import BusTraffic, PlanLatency
 class RealTimeFigures(MissesBeyond):
     """What a run in real time has shown; times in ms of simulated time.
 
-    `missed` is the share of the cycles of the fastest boards. `command_ms` and `status_ms` are the response measured
-    down the hierarchy from `commanded`, which is below a queue if there is one, and up; `command_bound_ms` is the
-    longest that the grid permits from there. Ages are those of commands when
-    the lowest level reads them, and of its statuses when they are read above. None: the rack has no such thing. `loads`
-    are processor time by core, `board_loads` by board, both as parts of one core; host boards are not traced.
+    `missed` is the share of the cycles of the fastest boards. `command_ms` and `status_ms` are the
+    response measured down the hierarchy from `commanded`, which is below a queue if there is one,
+    and up; `command_bound_ms` is the longest that the grid permits from there. Ages are those of
+    commands when the lowest level reads them, and of its statuses when they are read above. None:
+    the rack has no such thing. `loads` are processor time by core, `board_loads` by board, both as
+    parts of one core; host boards are not traced.
     """
 
     missed: float
@@ -47,7 +48,8 @@ class RealTimeFigures(MissesBeyond):
 
 @dataclass(frozen=True)
 class SystemFigures:
-    """One rack: what its config promises, and what its runs have shown. `poses` is None without a PUMA to move."""
+    """One rack: what its config promises, and what its runs have shown. `poses` is None without a
+    PUMA to move."""
 
     rack: str
     predicted: SystemPrediction

@@ -1,4 +1,5 @@
-"""An operator's hold of the highest level of a rack that takes one, and the torque that rests on it."""
+"""An operator's hold of the highest level of a rack that takes one, and the torque that rests on
+it."""
 
 from __future__ import annotations
 
@@ -23,10 +24,12 @@ ROUNDING_MS = 1e-6
 
 @dataclass(frozen=True)
 class HoldResponse:
-    """The response to an operator's hold, from giving it to the end of the lowest level's cycle that rests on it, ms.
+    """The response to an operator's hold, from giving it to the end of the lowest level's cycle
+    that rests on it, ms.
 
-    `measured_ms` and `longest_ms`, the longest on the grid, are simulated time, `wall_ms` is the wall clock's. `fate`
-    is what became of the command; unless it was acted on, nothing was measured.
+    `measured_ms` and `longest_ms`, the longest on the grid, are simulated time, `wall_ms` is the
+    wall clock's. `fate` is what became of the command; unless it was acted on, nothing was
+    measured.
     """
 
     level: str
@@ -42,7 +45,8 @@ class HoldResponse:
 
 
 def hold_paths(config: RackConfig, timing: RackTiming, layout: Layout) -> list[CommandPath]:
-    """Return the paths of a hold from every level that takes one and shows the response, the longest first."""
+    """Return the paths of a hold from every level that takes one and shows the response, the
+    longest first."""
     taken = commandable(config)
     paths = [
         path
@@ -52,12 +56,17 @@ def hold_paths(config: RackConfig, timing: RackTiming, layout: Layout) -> list[C
     return sorted(paths, key=lambda path: (len(path.levels), path.longest), reverse=True)
 
 
-def hold_for(config: RackConfig, timing: RackTiming, layout: Layout, seconds: float) -> CommandConfig | None:
-    """Return a hold of the highest level that takes one and responds within the run; None: there is none."""
+def hold_for(
+    config: RackConfig, timing: RackTiming, layout: Layout, seconds: float
+) -> CommandConfig | None:
+    """Return a hold of the highest level that takes one and responds within the run; None: there is
+    none."""
     ticks, after = (round(time_s * 1e9 / config.clock_ns) for time_s in (seconds, AFTER_HOLD_S))
     for path in hold_paths(config, timing, layout):
         if (last := ticks - path.longest - after) > 0:
-            return CommandConfig(level=path.levels[0], what="hold", tick=min(last, round(BEFORE_HOLD * ticks)))
+            return CommandConfig(
+                level=path.levels[0], what="hold", tick=min(last, round(BEFORE_HOLD * ticks))
+            )
     return None
 
 

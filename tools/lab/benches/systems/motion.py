@@ -1,9 +1,11 @@
-"""The same motion by every rack with a PUMA 560, from home through three poses; and how soon it is stopped.
+"""The same motion by every rack with a PUMA 560, from home through three poses; and how soon it is
+stopped.
 
-A rack has it as a config of its own, next to it: `<name>/three-poses.toml` in the folder of a rack, or
-`<name>-three-poses.toml`. All runs are in lockstep. In two more of them an operator stops the arm where it is fastest
-on its way to the first pose: by a hold of the highest level that takes one, and by the emergency stop. What host boards
-sent in the first run enters these at the same ticks, so that all three are the same until then.
+A rack has it as a config of its own, next to it: `<name>/three-poses.toml` in the folder of a rack,
+or `<name>-three-poses.toml`. All runs are in lockstep. In two more of them an operator stops the
+arm where it is fastest on its way to the first pose: by a hold of the highest level that takes one,
+and by the emergency stop. What host boards sent in the first run enters these at the same ticks, so
+that all three are the same until then.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ TOOL_SAMPLES = 400
 
 @dataclass(frozen=True)
 class Stop:
-    """An operator's stop: by what, and the time from giving it until the arm rested for good, ms; None: it did not.
+    """An operator's stop: by what, and the time from giving it until the arm rested for good, ms;
+    None: it did not.
 
     `speed` is that of the fastest joint when it was given, rad/s.
     """
@@ -56,10 +59,10 @@ class Stop:
 class PosesRun:
     """The motion of one rack. Times are simulated.
 
-    `begins_s` is from the start of the run, `lasts_s` from the first motion to rest in the last pose. Tracking errors
-    are those of the joints while their targets move, mrad, `tool_mm` is the largest distance of the tool from its
-    target. `reached` counts the poses in which the arm came to rest. `hold` is
-    None if no level takes one.
+    `begins_s` is from the start of the run, `lasts_s` from the first motion to rest in the last
+    pose. Tracking errors are those of the joints while their targets move, mrad, `tool_mm` is the
+    largest distance of the tool from its target. `reached` counts the poses in which the arm came
+    to rest. `hold` is None if no level takes one.
     """
 
     begins_s: float
@@ -79,7 +82,8 @@ class PosesRun:
 
 @dataclass(frozen=True)
 class _Moved:
-    """What the board of an arm has reported, cycle by cycle, in rad and rad/s, each array of shape (n, joints)."""
+    """What the board of an arm has reported, cycle by cycle, in rad and rad/s, each array of shape
+    (n, joints)."""
 
     tick: np.ndarray  # (n,)
     position: np.ndarray
@@ -108,7 +112,11 @@ def three_poses() -> Array:
 
 def poses_config(name: str) -> Path | None:
     """Return the config in which a rack does the motion; None if it has none."""
-    own = file_at(Path(name)) or file_at(CONFIGS / name / f"{name}.toml") or file_at(CONFIGS / f"{name}.toml")
+    own = (
+        file_at(Path(name))
+        or file_at(CONFIGS / name / f"{name}.toml")
+        or file_at(CONFIGS / f"{name}.toml")
+    )
     if own is None:
         return None
     is_main = own.stem == own.parent.name
@@ -133,12 +141,15 @@ class PosesBench:
         self._arm = next(box.name for box in self._layout.mailboxes if box.message in DRIVING)
 
     def measure(self, folder: Path) -> PosesRun:
-        """Run the motion, then stop it twice; record it into `folder`. Raises `Failure` if the arm does not move."""
+        """Run the motion, then stop it twice; record it into `folder`. Raises `Failure` if the arm
+        does not move."""
         recording = record(self._config, LONGEST_S, folder, self._share).recording
         fields = ("tick", "position", "velocity", "target", "target_velocity")
         moved = _Moved(*(recording.signal(self._arm, field) for field in fields))
         fastest = self._fastest(moved)
-        emergency = self._stopped(self._config, "emergency stop", StopRun(fastest, 0, (Deed(fastest, _latch),)))
+        emergency = self._stopped(
+            self._config, "emergency stop", StopRun(fastest, 0, (Deed(fastest, _latch),))
+        )
         return self._figures(moved, self._hold(fastest), emergency)
 
     def _figures(self, moved: _Moved, hold: Stop | None, emergency: Stop) -> PosesRun:
@@ -194,7 +205,11 @@ class PosesBench:
         velocity = after["message"]["velocity"]
         moving = np.flatnonzero(np.abs(velocity).max(axis=1) > REST_RAD_S)
         # It must be seen to rest.
-        rests = int(after["tick"][moving[-1] + 1]) if len(moving) and moving[-1] + 1 < len(after) else None
+        rests = (
+            int(after["tick"][moving[-1] + 1])
+            if len(moving) and moving[-1] + 1 < len(after)
+            else None
+        )
         speed = float(np.abs(velocity[0]).max())
         return Stop(by, speed, None if rests is None else (rests - run.tick) * tick_s * 1e3)
 

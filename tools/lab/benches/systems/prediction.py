@@ -13,10 +13,11 @@ from rack.levels.timing.rack import RackTiming
 
 @dataclass(frozen=True)
 class SystemPrediction:
-    """What a config promises, times in ms. `levels` are those of its longest response, the highest first.
+    """What a config promises, times in ms. `levels` are those of its longest response, the highest
+    first.
 
-    `boards` are the slots that it takes besides the clock's, `hosts` its boards without real time; `processes` are
-    those that it starts. `fits` is None without a budget; `loads` are by core.
+    `boards` are the slots that it takes besides the clock's, `hosts` its boards without real time;
+    `processes` are those that it starts. `fits` is None without a budget; `loads` are by core.
     """
 
     levels: tuple[str, ...]

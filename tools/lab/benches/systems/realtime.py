@@ -1,4 +1,5 @@
-"""What a run of a rack in real time has shown: ages of messages, plans, accesses to the bus, processor time."""
+"""What a run of a rack in real time has shown: ages of messages, plans, accesses to the bus,
+processor time."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from rack.tools.timing.analysis.analysis import task_loads
 
 @dataclass(frozen=True)
 class BusTraffic:
-    """Accesses to mailboxes a second of simulated time, and bytes of messages; both reads and writes."""
+    """Accesses to mailboxes a second of simulated time, and bytes of messages; both reads and
+    writes."""
 
     accesses: float
     bytes: float
@@ -31,9 +33,10 @@ class BusTraffic:
 class PlanLatency:
     """How long what one maker has planned takes until the level below can use it, ms.
 
-    `latency_ms`: of a planner from the release that begins a plan to the tick from which the plan is visible, of a host
-    board from sending an order to the tick from which levels see it. `computed_ms`: the processor time of a plan; None
-    of a host board, which is not traced. `made` counts them.
+    `latency_ms`: of a planner from the release that begins a plan to the tick from which the plan
+    is visible, of a host board from sending an order to the tick from which levels see it.
+    `computed_ms`: the processor time of a plan; None of a host board, which is not traced. `made`
+    counts them.
     """
 
     maker: str
@@ -49,8 +52,11 @@ def cycles_in(run: RunResult, layout: Layout, board: str) -> CycleCount:
     return CycleCount(min(due, counted["missed"] + counted["skipped"]), due)
 
 
-def bus_traffic(counts: Mapping[str, Mapping[str, int]], ticks: int, layout: Layout) -> dict[str, BusTraffic]:
-    """Return the traffic of every board on the bus, with that of its planner; `counts` as in `RunResult.tasks`."""
+def bus_traffic(
+    counts: Mapping[str, Mapping[str, int]], ticks: int, layout: Layout
+) -> dict[str, BusTraffic]:
+    """Return the traffic of every board on the bus, with that of its planner; `counts` as in
+    `RunResult.tasks`."""
     lasted_s = ticks * layout.clock_ns * 1e-9
     found: dict[str, BusTraffic] = {}
     for task in layout.tasks:
@@ -63,7 +69,9 @@ def bus_traffic(counts: Mapping[str, Mapping[str, int]], ticks: int, layout: Lay
     return found
 
 
-def board_loads(recording: Recording, cycles: Mapping[str, Cycles], timing: RackTiming) -> dict[str, float]:
+def board_loads(
+    recording: Recording, cycles: Mapping[str, Cycles], timing: RackTiming
+) -> dict[str, float]:
     """Return the part of a core's time that every board used, with its planner."""
     found: dict[str, float] = {}
     for name, load in task_loads(recording, cycles, timing).items():
@@ -73,14 +81,17 @@ def board_loads(recording: Recording, cycles: Mapping[str, Cycles], timing: Rack
 
 
 def plan_latencies(recording: Recording, cycles: Mapping[str, Cycles]) -> tuple[PlanLatency, ...]:
-    """Return the latencies of every planner that made plans, and of every host board whose orders entered."""
+    """Return the latencies of every planner that made plans, and of every host board whose orders
+    entered."""
     tasks = [task for task in recording.layout.tasks if task.role == "planner"]
     found = [_of_planner(recording, task, cycles.get(task.name)) for task in tasks]
     found += _of_hosts(recording)
     return tuple(one for one in found if one is not None)
 
 
-def _of_planner(recording: Recording, planner: TaskSpec, cycles: Cycles | None) -> PlanLatency | None:
+def _of_planner(
+    recording: Recording, planner: TaskSpec, cycles: Cycles | None
+) -> PlanLatency | None:
     box = f"{planner.board}.plan"
     if cycles is None or box not in recording.mailboxes:
         return None
@@ -90,11 +101,16 @@ def _of_planner(recording: Recording, planner: TaskSpec, cycles: Cycles | None) 
     made, first = np.unique(made, return_index=True)
     latency_ms = distribution((visible_at[first] - made) * recording.layout.clock_ns * 1e-6)
     computed_ms = distribution(cycles.used_ns * 1e-6)
-    return None if latency_ms is None else PlanLatency(planner.name, len(made), latency_ms, computed_ms)
+    return (
+        None
+        if latency_ms is None
+        else PlanLatency(planner.name, len(made), latency_ms, computed_ms)
+    )
 
 
 def _of_hosts(recording: Recording) -> Iterator[PlanLatency]:
-    """Yield the time that orders of host boards took through a bridge: in its ring, then until levels see them."""
+    """Yield the time that orders of host boards took through a bridge: in its ring, then until
+    levels see them."""
     layout = recording.layout
     tick_ms = recording.layout.clock_ns * 1e-6
     hosts = {host.name for host in layout.hosts}
@@ -110,11 +126,14 @@ def _of_hosts(recording: Recording) -> Iterator[PlanLatency]:
 
 
 def ages_ms(recording: Recording, timing: RackTiming, down: bool) -> Distribution | None:
-    """Return the age of commands in the cycles of the lowest levels, or of their statuses in those above, ms.
+    """Return the age of commands in the cycles of the lowest levels, or of their statuses in those
+    above, ms.
 
     An age is the time since the release that wrote the message. None if there is no such message.
     """
-    pairs = dict.fromkeys(chain[-2:] if down else chain[:-3:-1] for chain in timing.hierarchy.chains)
+    pairs = dict.fromkeys(
+        chain[-2:] if down else chain[:-3:-1] for chain in timing.hierarchy.chains
+    )
     found = [ages for writer, reader in pairs for ages in _ages(recording, writer, reader)]
     return distribution(np.concatenate(found) * timing.clock_ns * 1e-6) if found else None
 

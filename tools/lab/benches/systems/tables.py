@@ -26,7 +26,8 @@ NO_ARM = "no PUMA"
 
 @dataclass(frozen=True)
 class Systems:
-    """The figures of every rack; `seconds` is the length of a run, `absent` the peer that this machine lacks."""
+    """The figures of every rack; `seconds` is the length of a run, `absent` the peer that this
+    machine lacks."""
 
     figures: tuple[SystemFigures, ...]
     seconds: float
@@ -78,12 +79,17 @@ def lines_of(found: Systems, width: int | None) -> Iterator[str]:
 
 
 def _made_of(figures: Sequence[SystemFigures], width: int | None) -> Iterator[str]:
-    yield "by the configs: levels of the longest chain and their rates, cores and their predicted loads"
+    yield (
+        "by the configs: levels of the longest chain and their rates, cores and their predicted"
+        " loads"
+    )
     head = ["rack", "levels", "boards", "hosts", "processes", "cores", "rates, Hz", "loads", "fits"]
     rows = []
     for one in figures:
         said = one.predicted
-        counts = map(str, (len(said.levels) or "-", said.boards, said.hosts, said.processes, len(said.loads)))
+        counts = map(
+            str, (len(said.levels) or "-", said.boards, said.hosts, said.processes, len(said.loads))
+        )
         rates = " ".join(f"{rate:.4g}" for rate in said.rates_hz) or "-"
         fits = {True: "yes", False: "NO", None: "-"}[said.fits]
         rows.append([one.rack, *counts, rates, _loads(said.loads), fits])
@@ -94,7 +100,10 @@ def _made_of(figures: Sequence[SystemFigures], width: int | None) -> Iterator[st
 
 def _answered(found: Systems, width: int | None) -> Iterator[str]:
     yield ""
-    yield "response R_s from the release of the highest level, and ages of messages, ms: predicted from the cycles"
+    yield (
+        "response R_s from the release of the highest level, and ages of messages, ms: predicted"
+        " from the cycles"
+    )
     yield f"alone, and measured in {found.seconds:g} s of real time, median/longest"
     head = ["rack", "R_max", "bound, eq. 3.2", "sum, eq. 3.3", "down", "measured", "up", "measured"]
     head += ["command age", "status age"]
@@ -102,18 +111,43 @@ def _answered(found: Systems, width: int | None) -> Iterator[str]:
     for one in found.figures:
         said = one.predicted
         ran = one.realtime
-        promised = (said.longest_cycle_ms, said.bound_ms, said.sum_ms, ran.command_bound_ms, said.status_ms)
-        *cycles, down, up = ("-" if time is None or not said.levels else f"{time:g}" for time in promised)
+        promised = (
+            said.longest_cycle_ms,
+            said.bound_ms,
+            said.sum_ms,
+            ran.command_bound_ms,
+            said.status_ms,
+        )
+        *cycles, down, up = (
+            "-" if time is None or not said.levels else f"{time:g}" for time in promised
+        )
         measured = (down, _span(ran.command_ms), up, _span(ran.status_ms))
-        rows.append([one.rack, *cycles, *measured, _span(ran.command_age_ms), _span(ran.status_age_ms)])
+        rows.append(
+            [one.rack, *cycles, *measured, _span(ran.command_age_ms), _span(ran.status_age_ms)]
+        )
     yield from table(head, rows, width, NARROW)
 
 
 def _stopped(found: Systems, width: int | None) -> Iterator[str]:
     yield ""
-    yield "operator's stop, ms: in real time from a hold to the torque that rests on it, next to the longest on the"
-    yield "grid; in the same motion, at full speed, from a hold and from an emergency stop until the arm rests"
-    head = ["rack", "hold at", "torque", "longest", "in motion at", "speed, rad/s", "rest", "emergency stop, rest"]
+    yield (
+        "operator's stop, ms: in real time from a hold to the torque that rests on it, next to the"
+        " longest on the"
+    )
+    yield (
+        "grid; in the same motion, at full speed, from a hold and from an emergency stop until the"
+        " arm rests"
+    )
+    head = [
+        "rack",
+        "hold at",
+        "torque",
+        "longest",
+        "in motion at",
+        "speed, rad/s",
+        "rest",
+        "emergency stop, rest",
+    ]
     rows = []
     for one in found.figures:
         hold = one.realtime.hold
@@ -126,18 +160,41 @@ def _stopped(found: Systems, width: int | None) -> Iterator[str]:
             rows.append([*row, NO_ARM, *["-"] * 3])
         else:
             level = "-" if run.hold is None else run.hold.by
-            rows.append([*row, level, decimal(run.emergency.speed, 2), _rests(run.hold), _rests(run.emergency)])
+            rows.append(
+                [
+                    *row,
+                    level,
+                    decimal(run.emergency.speed, 2),
+                    _rests(run.hold),
+                    _rests(run.emergency),
+                ]
+            )
     yield from table(head, rows, width)
 
 
 def _planned(figures: Sequence[SystemFigures], width: int | None) -> Iterator[str]:
     yield ""
-    yield "plans, ms: from a planner's release until its plan is visible, or from a host's order until levels see it"
-    head = ["rack", "planner or host", "plans", "latency p50", "longest", "computing p50", "longest"]
+    yield (
+        "plans, ms: from a planner's release until its plan is visible, or from a host's order"
+        " until levels see it"
+    )
+    head = [
+        "rack",
+        "planner or host",
+        "plans",
+        "latency p50",
+        "longest",
+        "computing p50",
+        "longest",
+    ]
     rows = [
         [
             *(one.rack, plan.maker, str(plan.made)),
-            *(figure(times, key, 1) for times in (plan.latency_ms, plan.computed_ms) for key in ("p50", "max")),
+            *(
+                figure(times, key, 1)
+                for times in (plan.latency_ms, plan.computed_ms)
+                for key in ("p50", "max")
+            ),
         ]
         for one in figures
         for plan in one.realtime.plans
@@ -149,15 +206,38 @@ def _planned(figures: Sequence[SystemFigures], width: int | None) -> Iterator[st
 
 def _used(found: Systems, width: int | None) -> Iterator[str]:
     yield ""
-    yield "the bus, accesses and bytes a second, and processor time in parts of a core, without host boards"
-    head = ["rack", "accesses/s", "kB/s", "busiest", "accesses/s", "kB/s", "cores used", "by core", "most", "share"]
+    yield (
+        "the bus, accesses and bytes a second, and processor time in parts of a core, without host"
+        " boards"
+    )
+    head = [
+        "rack",
+        "accesses/s",
+        "kB/s",
+        "busiest",
+        "accesses/s",
+        "kB/s",
+        "cores used",
+        "by core",
+        "most",
+        "share",
+    ]
     rows = []
     for one in found.figures:
         ran = one.realtime
         name, most = max(ran.bus.items(), key=lambda each: each[1].accesses)
         heavy, share = max(ran.board_loads.items(), key=lambda each: each[1], default=("-", 0.0))
-        accesses, size = (sum(getattr(each, field) for each in ran.bus.values()) for field in ("accesses", "bytes"))
-        bus = (f"{accesses:.0f}", f"{size / 1e3:.0f}", name, f"{most.accesses:.0f}", f"{most.bytes / 1e3:.0f}")
+        accesses, size = (
+            sum(getattr(each, field) for each in ran.bus.values())
+            for field in ("accesses", "bytes")
+        )
+        bus = (
+            f"{accesses:.0f}",
+            f"{size / 1e3:.0f}",
+            name,
+            f"{most.accesses:.0f}",
+            f"{most.bytes / 1e3:.0f}",
+        )
         used = (decimal(sum(ran.loads.values()), 2), _loads(ran.loads), heavy, decimal(share, 2))
         rows.append([one.rack, *bus, *used])
     yield from table(head, rows, width)
@@ -165,7 +245,10 @@ def _used(found: Systems, width: int | None) -> Iterator[str]:
 
 def _late(found: Systems, width: int | None) -> Iterator[str]:
     yield ""
-    yield "cycles of the fastest boards missed, next to wakes that cyclictest made a cycle late on the same cores, %"
+    yield (
+        "cycles of the fastest boards missed, next to wakes that cyclictest made a cycle late on"
+        " the same cores, %"
+    )
     head = ["rack", "fastest, Hz", "missed", "cyclictest", "beyond"]
     rows = []
     for one in found.figures:
@@ -179,9 +262,23 @@ def _late(found: Systems, width: int | None) -> Iterator[str]:
 
 def _killed(figures: Sequence[SystemFigures], width: int | None) -> Iterator[str]:
     yield ""
-    yield "each process killed once, in lockstep: ticks until the Rack knew, and until a board that reads its messages"
+    yield (
+        "each process killed once, in lockstep: ticks until the Rack knew, and until a board that"
+        " reads its messages"
+    )
     yield "found them stale; unnoticed are those that were back before"
-    head = ["rack", "lockstep", "killed", "Rack", "neighbour", "ms", "first", "found by", "last", "found by"]
+    head = [
+        "rack",
+        "lockstep",
+        "killed",
+        "Rack",
+        "neighbour",
+        "ms",
+        "first",
+        "found by",
+        "last",
+        "found by",
+    ]
     head += ["unnoticed"]
     rows = [_kill_row(one.rack, one.kills) for one in figures]
     yield from table(head, rows, width)
@@ -200,7 +297,11 @@ def _kill_row(rack: str, kills: KilledBoards) -> list[str]:
     ends = [(seen[at].board, seen[at].by) for at in (0, -1)] if seen else [("-", "-")] * 2
     return [
         *(rack, f"{shown(kills.speed)}x", str(len(kills.detections))),
-        *(_between([kill.rack for kill in kills.detections]), _between([kill.neighbour for kill in seen]), _ends(ms)),
+        *(
+            _between([kill.rack for kill in kills.detections]),
+            _between([kill.neighbour for kill in seen]),
+            _ends(ms),
+        ),
         *(name for pair in ends for name in pair),
         str(len(kills.detections) - len(seen)),
     ]
@@ -208,7 +309,10 @@ def _kill_row(rack: str, kills: KilledBoards) -> list[str]:
 
 def _moved(figures: Sequence[SystemFigures], width: int | None) -> Iterator[str]:
     yield ""
-    yield "the same motion, PUMA 560, three poses from home, at rest in each: time from the first motion to rest in the"
+    yield (
+        "the same motion, PUMA 560, three poses from home, at rest in each: time from the first"
+        " motion to rest in the"
+    )
     yield "last pose, errors of the joints while they move, and the farthest of the tool"
     head = ["rack", "begins, s", "lasts, s", "rms, mrad", "peak, mrad", "tool, mm", "poses reached"]
     rows = []
@@ -254,7 +358,11 @@ def _span(times: Distribution | None) -> str:
 def _between(ticks: Sequence[int | None]) -> str:
     """Return the least and the greatest of ticks; "-" where one is unknown."""
     known = [str(each) for each in sorted(each for each in ticks if each is not None)]
-    return _ends(known) if len(known) == len(ticks) else f"{_ends(known)}, {len(ticks) - len(known)} never"
+    return (
+        _ends(known)
+        if len(known) == len(ticks)
+        else f"{_ends(known)}, {len(ticks) - len(known)} never"
+    )
 
 
 def _ends(texts: Sequence[str]) -> str:

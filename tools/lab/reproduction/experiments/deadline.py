@@ -1,4 +1,5 @@
-"""GOTO A, and GOTO A BY t: the same motion in soft time, by a time that is too early, and by one that can be met."""
+"""GOTO A, and GOTO A BY t: the same motion in soft time, by a time that is too early, and by one
+that can be met."""
 
 from __future__ import annotations
 
@@ -22,7 +23,10 @@ def _run(workshop: Workshop) -> Document:
     soft = _outcome(workshop, "goto", place, None)
     early = _outcome(workshop, "goto-too-early", place, round(TOO_EARLY * soft["done_s"], 2))
     if early["earliest_s"] is None:
-        raise Failure(f"goto by {early['by_s']:g} s was not refused; without a time it is done at {soft['done_s']:g} s")
+        raise Failure(
+            f"goto by {early['by_s']:g} s was not refused; without a time it is done at"
+            f" {soft['done_s']:g} s"
+        )
     met = _outcome(workshop, "goto-by", place, ceil(early["earliest_s"] * 10) / 10)
     return {"place": place, "runs": [soft, early, met]}
 
@@ -61,7 +65,8 @@ def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | N
 
 
 def _done_s(recording: Recording) -> float | None:
-    """Return the end of the cycle in which the task level reported A done, s; None: it never did."""
+    """Return the end of the cycle in which the task level reported A done, s; None: it never
+    did."""
     done, ticks = (recording.signal("task.status", name) for name in ("action", "visible_at"))
     reported = ticks[done >= 1]
     return float(reported[0]) * recording.layout.clock_ns * 1e-9 if len(reported) else None

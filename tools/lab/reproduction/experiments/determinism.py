@@ -42,7 +42,8 @@ def _recorded(workshop: Workshop, label: str, mode: str) -> Recording:
 
 
 def _outcome(recording: Recording, reference: Recording | None) -> Document:
-    """Return how a run ended, its first missed deadline, and where it diverges from the reference."""
+    """Return how a run ended, its first missed deadline, and where it diverges from the
+    reference."""
     ended = recording.ended
     config = recording.rack_config
     found = misses(recording)

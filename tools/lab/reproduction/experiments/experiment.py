@@ -1,8 +1,9 @@
 """Experiments, and the folder that keeps what they found.
 
-What an experiment found is kept as JSON with all that it depends on: its configs, its own settings, the program and the
-machine. It is made again only if one of these has changed, a picture is gone, or it was not finished: a file appears
-whole or not at all, so even a killed command continues where it was.
+What an experiment found is kept as JSON with all that it depends on: its configs, its own settings,
+the program and the machine. It is made again only if one of these has changed, a picture is gone,
+or it was not finished: a file appears whole or not at all, so even a killed command continues where
+it was.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ Document = dict[str, Any]
 
 
 class Lacking(Failure):
-    """The machine lacks what an experiment needs: its claims cannot be tested here, which is no failure."""
+    """The machine lacks what an experiment needs: its claims cannot be tested here, which is no
+    failure."""
 
 
 class Workshop:
-    """Where experiments work: the folder of the page. `share`: run on cores that another rack holds."""
+    """Where experiments work: the folder of the page. `share`: run on cores that another rack
+    holds."""
 
     def __init__(self, folder: Path, share: bool) -> None:
         self.folder = folder
@@ -72,12 +75,15 @@ class Workshop:
                 with suppress(SegmentError):
                     remove_dead(rack)
 
-    def config(self, name: str, settings: Sequence[str] = (), faults: str | None = None) -> RackConfig:
+    def config(
+        self, name: str, settings: Sequence[str] = (), faults: str | None = None
+    ) -> RackConfig:
         """Return a config under a name of its own. Raises `ConfigError`."""
         return load(name, [*settings, f"name={self.rack}"], faults)
 
     def run(self, label: str, config: RackConfig, seconds: float | None) -> Recording:
-        """Run a rack and return its recording, which stays in the folder; one of an unfinished run is replaced."""
+        """Run a rack and return its recording, which stays in the folder; one of an unfinished run
+        is replaced."""
         folder = self.folder / RUNS / label
         shutil.rmtree(folder, ignore_errors=True)
         return record(config, seconds, folder, self.share).recording
@@ -87,7 +93,8 @@ class Workshop:
         return self.folder / PICTURES / name
 
     def shown(self, paths: Sequence[Path]) -> str:
-        """Return a picture that was drawn, by its path within the folder; the page shows SVG, and needs no other."""
+        """Return a picture that was drawn, by its path within the folder; the page shows SVG, and
+        needs no other."""
         for path in paths:
             if path.suffix != ".svg":
                 path.unlink()
@@ -98,8 +105,8 @@ class Workshop:
 class Experiment:
     """A measurement: `make` returns what it found as plain data, after about `seconds`.
 
-    `inputs` returns what it rests on besides program and machine. The names of its pictures, within the folder, are in
-    the result under "pictures". `make` raises `Lacking` and `Failure`.
+    `inputs` returns what it rests on besides program and machine. The names of its pictures, within
+    the folder, are in the result under "pictures". `make` raises `Lacking` and `Failure`.
     """
 
     name: str
@@ -115,7 +122,8 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Kept:
-    """A result that is kept: what was found, when, in which time; or why nothing can be found on this machine."""
+    """A result that is kept: what was found, when, in which time; or why nothing can be found on
+    this machine."""
 
     found: Document
     took_s: float
@@ -126,8 +134,12 @@ class Kept:
 def kept(experiment: Experiment, folder: Path) -> Kept | None:
     """Return the result of an experiment if it is still right; None if it must be made."""
     try:
-        document = json.loads((folder / KEPT / f"{experiment.name}.json").read_text(encoding="utf-8"))
-        found = Kept(document["found"], document["took_s"], document["made_at"], document["lacking"])
+        document = json.loads(
+            (folder / KEPT / f"{experiment.name}.json").read_text(encoding="utf-8")
+        )
+        found = Kept(
+            document["found"], document["took_s"], document["made_at"], document["lacking"]
+        )
         pictures = found.found.get("pictures", {})
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
@@ -149,10 +161,14 @@ def made(experiment: Experiment, workshop: Workshop) -> Kept:
     if INTERRUPT.number:
         # A signal ends a run in order, but before its time.
         INTERRUPT.end()
-    result = Kept(found, round(time.monotonic() - started, 1), time.strftime("%Y-%m-%d %H:%M:%S"), lacking)
+    result = Kept(
+        found, round(time.monotonic() - started, 1), time.strftime("%Y-%m-%d %H:%M:%S"), lacking
+    )
     path = workshop.folder / KEPT / f"{experiment.name}.json"
     part = path.with_suffix(".part")
-    part.write_text(json.dumps({"depends": depends, **vars(result)}, indent=1) + "\n", encoding="utf-8")
+    part.write_text(
+        json.dumps({"depends": depends, **vars(result)}, indent=1) + "\n", encoding="utf-8"
+    )
     part.replace(path)
     return result
 
@@ -161,7 +177,10 @@ def made(experiment: Experiment, workshop: Workshop) -> Kept:
 def machine() -> Document:
     """Return what the figures depend on in this machine."""
     cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    model = next((line.partition(":")[2].strip() for line in cpu if line.startswith("model name")), platform.machine())
+    model = next(
+        (line.partition(":")[2].strip() for line in cpu if line.startswith("model name")),
+        platform.machine(),
+    )
     return {
         "processor": model,
         "cores": len(os.sched_getaffinity(0)),
@@ -175,7 +194,10 @@ def machine() -> Document:
 def need_real_time(cores: int = 1) -> None:
     """Raise `Lacking` on a machine without real-time priorities, or without so many cores."""
     if not permits_fifo():
-        why = "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot preempt its planner"
+        why = (
+            "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot"
+            " preempt its planner"
+        )
         raise Lacking(why)
     if (there := len(os.sched_getaffinity(0))) < cores:
         raise Lacking(f"it needs {cores} processors; this machine has {there}")

@@ -9,7 +9,12 @@ from typing import Any
 
 from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.levels.timing.forecast import Forecast
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop, need_real_time
+from rack.tools.lab.reproduction.experiments.experiment import (
+    Document,
+    Experiment,
+    Workshop,
+    need_real_time,
+)
 from rack.tools.recording.history import steal
 from rack.tools.timing.charts.letters import column_for, lines
 from rack.tools.timing.charts.measured import TracedRun
@@ -30,7 +35,8 @@ MS = 1e-6
 
 @dataclass(frozen=True)
 class FigureRack:
-    """A figure of the paper: its config, drawn over so many cycles, with another X, ms, if given."""
+    """A figure of the paper: its config, drawn over so many cycles, with another X, ms, if
+    given."""
 
     config: str
     cycles: int
@@ -62,7 +68,12 @@ class FigureRack:
         return Experiment(self.label, about, SECONDS + LAUNCH_S, self._inputs, partial(_run, self))
 
     def _inputs(self) -> Any:
-        return {"config": self.loaded().text(), "seconds": SECONDS, "cycles": self.cycles, "attempts": ATTEMPTS}
+        return {
+            "config": self.loaded().text(),
+            "seconds": SECONDS,
+            "cycles": self.cycles,
+            "attempts": ATTEMPTS,
+        }
 
     def panel(self) -> Panel:
         """Return the schedule that follows from its budget, from the first cycle on."""
@@ -91,7 +102,10 @@ def _run(figure: FigureRack, workshop: Workshop) -> Document:
     drawn = save([panel], f"{figure.label}: a run", workshop.picture(f"{figure.label}-run"))
     return {
         "tasks": {name: asdict(count) for name, count in panel.counts.items()},
-        "patterns": {lane: [one.most_common(COMMON) for one in counts] for lane, counts in panel.patterns.items()},
+        "patterns": {
+            lane: [one.most_common(COMMON) for one in counts]
+            for lane, counts in panel.patterns.items()
+        },
         "letters": list(lines(panel, column_ns(config, window_ns))),
         "steal": steal(run.recording)["percent"],
         "pictures": {"measured": workshop.shown(drawn)},
@@ -99,7 +113,8 @@ def _run(figure: FigureRack, workshop: Workshop) -> Document:
 
 
 def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
-    """Return the run in which the fewest of the executor's cycles were late: other programs take cores away.
+    """Return the run in which the fewest of the executor's cycles were late: other programs take
+    cores away.
 
     An executor that is late by its own schedule runs once.
     """
@@ -107,7 +122,9 @@ def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
     is_late = bool(figure.panel().chart.late(LEVEL))
     for attempt in range(1, ATTEMPTS + 1):
         label = f"{figure.label}-{attempt}"
-        run = TracedRun(workshop.run(label, workshop.config(figure.config, figure.settings), SECONDS))
+        run = TracedRun(
+            workshop.run(label, workshop.config(figure.config, figure.settings), SECONDS)
+        )
         late = len(run.chart(0, run.end_ns).late(LEVEL))
         tried.append((late, run))
         if is_late or not late:
@@ -119,11 +136,12 @@ def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
 class Planning:
     """A figure with one X, ms, and the time that its planner has.
 
-    `each_ms` is left for P in every cycle if U too is in every cycle, as the pattern "RXWPU" reads; `cycles_each` are
-    the cycles until P is done that way, None if it never is. `once_ms` is left for P and U together, U once a plan;
-    `cycles_once` are those cycles. `permitted` are the cycles that a plan may take. `failing` names the equations that
-    fail. `idle_ms` is left of an executor's cycle. `pattern` is the schedule's over the cycles of a plan, and `in_time`
-    says whether all its cycles and plans are in time.
+    `each_ms` is left for P in every cycle if U too is in every cycle, as the pattern "RXWPU" reads;
+    `cycles_each` are the cycles until P is done that way, None if it never is. `once_ms` is left
+    for P and U together, U once a plan; `cycles_once` are those cycles. `permitted` are the cycles
+    that a plan may take. `failing` names the equations that fail. `idle_ms` is left of an
+    executor's cycle. `pattern` is the schedule's over the cycles of a plan, and `in_time` says
+    whether all its cycles and plans are in time.
     """
 
     process_ms: float
@@ -164,7 +182,8 @@ def planning(name: str, process_ms: float) -> Planning:
 
 
 def _cycles(work_ns: int, left_ns: int) -> int | None:
-    """Return the cycles in which work is done, with so much time left for it in each; None: it never is."""
+    """Return the cycles in which work is done, with so much time left for it in each; None: it
+    never is."""
     return -(-work_ns // left_ns) if left_ns > 0 else None
 
 

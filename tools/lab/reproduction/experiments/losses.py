@@ -1,4 +1,5 @@
-"""Boards that die and sensors that fail, by scripts of faults: how many ticks until each is detected, and what then."""
+"""Boards that die and sensors that fail, by scripts of faults: how many ticks until each is
+detected, and what then."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Measurements that `rack bench` makes too: context switch, pipeline, response to an operator, partitions."""
+"""Measurements that `rack bench` makes too: context switch, pipeline, response to an operator,
+partitions."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from rack.tools.lab.benches.observed import observe
 from rack.tools.lab.benches.partition import PARTITIONS, compare
 from rack.tools.lab.benches.response import ResponseRuns
 from rack.tools.lab.benches.switch import PERIOD_S, WAKES, measure
-from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Document, Experiment, Workshop, need_real_time
+from rack.tools.lab.reproduction.experiments.experiment import (
+    PICTURES,
+    Document,
+    Experiment,
+    Workshop,
+    need_real_time,
+)
 
 LEVELS = 5
 """Levels of the pipeline: "it would take 5 control cycles"."""
@@ -33,7 +40,9 @@ def _switch(workshop: Workshop) -> Document:
     return asdict(measure())
 
 
-SWITCH = Experiment("switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, lambda: {"wakes": WAKES}, _switch)
+SWITCH = Experiment(
+    "switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, lambda: {"wakes": WAKES}, _switch
+)
 
 
 def _pipeline(workshop: Workshop) -> Document:
@@ -44,7 +53,12 @@ def _pipeline(workshop: Workshop) -> Document:
         config = loads(chain.text()).model_copy(update={"name": workshop.rack})
         run = observe(config, PIPELINE_S, workshop.share, [last])
         found[mode] = responses_of([run.messages[last]])
-    return {"levels": LEVELS, "rate_hz": RATE_HZ, "predicted": response_ticks([1] * LEVELS), "cycles": found}
+    return {
+        "levels": LEVELS,
+        "rate_hz": RATE_HZ,
+        "predicted": response_ticks([1] * LEVELS),
+        "cycles": found,
+    }
 
 
 PIPELINE = Experiment(
@@ -73,7 +87,10 @@ RESPONSE = Experiment(
 
 def _partition(workshop: Workshop) -> Document:
     need_real_time(cores=2)
-    return {"seconds": PARTITION_S, "partitions": [asdict(one) for one in compare(NAME, PARTITION_S, 1, Progress())]}
+    return {
+        "seconds": PARTITION_S,
+        "partitions": [asdict(one) for one in compare(NAME, PARTITION_S, 1, Progress())],
+    }
 
 
 PARTITION = Experiment(

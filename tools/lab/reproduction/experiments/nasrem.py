@@ -9,7 +9,12 @@ import numpy as np
 
 from rack.boards.config import load
 from rack.levels.timing.trace_times import distribution
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop, need_real_time
+from rack.tools.lab.reproduction.experiments.experiment import (
+    Document,
+    Experiment,
+    Workshop,
+    need_real_time,
+)
 from rack.tools.recording.cycles import Cycles
 from rack.tools.recording.history import counted, misses, steal
 from rack.tools.recording.recording import Recording
@@ -43,23 +48,36 @@ def _run(workshop: Workshop) -> Document:
         "steal": steal(recording)["percent"],
         "pairs": _pairs(analysis),
         "breaches": _breaches(analysis),
-        "tasks": {name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()},
+        "tasks": {
+            name: task_document(cycles, analysis.predicted)
+            for name, cycles in analysis.cycles.items()
+        },
         "phases": {n: _phases(c) for n, c in analysis.cycles.items() if c.task.role == "executor"},
         "loads": {str(core): load for core, load in analysis.loads.items()},
         "response": analysis.response,
         "mailboxes": [_mailbox(recording, name) for name in recording.mailboxes],
         "bus": {
-            n: {k: c[k] for k in ("reads", "read_bytes", "writes", "write_bytes")} for n, c in ended["tasks"].items()
+            n: {k: c[k] for k in ("reads", "read_bytes", "writes", "write_bytes")}
+            for n, c in ended["tasks"].items()
         },
-        "pictures": {"residuals": workshop.shown([stem.with_suffix(".png"), stem.with_suffix(".svg")])},
+        "pictures": {
+            "residuals": workshop.shown([stem.with_suffix(".png"), stem.with_suffix(".svg")])
+        },
     }
 
 
-NASREM = Experiment(NAME, "nasrem in real time, its whole task", LASTS_S, lambda: {"config": load(NAME).text()}, _run)
+NASREM = Experiment(
+    NAME,
+    "nasrem in real time, its whole task",
+    LASTS_S,
+    lambda: {"config": load(NAME).text()},
+    _run,
+)
 
 
 def _pairs(analysis: Analysis) -> list[Document]:
-    """Return every equation on every subject: predicted, measured in the worst cycle, and in most."""
+    """Return every equation on every subject: predicted, measured in the worst cycle, and in
+    most."""
     mostly = {_key(pair): pair for pair in analysis.mostly}
     return [
         {
@@ -80,7 +98,9 @@ def _key(pair: Pair) -> tuple[str, str, str]:
 
 def _breaches(analysis: Analysis) -> dict[str, int]:
     """Return how many cycles broke each equation by their own numbers."""
-    broken = chain(*({one.equation for one in breach.broken} for breach in analysis.judged_breaches))
+    broken = chain(
+        *({one.equation for one in breach.broken} for breach in analysis.judged_breaches)
+    )
     found = list(broken)
     return {equation: found.count(equation) for equation in sorted(set(found))}
 

@@ -39,7 +39,9 @@ def _run(name: str, workshop: Workshop) -> Document:
 def systems_of(found: Iterable[Document]) -> Systems:
     """Return what was measured of several racks, as one comparison."""
     each = [TypeAdapter(Systems).validate_python(one) for one in found]
-    return Systems(tuple(figures for one in each for figures in one.figures), SECONDS, each[0].absent)
+    return Systems(
+        tuple(figures for one in each for figures in one.figures), SECONDS, each[0].absent
+    )
 
 
 SYSTEMS = tuple(system_experiment(name) for name in systems())

@@ -15,7 +15,10 @@ LASTS_S = 20.0
 
 
 def _run(workshop: Workshop) -> Document:
-    return {"disturbed": _task(workshop, NAME, ()), "undisturbed": _task(workshop, f"{NAME}-undisturbed", UNDISTURBED)}
+    return {
+        "disturbed": _task(workshop, NAME, ()),
+        "undisturbed": _task(workshop, f"{NAME}-undisturbed", UNDISTURBED),
+    }
 
 
 TABLES = Experiment(

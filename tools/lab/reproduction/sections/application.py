@@ -12,7 +12,15 @@ from rack.tools.lab.reproduction.experiments.measured import PARTITION, SWITCH
 from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
 from rack.tools.lab.reproduction.experiments.tables import TABLES
 from rack.tools.lab.reproduction.sections.equations import forecast_of
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Plate, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Columns,
+    Plate,
+    Ruling,
+    Side,
+    code,
+    text,
+)
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 from rack.tools.timing.charts import figure5
 
@@ -38,9 +46,10 @@ def _earlier(workshop: Workshop) -> Side:
     planners = [name for name, board in config.board.items() if board.planner]
     return Side.of(
         Columns(("level", "cycle", "its state tables", "planner"), rows),
-        f"The levels with state tables have {same} cycle. Levels with a planner: {', '.join(planners) or 'none'}; "
-        "plans are poses and places in the tables. We run the task twice in lockstep: with what moves in the cell, a "
-        "pusher that shoves a block along while the arm reaches for it, and without.",
+        f"The levels with state tables have {same} cycle. Levels with a planner:"
+        f" {', '.join(planners) or 'none'}; plans are poses and places in the tables. We run the"
+        " task twice in lockstep: with what moves in the cell, a pusher that shoves a block along"
+        " while the arm reaches for it, and without.",
     )
 
 
@@ -54,23 +63,35 @@ def _earlier_tested(findings: Findings) -> Assessment:
     disturbed, calm = (findings[TABLES.name][key] for key in ("disturbed", "undisturbed"))
     usual = {(level, row["name"]) for level, rows in calm["rows"].items() for row in rows}
     extra = [
-        (level, row) for level, rows in disturbed["rows"].items() for row in rows if (level, row["name"]) not in usual
+        (level, row)
+        for level, rows in disturbed["rows"].items()
+        for row in rows
+        if (level, row["name"]) not in usual
     ]
-    fired = [(level, text(row["name"]), str(row["cycles"]), f"{row['first_s']:g}") for level, row in extra]
+    fired = [
+        (level, text(row["name"]), str(row["cycles"]), f"{row['first_s']:g}")
+        for level, row in extra
+    ]
     counts = [
-        (level, str(len(rows)), str(sum(row["cycles"] for row in rows))) for level, rows in disturbed["rows"].items()
+        (level, str(len(rows)), str(sum(row["cycles"] for row in rows)))
+        for level, rows in disturbed["rows"].items()
     ]
     side = Side.of(
         Columns(("level", "rows that fired", "cycles"), counts),
         Columns(
-            ("level", "row", "cycles", "first at, s"), fired, "Rows that fired only in the run with the disturbance."
+            ("level", "row", "cycles", "first at, s"),
+            fired,
+            "Rows that fired only in the run with the disturbance.",
         ),
     )
     if not (disturbed["outcome"]["worked"] and calm["outcome"]["worked"]):
         return Assessment(side, Ruling.FAILS, "A task was not done.")
     if not extra:
         return Assessment(side, Ruling.FAILS, "No state transition answered the disturbance.")
-    why = "The task is done with the disturbance and without; transitions of its own answered the disturbance."
+    why = (
+        "The task is done with the disturbance and without; transitions of its own answered the"
+        " disturbance."
+    )
     return Assessment(side, Ruling.HOLDS, why)
 
 
@@ -83,12 +104,20 @@ def _levels(workshop: Workshop) -> Side:
             str(board.core),
             str(board.priority),
             {"tight": "tightly", "loose": "loosely", "none": "-"}[board.coupling],
-            "-" if board.planner is None else str(board.core if board.planner_core is None else board.planner_core),
+            (
+                "-"
+                if board.planner is None
+                else str(board.core if board.planner_core is None else board.planner_core)
+            ),
         )
         for name, board in config.board.items()
     ]
     head = ("level", "rate, Hz", "processor", "priority", "planner coupled", "planner's processor")
-    return Side.of(Columns(head, rows, f"From the config of {code(NAME)}. The planners have no real-time priority."))
+    return Side.of(
+        Columns(
+            head, rows, f"From the config of {code(NAME)}. The planners have no real-time priority."
+        )
+    )
 
 
 def _levels_tested(findings: Findings) -> Assessment:
@@ -108,7 +137,14 @@ def _levels_tested(findings: Findings) -> Assessment:
         lateness = task["lateness_ms"]
         late = [f"{1e3 * lateness[key]:.0f}" for key in ("p50", "p99")]
         rows.append(
-            (name, f"{nominal:g}", f"{measured:.2f}", *late, f"{task['largest_gap_ms']:.2f}", str(task["core"]))
+            (
+                name,
+                f"{nominal:g}",
+                f"{measured:.2f}",
+                *late,
+                f"{task['largest_gap_ms']:.2f}",
+                str(task["core"]),
+            )
         )
     head = (
         "level",
@@ -125,10 +161,14 @@ def _levels_tested(findings: Findings) -> Assessment:
     side = Side.of(Columns(head, rows), words)
     if not off:
         return Assessment(
-            side, Ruling.HOLDS, f"All rates are those of the paper and the config, within {100 * NOMINAL:g} %."
+            side,
+            Ruling.HOLDS,
+            f"All rates are those of the paper and the config, within {100 * NOMINAL:g} %.",
         )
     return Assessment(
-        side, Ruling.BOUNDED, f"More than {100 * NOMINAL:g} % below its rate: {', '.join(off)}; cycles were skipped."
+        side,
+        Ruling.BOUNDED,
+        f"More than {100 * NOMINAL:g} % below its rate: {', '.join(off)}; cycles were skipped.",
     )
 
 
@@ -138,13 +178,18 @@ def _switch(workshop: Workshop) -> Side:
     for settings in ((), (setting,)):
         config = load(NAME, settings)
         failing = ", ".join(
-            f"{verdict.equation} ({verdict.subject})" for verdict in forecast_of(config).verdicts if not verdict.holds
+            f"{verdict.equation} ({verdict.subject})"
+            for verdict in forecast_of(config).verdicts
+            if not verdict.holds
         )
         rows.append((f"{1e3 * config.timing.context_switch_ms:g}", text(failing) or "none"))
     head = ("t<sub>cs</sub>, us", f"what fails in {code(NAME)}")
     return Side.of(
         Columns(
-            head, rows, f"By the budgets of the config; the second row has the paper's task switch ({code(setting)})."
+            head,
+            rows,
+            "By the budgets of the config; the second row has the paper's task switch"
+            f" ({code(setting)}).",
         )
     )
 
@@ -157,17 +202,22 @@ def _switch_tested(findings: Findings) -> Assessment:
         "switch_us": "t<sub>cs</sub>, half of both",
     }
     rows = [
-        (name, *(f"{found[key][part]:.1f}" for part in ("min", "p50", "p99", "max"))) for key, name in names.items()
+        (name, *(f"{found[key][part]:.1f}" for part in ("min", "p50", "p99", "max")))
+        for key, name in names.items()
     ]
     side = Side.of(
-        Columns(("us", "least", "median", "99th percentile", "longest"), rows, f"Of {found['wakes']} switches.")
+        Columns(
+            ("us", "least", "median", "99th percentile", "longest"),
+            rows,
+            f"Of {found['wakes']} switches.",
+        )
     )
     median = found["switch_us"]["p50"]
     assumed = 1e3 * load(NAME).timing.context_switch_ms
     why = (
-        f"NIST's 68020 boards cannot be measured any more. On this machine a switch takes {median:.0f} us, "
-        f"{PAPER_US / median:.1f} times less than theirs; the 99th percentile, {found['switch_us']['p99']:.0f} us, "
-        f"compares with the {assumed:g} us of the config."
+        "NIST's 68020 boards cannot be measured any more. On this machine a switch takes"
+        f" {median:.0f} us, {PAPER_US / median:.1f} times less than theirs; the 99th percentile,"
+        f" {found['switch_us']['p99']:.0f} us, compares with the {assumed:g} us of the config."
     )
     return Assessment(side, Ruling.BOUNDED, why)
 
@@ -180,13 +230,20 @@ def _figure5(workshop: Workshop) -> Side:
         for one in figure5.placed(config)
     ]
     caption = f"The levels of {code(NAME)} among the paper's regions."
-    return Side.of(Plate(Path(path), caption), Columns(("level", "cycle", "the figure suggests", "planner here"), rows))
+    return Side.of(
+        Plate(Path(path), caption),
+        Columns(("level", "cycle", "the figure suggests", "planner here"), rows),
+    )
 
 
 def _figure5_tested(findings: Findings) -> Assessment:
     """Compare partitions: do slow levels do with multitasking, and do fast ones need more?"""
     found = findings[PARTITION.name]["partitions"]
-    slow = {one.level for one in figure5.placed(load(NAME)) if figure5.region_of(one.cycle_s).name == "multitasking"}
+    slow = {
+        one.level
+        for one in figure5.placed(load(NAME))
+        if figure5.region_of(one.cycle_s).name == "multitasking"
+    }
     rows = []
     missed = {kind: [0, 0] for kind in ("slow", "fast", "apart")}
     for partition in found:
@@ -208,27 +265,40 @@ def _figure5_tested(findings: Findings) -> Assessment:
         "late",
         "plan's age, ms, longest",
     )
-    words = f"Each partition ran {code(NAME)} for {findings[PARTITION.name]['seconds']:g} s in real time."
+    words = (
+        f"Each partition ran {code(NAME)} for {findings[PARTITION.name]['seconds']:g} s in real"
+        " time."
+    )
     side = Side.of(Columns(head, rows, words))
     shares = {region: bad / all_ if all_ else 0.0 for region, (bad, all_) in missed.items()}
     said = (
-        f"of the cycles and plans of levels from a quarter of a second up {100 * shares['slow']:.1f} % were missed; of "
-        f"those below, {100 * shares['fast']:.1f} % with planners on the same processor, and "
-        f"{100 * shares['apart']:.1f} % with planners on boards of their own."
+        "of the cycles and plans of levels from a quarter of a second up"
+        f" {100 * shares['slow']:.1f} % were missed; of those below, {100 * shares['fast']:.1f} %"
+        f" with planners on the same processor, and {100 * shares['apart']:.1f} % with planners on"
+        " boards of their own."
     )
     if shares["slow"] > FEW:
         return Assessment(side, Ruling.FAILS, f"Against the figure, {said}")
     if shares["fast"] <= shares["apart"] + FEW:
-        why = "As the figure says, slow levels do with multitasking. On this machine fast ones need no more either: "
+        why = (
+            "As the figure says, slow levels do with multitasking. On this machine fast ones need"
+            " no more either: "
+        )
         return Assessment(side, Ruling.BOUNDED, f"{why}{said}")
-    return Assessment(side, Ruling.HOLDS, f"Slow levels do with multitasking, fast ones do not: {said}")
+    return Assessment(
+        side, Ruling.HOLDS, f"Slow levels do with multitasking, fast ones do not: {said}"
+    )
 
 
 def _partition_row(partition: str, level: Document) -> tuple[str, ...]:
     executor = level["executor"]
     planner = level["planner"]
     age = level["plan_age_ms"]
-    fits = [task["fits"] for task in (executor, planner) if task is not None and task["fits"] is not None]
+    fits = [
+        task["fits"]
+        for task in (executor, planner)
+        if task is not None and task["fits"] is not None
+    ]
     return (
         partition,
         level["level"],
@@ -249,10 +319,13 @@ CHAPTER = Chapter(
         Statement(
             name="state-tables",
             title="The earlier controller: executors and state tables",
-            quote="The concurrent hierarchical model ... has been previously implemented with a purely executor style "
-            "of task decomposition. ... The flow of control featured state-table transitions. Where planning was "
-            "appropriate, static plan definitions were used. ... The system was sensory-interactive and adapted to "
-            "perturbations in the environment in real-time.",
+            quote=(
+                "The concurrent hierarchical model ... has been previously implemented with a"
+                " purely executor style of task decomposition. ... The flow of control featured"
+                " state-table transitions. Where planning was appropriate, static plan definitions"
+                " were used. ... The system was sensory-interactive and adapted to perturbations in"
+                " the environment in real-time."
+            ),
             experiments=(TABLES,),
             predicted=_earlier,
             tested=_earlier_tested,
@@ -260,10 +333,13 @@ CHAPTER = Chapter(
         Statement(
             name="nasrem",
             title="NASREM: four levels, 400 and 50 Hz",
-            quote="The concurrent hierarchy decomposes into these levels: task, elemental move, primitive, and servo. "
-            "... The executor [of the primitive level] runs at 50Hz and supplies new joint positions to the servo "
-            "level at each clock cycle. At the servo level, the robot receives torque commands at updates of 400 Hz. "
-            "... A system clock synchronizes software execution on all processor boards.",
+            quote=(
+                "The concurrent hierarchy decomposes into these levels: task, elemental move,"
+                " primitive, and servo. ... The executor [of the primitive level] runs at 50Hz and"
+                " supplies new joint positions to the servo level at each clock cycle. At the servo"
+                " level, the robot receives torque commands at updates of 400 Hz. ... A system"
+                " clock synchronizes software execution on all processor boards."
+            ),
             experiments=(NASREM,),
             predicted=_levels,
             tested=_levels_tested,
@@ -279,9 +355,12 @@ CHAPTER = Chapter(
         Statement(
             name="figure-5",
             title="Figure 5: concurrency by cycle time",
-            quote="Figure 5 provides a summary of the implementation design for planning and execution within the "
-            "concurrent hierarchical model based on timing constraints at NIST. ... Multitasking on a single "
-            "processor supplies enough processing power for both the planner and executor [at higher levels].",
+            quote=(
+                "Figure 5 provides a summary of the implementation design for planning and"
+                " execution within the concurrent hierarchical model based on timing constraints at"
+                " NIST. ... Multitasking on a single processor supplies enough processing power for"
+                " both the planner and executor [at higher levels]."
+            ),
             experiments=(PARTITION,),
             predicted=_figure5,
             tested=_figure5_tested,

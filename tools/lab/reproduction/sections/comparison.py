@@ -13,7 +13,16 @@ from rack.tools.lab.benches.systems.prediction import SystemPrediction, predicti
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
 from rack.tools.lab.reproduction.experiments.systems import SYSTEMS, systems_of
 from rack.tools.lab.reproduction.sections.gantt import DISTURBED
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listing, Plate, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Columns,
+    Listing,
+    Plate,
+    Ruling,
+    Side,
+    code,
+    text,
+)
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
 RCCL = "rccl"
@@ -42,7 +51,10 @@ def _promised(workshop: Workshop) -> Side:
         "status",
         "fits",
     )
-    caption = "Responses by equations 3.2 and 3.3, and on the clock's grid, ms. Hosts are boards without real time."
+    caption = (
+        "Responses by equations 3.2 and 3.3, and on the clock's grid, ms. Hosts are boards without"
+        " real time."
+    )
     return Side.of(Columns(head, rows, caption))
 
 
@@ -71,18 +83,35 @@ def _compared(findings: Findings) -> Assessment:
         "missed, %",
     )
     rows = [_measured_row(one) for one in found.figures]
-    caption = "Responses in ms: longest of a run in real time. A hold is given to the highest level that takes one."
+    caption = (
+        "Responses in ms: longest of a run in real time. A hold is given to the highest level that"
+        " takes one."
+    )
     drawn = findings.workshop.shown(found.plot(findings.workshop.folder / PICTURES))
     side = Side.of(
         Columns(head, rows, caption),
-        Plate(Path(drawn), "Responses with their bounds, ages of messages, and more, system by system."),
-        Listing("\n".join(found.lines(None)), f"All figures, as {code('rack bench systems')} prints them."),
+        Plate(
+            Path(drawn),
+            "Responses with their bounds, ages of messages, and more, system by system.",
+        ),
+        Listing(
+            "\n".join(found.lines(None)),
+            f"All figures, as {code('rack bench systems')} prints them.",
+        ),
     )
     failed = [one for one in found.figures if not one.worked]
     if failed and all(one.realtime.missed > DISTURBED for one in failed):
-        missed = ", ".join(f"{one.rack} ({100 * one.realtime.missed:.1f} % of its fastest cycles)" for one in failed)
-        why = f"Missed too many cycles to do its task: {missed}. Should other programs have had the processors: "
-        return Assessment(side, Ruling.UNTESTABLE, f"{why}{code('rack reproduce --only 4.1 --again')}.")
+        missed = ", ".join(
+            f"{one.rack} ({100 * one.realtime.missed:.1f} % of its fastest cycles)"
+            for one in failed
+        )
+        why = (
+            f"Missed too many cycles to do its task: {missed}. Should other programs have had the"
+            " processors: "
+        )
+        return Assessment(
+            side, Ruling.UNTESTABLE, f"{why}{code('rack reproduce --only 4.1 --again')}."
+        )
     if failed:
         names = "; ".join(f"{one.rack}: {one.failure}" for one in failed)
         return Assessment(side, Ruling.FAILS, f"These did not run as they should: {text(names)}.")
@@ -90,11 +119,15 @@ def _compared(findings: Findings) -> Assessment:
     count = len(found.figures)
     if late:
         why = (
-            f"All {count} systems run on one set of mechanisms. Beyond its bound after missed cycles: "
-            f"{', '.join(late)}."
+            f"All {count} systems run on one set of mechanisms. Beyond its bound after missed"
+            f" cycles: {', '.join(late)}."
         )
         return Assessment(side, Ruling.BOUNDED, why)
-    return Assessment(side, Ruling.HOLDS, f"All {count} systems run on one set of mechanisms, within their bounds.")
+    return Assessment(
+        side,
+        Ruling.HOLDS,
+        f"All {count} systems run on one set of mechanisms, within their bounds.",
+    )
 
 
 def _measured_row(one: SystemFigures) -> tuple[str, ...]:
@@ -107,7 +140,14 @@ def _measured_row(one: SystemFigures) -> tuple[str, ...]:
         else f"{hold.measured_ms:g} of {hold.longest_ms:g} ({hold.level})"
     )
     killed = f"{ticks[0]} to {ticks[-1]}" if ticks else "-"
-    return (code(one.rack), _longest(ran.command_ms), _longest(ran.status_ms), held, killed, f"{100 * ran.missed:.2f}")
+    return (
+        code(one.rack),
+        _longest(ran.command_ms),
+        _longest(ran.status_ms),
+        held,
+        killed,
+        f"{100 * ran.missed:.2f}",
+    )
 
 
 def _longest(times: Distribution | None) -> str:
@@ -130,7 +170,9 @@ def _layered(workshop: Workshop) -> Side:
         said = _promise(name)
         ratio = max(said.rates_hz) / min(said.rates_hz) if said.rates_hz else 1.0
         rows.append((code(name), str(len(said.levels)), str(said.hosts), f"{ratio:.4g}"))
-    return Side.of(Columns(("rack", "levels", "boards without real time", "fastest rate to slowest"), rows))
+    return Side.of(
+        Columns(("rack", "levels", "boards without real time", "fastest rate to slowest"), rows)
+    )
 
 
 def _layered_tested(findings: Findings) -> Assessment:
@@ -140,13 +182,13 @@ def _layered_tested(findings: Findings) -> Assessment:
     even = [name for name, said in promised.items() if sorted(said.rates_hz) != list(said.rates_hz)]
     if flat or even:
         why = (
-            f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a faster level above a "
-            f"slower one: {', '.join(even) or 'none'}."
+            f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a"
+            f" faster level above a slower one: {', '.join(even) or 'none'}."
         )
         return Assessment(Side(), Ruling.BOUNDED, why)
     why = (
-        f"From the configs alone: all {len(promised)} have at least two levels, and no level is faster than the one "
-        "below."
+        f"From the configs alone: all {len(promised)} have at least two levels, and no level is"
+        " faster than the one below."
     )
     return Assessment(Side(), Ruling.HOLDS, why)
 
@@ -154,7 +196,12 @@ def _layered_tested(findings: Findings) -> Assessment:
 def _rccl(workshop: Workshop) -> Side:
     layout = wire(load(RCCL))
     rows = [
-        (task.name, f"{1e9 / (task.every * layout.clock_ns):g}", str(task.core), str(task.priority or "-"))
+        (
+            task.name,
+            f"{1e9 / (task.every * layout.clock_ns):g}",
+            str(task.core),
+            str(task.priority or "-"),
+        )
         for task in layout.tasks
     ]
     queues = [
@@ -162,22 +209,27 @@ def _rccl(workshop: Workshop) -> Side:
         for box in layout.mailboxes
         if box.capacity
     ]
-    return Side.of(Columns(("task", "rate, Hz", "processor", "priority"), rows), f"Queues: {'; '.join(queues)}.")
+    return Side.of(
+        Columns(("task", "rate, Hz", "processor", "priority"), rows),
+        f"Queues: {'; '.join(queues)}.",
+    )
 
 
 def _rccl_tested(findings: Findings) -> Assessment:
     found = systems_of([findings[RCCL_RUN.name]]).figures[0]
     rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
     layout = wire(load(RCCL))
-    fastest = [task for task in layout.tasks if task.every == min(other.every for other in layout.tasks)]
+    fastest = [
+        task for task in layout.tasks if task.every == min(other.every for other in layout.tasks)
+    ]
     cores = {task.core for task in layout.tasks}
     side = Side.of(Columns(("board", "processor time, share of one"), rows))
     if not found.worked:
         return Assessment(side, Ruling.FAILS, text(found.failure))
     why = (
-        f"Joint control has a board a joint, but {len(fastest)} boards of that rate share {len(cores)} processors: "
-        f"each joint its own processor cannot be had here. At 1 kHz {100 * found.realtime.missed:.2f} % of their "
-        "cycles were missed."
+        f"Joint control has a board a joint, but {len(fastest)} boards of that rate share"
+        f" {len(cores)} processors: each joint its own processor cannot be had here. At 1 kHz"
+        f" {100 * found.realtime.missed:.2f} % of their cycles were missed."
     )
     return Assessment(side, Ruling.BOUNDED, why)
 
@@ -185,14 +237,19 @@ def _rccl_tested(findings: Findings) -> Assessment:
 CHAPTER = Chapter(
     name="4.1",
     title="Comparison of Concurrent Hierarchical Control to Other Models",
-    intro="The systems of section 4.1 as racks: what each was, what is modelled and what is assumed is in the README "
-    "of its folder in <code>configs</code>.",
+    intro=(
+        "The systems of section 4.1 as racks: what each was, what is modelled and what is assumed"
+        " is in the README of its folder in <code>configs</code>."
+    ),
     statements=(
         Statement(
             name="systems",
             title="The systems next to each other",
-            quote="A survey of existing robot control systems provides numerous concurrent models. ... These "
-            "architectures share common characteristics with the concurrent, hierarchical control model.",
+            quote=(
+                "A survey of existing robot control systems provides numerous concurrent models."
+                " ... These architectures share common characteristics with the concurrent,"
+                " hierarchical control model."
+            ),
             experiments=SYSTEMS,
             predicted=_promised,
             tested=_compared,
@@ -200,9 +257,12 @@ CHAPTER = Chapter(
         Statement(
             name="two-levels",
             title="At least two levels",
-            quote="Although few of these control systems are directly labeled as a hierarchical, most systems have at "
-            "least a two-level hierarchy, with a low-level, real-time subsystem handling real-time motion control, "
-            "and a slower high-level subsystem responsible for planning.",
+            quote=(
+                "Although few of these control systems are directly labeled as a hierarchical, most"
+                " systems have at least a two-level hierarchy, with a low-level, real-time"
+                " subsystem handling real-time motion control, and a slower high-level subsystem"
+                " responsible for planning."
+            ),
             experiments=(),
             predicted=_layered,
             tested=_layered_tested,
@@ -210,9 +270,12 @@ CHAPTER = Chapter(
         Statement(
             name="rccl",
             title="RCCL: a processor a joint",
-            quote="The joint control level operates at 1 kHz and assigns 1 processor per joint. The fine motion "
-            "trajectory level runs a 50 Hz and runs as high-priority cyclic task. Concurrently, a rough motion "
-            "planner asynchronously produces a queue of motion requests for the trajectory level as a background task.",
+            quote=(
+                "The joint control level operates at 1 kHz and assigns 1 processor per joint. The"
+                " fine motion trajectory level runs a 50 Hz and runs as high-priority cyclic task."
+                " Concurrently, a rough motion planner asynchronously produces a queue of motion"
+                " requests for the trajectory level as a background task."
+            ),
             experiments=(RCCL_RUN,),
             predicted=_rccl,
             tested=_rccl_tested,

@@ -16,9 +16,10 @@ def _predictable(workshop: Workshop) -> Side:
     forecast = forecast_of(load(NAME))
     failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
     return Side.of(
-        f"By the budgets of {code(NAME)}, {len(forecast.verdicts) - len(failing)} of {len(forecast.verdicts)} "
-        "judgements of the timing model hold. It then predicts more than bounds: the tick at which the torque rests "
-        "on a command that an operator gives at any tick, to any level."
+        f"By the budgets of {code(NAME)}, {len(forecast.verdicts) - len(failing)} of"
+        f" {len(forecast.verdicts)} judgements of the timing model hold. It then predicts more than"
+        " bounds: the tick at which the torque rests on a command that an operator gives at any"
+        " tick, to any level."
     )
 
 
@@ -26,28 +27,49 @@ def _predictable_tested(findings: Findings) -> Assessment:
     found = findings[RESPONSE.name]
     names = ("min", "median", "max", "longest", "sum_eq_3_3", "bound_eq_3_2", "max_from_reading")
     rows = [
-        (row["level"], str(row["commands"]), *(f"{row[f'{name}_ms']:g}" for name in names), str(row["off_prediction"]))
+        (
+            row["level"],
+            str(row["commands"]),
+            *(f"{row[f'{name}_ms']:g}" for name in names),
+            str(row["off_prediction"]),
+        )
         for row in found["levels"]
     ]
-    head = ["given to", "commands", "least", "median", "longest", "longest on the grid", "sum, 3.3", "bound, 3.2"]
+    head = [
+        "given to",
+        "commands",
+        "least",
+        "median",
+        "longest",
+        "longest on the grid",
+        "sum, 3.3",
+        "bound, 3.2",
+    ]
     head += ["longest from its reading", "not at the predicted tick"]
     twins = [twin for twin in found["twins"] if not twin["agrees"]]
     side = Side.of(
         Columns(
             head,
             rows,
-            "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of the cycle that "
-            "acts.",
+            "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of"
+            " the cycle that acts.",
         ),
-        Plate(Path(found["pictures"]["response"]), "Responses to commands at each level, with their bounds."),
+        Plate(
+            Path(found["pictures"]["response"]),
+            "Responses to commands at each level, with their bounds.",
+        ),
     )
     if found["held"] and not twins:
         why = (
-            f"All {found['measured']} commands took effect at the predicted tick and within the bounds of equations "
-            "3.2 and 3.3. In a run without one of them, the torque is the same until that tick, bit for bit."
+            f"All {found['measured']} commands took effect at the predicted tick and within the"
+            " bounds of equations 3.2 and 3.3. In a run without one of them, the torque is the"
+            " same until that tick, bit for bit."
         )
         return Assessment(side, Ruling.HOLDS, why)
-    why = f"{found['beyond']} responses beyond a bound, {found['off_prediction']} not at the predicted tick."
+    why = (
+        f"{found['beyond']} responses beyond a bound, {found['off_prediction']} not at the"
+        " predicted tick."
+    )
     return Assessment(side, Ruling.FAILS, why)
 
 
@@ -59,9 +81,12 @@ CHAPTER = Chapter(
         Statement(
             name="predictable-response",
             title="Predictable response",
-            quote="The regulated and predictable behavior of the virtual control loop leads to timing metrics "
-            "guaranteeing performance. Predictable response time, especially important as complexity increases, is a "
-            "key for more reliable and safe robot controls systems.",
+            quote=(
+                "The regulated and predictable behavior of the virtual control loop leads to timing"
+                " metrics guaranteeing performance. Predictable response time, especially important"
+                " as complexity increases, is a key for more reliable and safe robot controls"
+                " systems."
+            ),
             experiments=(RESPONSE,),
             predicted=_predictable,
             tested=_predictable_tested,

@@ -1,4 +1,5 @@
-"""Equations as statements: predicted for the NASREM rack, measured in its run, and a rack in which each fails."""
+"""Equations as statements: predicted for the NASREM rack, measured in its run, and a rack in which
+each fails."""
 
 from __future__ import annotations
 
@@ -13,7 +14,15 @@ from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.tables import ms
 from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
 from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listing, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Columns,
+    Listing,
+    Ruling,
+    Side,
+    code,
+    text,
+)
 from rack.tools.lab.reproduction.sections.statement import Findings, Statement
 
 SIGNS = {"<": "&lt;", "<=": "≤", "=": "="}
@@ -29,9 +38,12 @@ class Biting:
     about: str
 
     def side(self, equation: str) -> tuple[str, Columns | Listing]:
-        """Return the rack in words, and what the timing model, or the check of the config, says of it."""
+        """Return the rack in words, and what the timing model, or the check of the config, says of
+        it."""
         given = " ".join(f"--set {setting}" for setting in self.settings)
-        words = f"Where it fails: {self.about} ({code(f'rack check {self.config} {given}'.strip())})."
+        words = (
+            f"Where it fails: {self.about} ({code(f'rack check {self.config} {given}'.strip())})."
+        )
         try:
             found = verdicts_of(load(self.config, self.settings), equation)
         except ConfigError as error:
@@ -51,7 +63,8 @@ def verdicts_of(config: RackConfig, equation: str) -> list[EquationVerdict]:
 
 @dataclass(frozen=True)
 class PaperEquation:
-    """An equation of the paper: its number, its wording, its form, how we read it, and a rack in which it fails."""
+    """An equation of the paper: its number, its wording, its form, how we read it, and a rack in
+    which it fails."""
 
     number: str
     title: str
@@ -60,8 +73,11 @@ class PaperEquation:
     reading: str
     biting: Biting
 
-    def statement(self, tested: Callable[[PaperEquation, Findings], Assessment] | None = None) -> Statement:
-        """Return the equation as a statement, judged by `tested` or by all of its subjects in the run."""
+    def statement(
+        self, tested: Callable[[PaperEquation, Findings], Assessment] | None = None
+    ) -> Statement:
+        """Return the equation as a statement, judged by `tested` or by all of its subjects in the
+        run."""
         return Statement(
             name=f"equation-{self.number}",
             title=f"Equation {self.number}: {self.title}",
@@ -73,11 +89,14 @@ class PaperEquation:
         )
 
     def predicted(self, workshop: Workshop) -> Side:
-        """Return both sides for the NASREM rack by its budgets, and the rack in which the equation fails."""
+        """Return both sides for the NASREM rack by its budgets, and the rack in which the equation
+        fails."""
         found = verdicts_of(load(NAME), self.number)
         meanings = dict.fromkeys(code(verdict.meaning) for verdict in found)
         table = Columns(HEAD, rows_of(self.number, [verdict.document() for verdict in found]))
-        words = f"{self.reading} For {code(NAME)}, by the budgets of its config: {'; '.join(meanings)}."
+        words = (
+            f"{self.reading} For {code(NAME)}, by the budgets of its config: {'; '.join(meanings)}."
+        )
         return Side.of(words, table, *self.biting.side(self.number))
 
 
@@ -87,8 +106,17 @@ def rows_of(equation: str, verdicts: list[Document]) -> list[tuple[str, ...]]:
 
 
 def _row(verdict: Document) -> tuple[str, ...]:
-    left, right, margin = (_shown(verdict[side], verdict["unit"]) for side in ("left", "right", "margin"))
-    return text(verdict["subject"]), left, SIGNS[verdict["sign"]], right, margin, "ok" if verdict["holds"] else "FAILS"
+    left, right, margin = (
+        _shown(verdict[side], verdict["unit"]) for side in ("left", "right", "margin")
+    )
+    return (
+        text(verdict["subject"]),
+        left,
+        SIGNS[verdict["sign"]],
+        right,
+        margin,
+        "ok" if verdict["holds"] else "FAILS",
+    )
 
 
 def _shown(side: float | None, unit: str) -> str:
@@ -99,12 +127,17 @@ def _shown(side: float | None, unit: str) -> str:
 
 def measured_of(equation: str, found: Document) -> list[Document]:
     """Return the measured verdicts on one equation, each with whether it holds in most cycles."""
-    pairs = [pair for pair in found["pairs"] if pair["equation"] == equation and pair["measured"] is not None]
+    pairs = [
+        pair
+        for pair in found["pairs"]
+        if pair["equation"] == equation and pair["measured"] is not None
+    ]
     return [{**pair["measured"], "mostly": pair["mostly"]} for pair in pairs]
 
 
 def table_of(verdicts: list[Document]) -> Columns:
-    """Return the measured verdicts as a table: the worst cycle of the run, and whether most cycles are better."""
+    """Return the measured verdicts as a table: the worst cycle of the run, and whether most cycles
+    are better."""
     rows = [(*_row(verdict), "yes" if verdict["mostly"] else "NO") for verdict in verdicts]
     return Columns((*HEAD[:-1], "worst cycle", "in 99 of 100"), rows)
 
@@ -116,23 +149,37 @@ def judged(equation: PaperEquation, findings: Findings) -> Assessment:
     counts = found["breaches"].get(equation.number, 0)
     lasted = found["outcome"]["ticks"] * load(NAME).clock_ns * 1e-9
     words = (
-        f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without those of the start-up."
+        f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without"
+        " those of the start-up."
     )
     side = Side.of(words, table_of(verdicts))
     broken = [verdict["subject"] for verdict in verdicts if not verdict["holds"]]
     if not broken:
         return Assessment(
-            side, Ruling.HOLDS, "It holds as predicted for every level, in the worst cycle of the run too."
+            side,
+            Ruling.HOLDS,
+            "It holds as predicted for every level, in the worst cycle of the run too.",
         )
     if all(verdict["mostly"] for verdict in verdicts):
-        why = f"It holds as predicted in 99 of 100 cycles; in the worst it fails for {text(', '.join(broken))}. "
+        why = (
+            "It holds as predicted in 99 of 100 cycles; in the worst it fails for"
+            f" {text(', '.join(broken))}. "
+        )
         why += f"{counts} cycles broke it by their own numbers. " if counts else ""
         why += stolen(found)
         return Assessment(side, Ruling.BOUNDED, why)
-    return Assessment(side, Ruling.FAILS, f"It fails for {text(', '.join(broken))}, in more than one of 100 cycles.")
+    return Assessment(
+        side,
+        Ruling.FAILS,
+        f"It fails for {text(', '.join(broken))}, in more than one of 100 cycles.",
+    )
 
 
 def stolen(found: Document) -> str:
     """Return how much of its cores the hypervisor took from a run."""
     taken = ", ".join(f"{percent:g} % of core {core}" for core, percent in found["steal"].items())
-    return f"Meanwhile the hypervisor took {taken}." if taken else "The hypervisor's share is not known."
+    return (
+        f"Meanwhile the hypervisor took {taken}."
+        if taken
+        else "The hypervisor's share is not known."
+    )

@@ -1,4 +1,5 @@
-"""Figure 1 of the paper, drawn from a config: commands down, statuses up, a planner and an executor in each level."""
+"""Figure 1 of the paper, drawn from a config: commands down, statuses up, a planner and an executor
+in each level."""
 
 from __future__ import annotations
 
@@ -18,19 +19,24 @@ TOP = 40
 SIDE = 250
 """Width of the boards next to the hierarchy."""
 STYLE = (
-    "text{font:13px system-ui,'DejaVu Sans',sans-serif;fill:#1c1e21}.small{font-size:11px;fill:#5b6470}"
+    "text{font:13px system-ui,'DejaVu"
+    " Sans',sans-serif;fill:#1c1e21}.small{font-size:11px;fill:#5b6470}"
     ".name{font-weight:600}.box{fill:#fff;stroke:#1c1e21;stroke-width:1.3}.part{fill:#eef2f8;stroke:#6b7686}"
     ".plan{fill:#e6f4ec;stroke:#5c8a6e}.line{fill:none;stroke:#31579b;stroke-width:1.6}.up{stroke:#8a6100}"
     ".aside{stroke:#8b93a0;stroke-dasharray:4 3}"
 )
 PAPER = '<rect width="100%" height="100%" fill="#fff"/>'
-ARROW = '<marker id="{0}" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+ARROW = (
+    '<marker id="{0}" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7"'
+    ' orient="auto">'
+)
 ARROW += '<path d="M0 0 8 4 0 8z" fill="{1}"/></marker>'
 
 
 @dataclass(frozen=True)
 class Flow:
-    """The mailboxes between two levels, down and up, and within a level from planner to executor."""
+    """The mailboxes between two levels, down and up, and within a level from planner to
+    executor."""
 
     down: tuple[MailboxSpec, ...]
     up: tuple[MailboxSpec, ...]
@@ -52,7 +58,9 @@ def flow_svg(rack: RackTiming, layout: Layout) -> str:
     height = TOP + len(levels) * (HIGH + GAP) - GAP + 24
     drawn = [*_levels(rack, layout, levels), *_others(layout, levels, others)]
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 {height}" role="img">'
-    marks = "".join(ARROW.format(*mark) for mark in (("d", "#31579b"), ("u", "#8a6100"), ("a", "#8b93a0")))
+    marks = "".join(
+        ARROW.format(*mark) for mark in (("d", "#31579b"), ("u", "#8a6100"), ("a", "#8b93a0"))
+    )
     return f"{head}<style>{STYLE}</style><defs>{marks}</defs>{PAPER}{''.join(drawn)}</svg>\n"
 
 
@@ -67,7 +75,10 @@ def _levels(rack: RackTiming, layout: Layout, levels: Sequence[str]) -> Iterator
         yield _text(LEFT + 318, y + 52, "executor", "name", "middle")
         yield _text(LEFT + 318, y + 69, "runs every cycle", "small", "middle")
         if board.has_planner:
-            yield f'<rect class="part plan" x="{LEFT + 14}" y="{y + 32}" width="160" height="46" rx="4"/>'
+            yield (
+                f'<rect class="part plan" x="{LEFT + 14}" y="{y + 32}" width="160" height="46"'
+                ' rx="4"/>'
+            )
             yield _text(LEFT + 94, y + 52, "planner", "name", "middle")
             place = "same processor" if board.coupling == "tight" else "board of its own"
             yield _text(LEFT + 94, y + 69, place, "small", "middle")
@@ -94,7 +105,9 @@ def _others(layout: Layout, levels: Sequence[str], others: Sequence[str]) -> Ite
         y = TOP + (2 * number + 1) * (HIGH + GAP)
         sources = [level for level in levels if _read(layout, level, name)]
         own = [box for box in layout.mailboxes if box.writer == name]
-        readers = sorted({reader.partition(".")[0] for box in own for reader in box.readers} - {name})
+        readers = sorted(
+            {reader.partition(".")[0] for box in own for reader in box.readers} - {name}
+        )
         yield f'<rect class="box" x="14" y="{y}" width="{SIDE}" height="{HIGH}" rx="6"/>'
         yield _text(26, y + 22, name, "name")
         yield _text(26, y + 46, f"reads {', '.join(sources) or 'none of the levels'}", "small")

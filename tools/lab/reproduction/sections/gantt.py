@@ -18,7 +18,15 @@ from rack.tools.lab.reproduction.experiments.figures import (
     column_ns,
     sweep,
 )
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Listing, Plate, Ruling, Side, code
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Columns,
+    Listing,
+    Plate,
+    Ruling,
+    Side,
+    code,
+)
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 from rack.tools.timing.charts.letters import lines
 
@@ -35,7 +43,8 @@ AGAIN = code("rack reproduce --only 3.4 --again")
 DISTURBED = 0.02
 """Part of an executor's cycles late from which on a run shows the machine, not the figure."""
 MOSTLY = 0.5
-"""Part of the cycles, or plans, late from which on a run is said to fail: the figures fail in all, or in none."""
+"""Part of the cycles, or plans, late from which on a run is said to fail: the figures fail in all,
+or in none."""
 PAPER_X = [LEAST_X + STEP_X * k for k in range(round((MOST_X - LEAST_X) / STEP_X) + 1)]
 
 FIG2 = FigureRack("fig2", 2)
@@ -53,14 +62,19 @@ def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:
 
     panel = figure.panel()
     config = figure.loaded()
-    paths = save([panel], f"{figure.label}: the schedule of its budget", workshop.picture(figure.label))
-    caption = f"The schedule computed from the budget of {code(figure.label)}, drawn as in the paper."
+    paths = save(
+        [panel], f"{figure.label}: the schedule of its budget", workshop.picture(figure.label)
+    )
+    caption = (
+        f"The schedule computed from the budget of {code(figure.label)}, drawn as in the paper."
+    )
     letters = "\n".join(lines(panel, column_ns(config, figure.window_ns(config))))
     return Plate(Path(workshop.shown(paths)), caption), Listing(letters)
 
 
 def ran(figure: FigureRack, found: Document) -> Side:
-    """Return the run of a figure: its chart, how many cycles and plans were late, and its patterns."""
+    """Return the run of a figure: its chart, how many cycles and plans were late, and its
+    patterns."""
     steal = ", ".join(f"core {core} {percent:g} %" for core, percent in found["steal"].items())
     rows = [
         (
@@ -72,12 +86,13 @@ def ran(figure: FigureRack, found: Document) -> Side:
         for task, count in found["tasks"].items()
     ]
     caption = (
-        "Late: past its deadline; skipped: of the late ones, those that never began. Taken by the hypervisor "
-        f"meanwhile: {steal or 'not measured'}."
+        "Late: past its deadline; skipped: of the late ones, those that never began. Taken by the"
+        f" hypervisor meanwhile: {steal or 'not measured'}."
     )
     return Side.of(
         Plate(
-            Path(found["pictures"]["measured"]), f"A run of {code(figure.label)} by real processes, from its middle."
+            Path(found["pictures"]["measured"]),
+            f"A run of {code(figure.label)} by real processes, from its middle.",
         ),
         Columns(("", "all", "late", "skipped"), rows, caption),
         _patterns(found),
@@ -86,9 +101,15 @@ def ran(figure: FigureRack, found: Document) -> Side:
 
 def _patterns(found: Document) -> Columns:
     rows = [
-        (lane, code(pattern), str(count)) for lane, both in found["patterns"].items() for pattern, count in chain(*both)
+        (lane, code(pattern), str(count))
+        for lane, both in found["patterns"].items()
+        for pattern, count in chain(*both)
     ]
-    return Columns(("processor of", "pattern", "times"), rows, "The most frequent patterns, over the cycles of a plan.")
+    return Columns(
+        ("processor of", "pattern", "times"),
+        rows,
+        "The most frequent patterns, over the cycles of a plan.",
+    )
 
 
 def late(found: Document, task: str) -> float:
@@ -107,18 +128,22 @@ def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
     found = findings[figure.label]
     counts = [found["tasks"][task] for task in (LEVEL, PLANNER)]
     said = (
-        f"{counts[0]['late']} of {counts[0]['jobs']} cycles and {counts[1]['late']} of {counts[1]['jobs']} plans late"
+        f"{counts[0]['late']} of {counts[0]['jobs']} cycles and {counts[1]['late']} of"
+        f" {counts[1]['jobs']} plans late"
     )
     measured = ran(figure, found)
     if fails(found) == works and DISTURBED < late(found, LEVEL) < MOSTLY:
         why = f"Other programs had the processors too often: {said}. On a quiet machine: {AGAIN}."
         return Assessment(measured, Ruling.UNTESTABLE, why)
     if fails(found) == works:
-        return Assessment(measured, Ruling.FAILS, f"The paper says that it {_verb(works)}; the run had {said}.")
+        return Assessment(
+            measured, Ruling.FAILS, f"The paper says that it {_verb(works)}; the run had {said}."
+        )
     stray = [count for count in counts if count["late"] and count["late"] <= MOSTLY * count["jobs"]]
     if stray:
         why = (
-            f"It {_verb(works)}, as the paper says: {said}. The stray ones are this machine's: see the time taken away."
+            f"It {_verb(works)}, as the paper says: {said}. The stray ones are this machine's: see"
+            " the time taken away."
         )
         return Assessment(measured, Ruling.BOUNDED, why)
     return Assessment(measured, Ruling.HOLDS, f"It {_verb(works)}, as the paper says: {said}.")
@@ -132,8 +157,15 @@ def _predicted(figure: FigureRack, workshop: Workshop) -> Side:
     plate, letters = drawn(figure, workshop)
     (found,) = sweep(figure.config, [budget_of(figure.loaded()).process_ms])
     failing = ", ".join(found.failing)
-    judged = f"These fail: {failing}." if failing else "Every equation holds, and every cycle and plan is in time."
-    about = f"With X = {found.process_ms:g} ms a cycle leaves {found.idle_ms:g} ms after the executor. {judged}"
+    judged = (
+        f"These fail: {failing}."
+        if failing
+        else "Every equation holds, and every cycle and plan is in time."
+    )
+    about = (
+        f"With X = {found.process_ms:g} ms a cycle leaves {found.idle_ms:g} ms after the executor."
+        f" {judged}"
+    )
     return Side.of(plate, letters, about)
 
 
@@ -145,7 +177,14 @@ def budget_of(config: RackConfig) -> BudgetConfig:
 
 
 def _planning_table(rows: list[Planning]) -> Columns:
-    head = ["X", "P a cycle, U in each", "plan after", "P and U a cycle, U once", "plan after", "permitted"]
+    head = [
+        "X",
+        "P a cycle, U in each",
+        "plan after",
+        "P and U a cycle, U once",
+        "plan after",
+        "permitted",
+    ]
     head += ["eqs that fail", "schedule", "in time"]
     cells = [
         (
@@ -171,7 +210,8 @@ def _in_cycles(count: int | None) -> str:
 def contradicting(rows: list[Planning]) -> list[Planning]:
     """Return the cases in which figure 2 does not do what the paper says of it.
 
-    It says that the planner runs at least `LEAST_P` in each cycle, and that two cycles suffice for P and U.
+    It says that the planner runs at least `LEAST_P` in each cycle, and that two cycles suffice for
+    P and U.
     """
     return [one for one in rows if one.each_ms < LEAST_P or _is_slow(one)]
 
@@ -195,23 +235,30 @@ def _sweep_side(workshop: Workshop) -> Side:
     most_once = cycle_ms - fixed_ms - work_ms / worst.permitted
     literal = (
         'Read literally, "RXWPU" has U in every cycle, and P has '
-        f"{cycle_ms - fixed_ms - budget.update_ms:g} &minus; X ms in each: at least {LEAST_P:g} ms up to X = "
+        f"{cycle_ms - fixed_ms - budget.update_ms:g} &minus; X ms in each: at least {LEAST_P:g} ms"
+        " up to X = "
         f"{most_each:g}. With X = {_values(less) or 'none'} it is less; "
-        f"with X = {worst.process_ms:g} it is {worst.each_ms:g} ms, and a plan takes {_in_cycles(worst.cycles_each)}, "
+        f"with X = {worst.process_ms:g} it is {worst.each_ms:g} ms, and a plan takes"
+        f" {_in_cycles(worst.cycles_each)}, "
         f"{(worst.cycles_each or 0) * cycle_ms:g} ms instead of {worst.permitted * cycle_ms:g}."
     )
     kind = (
-        f"Read kindly, there is one U for each plan, and P and U share {cycle_ms - fixed_ms:g} &minus; X ms of a "
-        f"cycle. In {worst.permitted} cycles with X = {worst.process_ms:g} that is "
-        f"{worst.permitted * worst.once_ms:g} ms, but P and U need {work_ms:g}: the plan is computed in time, its "
-        f"update comes in cycle {worst.cycles_once}. Up to X = {most_once:g} two cycles would do; equation 3.8 "
-        f"demands less than that. Too slow: X = {_values(slow) or 'none'}."
+        f"Read kindly, there is one U for each plan, and P and U share {cycle_ms - fixed_ms:g}"
+        f" &minus; X ms of a cycle. In {worst.permitted} cycles with X = {worst.process_ms:g} that"
+        f" is {worst.permitted * worst.once_ms:g} ms, but P and U need {work_ms:g}: the plan is"
+        f" computed in time, its update comes in cycle {worst.cycles_once}. Up to X = {most_once:g}"
+        " two cycles would do; equation 3.8 demands less than that. Too slow: X ="
+        f" {_values(slow) or 'none'}."
     )
-    third = all(count is not None and count <= WORST_CYCLES for count in (worst.cycles_each, worst.cycles_once))
+    third = all(
+        count is not None and count <= WORST_CYCLES
+        for count in (worst.cycles_each, worst.cycles_once)
+    )
     follows = (
-        f"So the figure is what its text says as long as X is at most {most_each:g} ms, or at most {most_once:g} on "
-        f"average over the cycles of a plan, whereas the paper permits {MOST_X:g}. Its weaker demand, a plan at worst "
-        f"in every third cycle, is {'met' if third else 'not met'} with X = {worst.process_ms:g} in both readings."
+        f"So the figure is what its text says as long as X is at most {most_each:g} ms, or at most"
+        f" {most_once:g} on average over the cycles of a plan, whereas the paper permits"
+        f" {MOST_X:g}. Its weaker demand, a plan at worst in every third cycle, is"
+        f" {'met' if third else 'not met'} with X = {worst.process_ms:g} in both readings."
     )
     return Side.of(_planning_table(rows), literal, kind, follows)
 
@@ -230,13 +277,19 @@ def _sweep_tested(findings: Findings) -> Assessment:
         for x, found in ((LEAST_X, short), (MOST_X, long))
     )
     if not odd:
-        return Assessment(measured, Ruling.HOLDS, f"Every X from {LEAST_X:g} to {MOST_X:g} ms works. Runs: {said}.")
+        return Assessment(
+            measured,
+            Ruling.HOLDS,
+            f"Every X from {LEAST_X:g} to {MOST_X:g} ms works. Runs: {said}.",
+        )
     agrees = fails(long) == _is_slow(rows[-1]) and fails(short) == _is_slow(rows[0])
     if not agrees:
-        return Assessment(measured, Ruling.FAILS, f"The computation is not confirmed by the runs: {said}.")
+        return Assessment(
+            measured, Ruling.FAILS, f"The computation is not confirmed by the runs: {said}."
+        )
     why = (
-        '"X will range from 1 to 3 ms" and "the planner runs at least 3 ms each cycle" exclude each other for X = '
-        f"{_values(odd)}. Runs agree with the computation: {said}."
+        '"X will range from 1 to 3 ms" and "the planner runs at least 3 ms each cycle" exclude'
+        f" each other for X = {_values(odd)}. Runs agree with the computation: {said}."
     )
     return Assessment(measured, Ruling.CONTRADICTS, why)
 
@@ -245,8 +298,8 @@ def _fig3_side(workshop: Workshop) -> Side:
     rows = sweep(FIG3.config, PAPER_X)
     works = [one for one in rows if not _is_slow(one)]
     text = (
-        f"The failure depends on X. With X = {_values(works) or 'none'} three cycles are enough for P and U; with "
-        f"X = {_values([one for one in rows if one not in works])} they are not."
+        f"The failure depends on X. With X = {_values(works) or 'none'} three cycles are enough for"
+        f" P and U; with X = {_values([one for one in rows if one not in works])} they are not."
     )
     return Side.of(*_predicted(FIG3, workshop).items, _planning_table(rows), text)
 
@@ -260,8 +313,8 @@ def _fig3_tested(findings: Findings) -> Assessment:
         return Assessment(measured, own.ruling, own.why)
     in_time = 100 * (1 - late(short, PLANNER))
     why = (
-        f"{own.why} With X = {LEAST_X:g}, which the paper permits too, {in_time:.0f} % of the plans were in time: the "
-        "figure fails only from a certain X on."
+        f"{own.why} With X = {LEAST_X:g}, which the paper permits too, {in_time:.0f} % of the plans"
+        " were in time: the figure fails only from a certain X on."
     )
     return Assessment(measured, Ruling.BOUNDED, why)
 
@@ -269,11 +322,14 @@ def _fig3_tested(findings: Findings) -> Assessment:
 def _fig4_side(workshop: Workshop) -> Side:
     rows = sweep(FIG4.config, PAPER_X)
     full = [one for one in rows if one.idle_ms <= 0]
-    text = f'The "-" of the pattern is there up to X = {max(one.process_ms for one in rows if one.idle_ms > 0):g} ms.'
+    text = (
+        'The "-" of the pattern is there up to X ='
+        f" {max(one.process_ms for one in rows if one.idle_ms > 0):g} ms."
+    )
     if full:
         text += (
-            f" With X = {_values(full)} the executor fills its cycle: every cycle is still in time, but equation 3.6, "
-            "0 &lt; t<sub>residual</sub>, fails."
+            f" With X = {_values(full)} the executor fills its cycle: every cycle is still in time,"
+            " but equation 3.6, 0 &lt; t<sub>residual</sub>, fails."
         )
     return Side.of(*_predicted(FIG4, workshop).items, text, _planning_table(rows))
 
@@ -292,26 +348,32 @@ def _statement(name: str, title: str, quote: str, figure: FigureRack, works: boo
 CHAPTER = Chapter(
     name="3.4",
     title="Algorithm Timing Analysis",
-    intro="One level as a Gantt chart. R reads command and status (1 ms), X is the executor (1 to 3 ms), W writes "
-    "command and status (1 ms), P plans (1 to 6 ms), U updates the plan (1 ms), C communicates with another processor "
-    "(1 ms). A new plan is wanted within 16 ms, at worst every third cycle. The racks <code>fig2</code>, "
-    "<code>fig3</code>, <code>fig4</code> and <code>fig4-overload</code> really compute that long; they use X = 2 ms, "
-    "as the figures do, and the longest P.",
+    intro=(
+        "One level as a Gantt chart. R reads command and status (1 ms), X is the executor (1 to 3"
+        " ms), W writes command and status (1 ms), P plans (1 to 6 ms), U updates the plan (1 ms),"
+        " C communicates with another processor (1 ms). A new plan is wanted within 16 ms, at worst"
+        " every third cycle. The racks <code>fig2</code>, <code>fig3</code>, <code>fig4</code> and"
+        " <code>fig4-overload</code> really compute that long; they use X = 2 ms, as the figures"
+        " do, and the longest P."
+    ),
     statements=(
         _statement(
             "figure-2",
             "Figure 2: one processor, 8 ms",
-            "For this case, all the functions can run tightly-coupled on one processor in one cycle, with sufficient "
-            'residual processing time. ... The algorithm repeats ad infinitum the basic "RXWPU" computational pattern.',
+            "For this case, all the functions can run tightly-coupled on one processor in one"
+            " cycle, with sufficient residual processing time. ... The algorithm repeats ad"
+            ' infinitum the basic "RXWPU" computational pattern.',
             FIG2,
             works=True,
         ),
         Statement(
             name="figure-2-x",
             title="Figure 2 with X from 1 to 3 ms",
-            quote="X ... will range from 1 to 3 ms computation intervals. ... The planner runs at least 3 ms. each "
-            "cycle which implies that after two cycles 6 ms. will have been allotted to the planner with 1 ms. for "
-            "plan updating.",
+            quote=(
+                "X ... will range from 1 to 3 ms computation intervals. ... The planner runs at"
+                " least 3 ms. each cycle which implies that after two cycles 6 ms. will have been"
+                " allotted to the planner with 1 ms. for plan updating."
+            ),
             experiments=(SHORT_2.experiment(), LONG_2.experiment()),
             predicted=_sweep_side,
             tested=_sweep_tested,
@@ -319,8 +381,10 @@ CHAPTER = Chapter(
         Statement(
             name="figure-3",
             title="Figure 3: one processor, 6 ms",
-            quote="A 6 ms. response time allows insufficient time for planning, so that within 3 cycles no updated "
-            "plan exists.",
+            quote=(
+                "A 6 ms. response time allows insufficient time for planning, so that within 3"
+                " cycles no updated plan exists."
+            ),
             experiments=(FIG3.experiment(), SHORT_3.experiment()),
             predicted=_fig3_side,
             tested=_fig3_tested,
@@ -328,9 +392,12 @@ CHAPTER = Chapter(
         Statement(
             name="figure-4",
             title="Figure 4: two processors, 6 ms",
-            quote='The executor repeats ad infinitum a "CRXW-" computational pattern. Processor two (P2) will execute '
-            "planning exclusively. Computational resources easily guarantee 6 ms. planning to generate updated plans "
-            "with 12 ms. ... The control level effectively meets all timing constraints with some computational waste.",
+            quote=(
+                'The executor repeats ad infinitum a "CRXW-" computational pattern. Processor two'
+                " (P2) will execute planning exclusively. Computational resources easily guarantee"
+                " 6 ms. planning to generate updated plans with 12 ms. ... The control level"
+                " effectively meets all timing constraints with some computational waste."
+            ),
             experiments=(FIG4.experiment(),),
             predicted=_fig4_side,
             tested=partial(_judged, FIG4, True),
@@ -338,9 +405,9 @@ CHAPTER = Chapter(
         _statement(
             "figure-4-overload",
             "Figure 4 with X = 4 ms",
-            "If the function X is replaced by a newer version which requires 4 ms. a cycle, then the above functional "
-            "allocation across processors will not work. For in the worst case, there is no time for interprocessor "
-            "communication with the planner (C).",
+            "If the function X is replaced by a newer version which requires 4 ms. a cycle, then"
+            " the above functional allocation across processors will not work. For in the worst"
+            " case, there is no time for interprocessor communication with the planner (C).",
             OVERLOAD,
             works=False,
         ),

@@ -17,11 +17,13 @@ def _determined(workshop: Workshop) -> Side:
     layout = wire(load(NAME))
     by_ticks = sum(box.is_by_ticks for box in layout.mailboxes)
     return Side.of(
-        f"{by_ticks} of the {len(layout.mailboxes)} mailboxes of {code(NAME)} show a message at a tick that is fixed "
-        "in advance: at the end of the cycle in which it was written, however early that was. What a level reads then "
-        "depends on ticks alone. We predict equal digests, which cover every message, in two runs in lockstep and in "
-        "a run in real time, as long as no deadline is missed; and no difference before the first miss. Each run "
-        f"simulates {SECONDS:g} s; there are at most {ATTEMPTS} in real time, until one is without a miss."
+        f"{by_ticks} of the {len(layout.mailboxes)} mailboxes of {code(NAME)} show a message at a"
+        " tick that is fixed in advance: at the end of the cycle in which it was written, however"
+        " early that was. What a level reads then depends on ticks alone. We predict equal"
+        " digests, which cover every message, in two runs in lockstep and in a run in real time,"
+        " as long as no deadline is missed; and no difference before the first miss. Each run"
+        f" simulates {SECONDS:g} s; there are at most {ATTEMPTS} in real time, until one is without"
+        " a miss."
     )
 
 
@@ -44,14 +46,23 @@ def _determined_tested(findings: Findings) -> Assessment:
         return Assessment(side, Ruling.FAILS, "Two runs in lockstep differ.")
     real = [run for run in runs if run["mode"] == REAL]
     if any(not _is_explained(run) for run in real):
-        return Assessment(side, Ruling.FAILS, "A run in real time diverged before it had missed a deadline.")
+        return Assessment(
+            side, Ruling.FAILS, "A run in real time diverged before it had missed a deadline."
+        )
     if any(run["first_miss"] is None and run["digest"] == reference for run in real):
-        why = "Lockstep twice and a run in real time without a miss wrote the same messages, bit for bit"
-        missed = " Runs that missed deadlines diverged no earlier than at the first miss." if len(real) > 1 else ""
+        why = (
+            "Lockstep twice and a run in real time without a miss wrote the same messages, bit"
+            " for bit"
+        )
+        missed = (
+            " Runs that missed deadlines diverged no earlier than at the first miss."
+            if len(real) > 1
+            else ""
+        )
         return Assessment(side, Ruling.HOLDS, f"{why}.{missed}")
     why = (
-        "Lockstep twice wrote the same messages. This machine kept no run in real time free of misses; none "
-        "diverged before its first miss, and every miss is on record."
+        "Lockstep twice wrote the same messages. This machine kept no run in real time free of"
+        " misses; none diverged before its first miss, and every miss is on record."
     )
     return Assessment(side, Ruling.BOUNDED, why)
 
@@ -84,16 +95,28 @@ def _costs(workshop: Workshop) -> Side:
     rows = []
     for name, level in rack.levels.items():
         share = 100 * level.communication_ns / (level.communication_ns + level.execution_ns)
-        rows.append((name, f"{level.execution_ns * 1e-6:g}", f"{level.communication_ns * 1e-6:g}", f"{share:.0f}"))
+        rows.append(
+            (
+                name,
+                f"{level.execution_ns * 1e-6:g}",
+                f"{level.communication_ns * 1e-6:g}",
+                f"{share:.0f}",
+            )
+        )
     head = ("level", "t<sub>exec</sub>", "t<sub>comm</sub>", "communication, % of both")
     loads = ", ".join(f"core {core}: {100 * load_:.0f} %" for core, load_ in rack.loads.items())
     return Side.of(
-        Columns(head, rows, f"Worst case, by the budgets. Loads of the processors, planners included: {loads}.")
+        Columns(
+            head,
+            rows,
+            f"Worst case, by the budgets. Loads of the processors, planners included: {loads}.",
+        )
     )
 
 
 def _costs_tested(findings: Findings) -> Assessment:
-    """Compare the processor time of communication with what the less loaded processor takes off the other one."""
+    """Compare the processor time of communication with what the less loaded processor takes off the
+    other one."""
     found = findings[NASREM.name]
     rows = []
     communicates = 0.0
@@ -120,12 +143,16 @@ def _costs_tested(findings: Findings) -> Assessment:
         "communication, ms a second",
     )
     loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found["loads"].items())
-    side = Side.of(Columns(head, rows, f"Medians of a run. Processor time of all tasks, ms a second: {loads}."))
+    side = Side.of(
+        Columns(head, rows, f"Medians of a run. Processor time of all tasks, ms a second: {loads}.")
+    )
     if not saved:
-        return Assessment(side, Ruling.UNTESTABLE, "All boards ran on one processor: there is nothing to save.")
+        return Assessment(
+            side, Ruling.UNTESTABLE, "All boards ran on one processor: there is nothing to save."
+        )
     words = (
-        f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second processor takes "
-        f"{1e3 * saved:.0f} ms a second off the first."
+        f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second"
+        f" processor takes {1e3 * saved:.0f} ms a second off the first."
     )
     return Assessment(side, Ruling.HOLDS if communicates < saved else Ruling.BOUNDED, words)
 
@@ -133,15 +160,20 @@ def _costs_tested(findings: Findings) -> Assessment:
 ABSTRACT = Chapter(
     name="abstract",
     title="Abstract",
-    intro="The paper presents concurrent hierarchical control as an efficient, flexible and deterministic method, and "
-    "analyses its timing. What follows reproduces it on processes, pinned to the cores of one machine, that share "
-    "memory as the paper's boards share a VME bus.",
+    intro=(
+        "The paper presents concurrent hierarchical control as an efficient, flexible and"
+        " deterministic method, and analyses its timing. What follows reproduces it on processes,"
+        " pinned to the cores of one machine, that share memory as the paper's boards share a VME"
+        " bus."
+    ),
     statements=(
         Statement(
             name="determinism",
             title="Determinism is the measure",
-            quote="Satisfying real-time constraints is important, but determinism, not performance, is the key "
-            "element in assessing a control model.",
+            quote=(
+                "Satisfying real-time constraints is important, but determinism, not performance,"
+                " is the key element in assessing a control model."
+            ),
             experiments=(DETERMINISM,),
             predicted=_determined,
             tested=_determined_tested,
@@ -151,14 +183,20 @@ ABSTRACT = Chapter(
 INTRODUCTION = Chapter(
     name="1",
     title="Introduction",
-    intro="A robot controller is split into cooperating processes to make it faster; communication is the price.",
+    intro=(
+        "A robot controller is split into cooperating processes to make it faster; communication is"
+        " the price."
+    ),
     statements=(
         Statement(
             name="communication",
             title="The cost of communication",
-            quote="The cost of communications must not negate the time savings obtained by parallel execution on the "
-            "different processors. Thus, to achieve the benefits of parallelism, a robot control model must be "
-            "inherently concurrent and have an efficient means of communication.",
+            quote=(
+                "The cost of communications must not negate the time savings obtained by parallel"
+                " execution on the different processors. Thus, to achieve the benefits of"
+                " parallelism, a robot control model must be inherently concurrent and have an"
+                " efficient means of communication."
+            ),
             experiments=(NASREM,),
             predicted=_costs,
             tested=_costs_tested,

@@ -1,6 +1,8 @@
-"""The page as data: sections of claims, each with the paper's words, our prediction, our measurement and a ruling.
+"""The page as data: sections of claims, each with the paper's words, our prediction, our
+measurement and a ruling.
 
-Texts are HTML of a few inline tags (`<i>`, `<b>`, `<sub>`, `<sup>`, `<code>`), which Markdown takes too.
+Texts are HTML of a few inline tags (`<i>`, `<b>`, `<sub>`, `<sup>`, `<code>`), which Markdown takes
+too.
 """
 
 from __future__ import annotations
@@ -73,7 +75,11 @@ class Side:
     @classmethod
     def of(cls, *items: Item | str | None) -> Side:
         """Return the side of these items; a bare text is a paragraph, None is nothing."""
-        return cls(tuple(Prose(item) if isinstance(item, str) else item for item in items if item is not None))
+        return cls(
+            tuple(
+                Prose(item) if isinstance(item, str) else item for item in items if item is not None
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -142,7 +148,11 @@ class Page:
             "facts": {name: plain(value) for name, value in self.facts},
             "rulings": {ruling.name.lower(): len(self.of(ruling)) for ruling in Ruling},
             "sections": [
-                {"section": one.name, "title": one.title, "claims": [claim.document() for claim in one.claims]}
+                {
+                    "section": one.name,
+                    "title": one.title,
+                    "claims": [claim.document() for claim in one.claims],
+                }
                 for one in self.sections
             ],
         }

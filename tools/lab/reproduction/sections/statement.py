@@ -6,7 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Kept, Workshop
-from rack.tools.lab.reproduction.sections.page import Assessment, PageClaim, PageSection, Ruling, Side, text
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    PageClaim,
+    PageSection,
+    Ruling,
+    Side,
+    text,
+)
 
 
 @dataclass(frozen=True)
@@ -24,7 +31,8 @@ class Findings:
 class Statement:
     """A claim in the paper's words, with the experiments that it rests on.
 
-    `predicted` computes our side from configs alone, and may draw; `tested` judges what the experiments have found.
+    `predicted` computes our side from configs alone, and may draw; `tested` judges what the
+    experiments have found.
     """
 
     name: str
@@ -51,8 +59,14 @@ class Statement:
         found: dict[str, Document] = {}
         for name, result in needed.items():
             if isinstance(result, str):
-                reason = f": {text(result)}" if result else "; <code>rack reproduce</code> with the same folder goes on"
-                return Assessment(Side(), Ruling.UNMADE, f"The experiment {text(name)} has not been made{reason}.")
+                reason = (
+                    f": {text(result)}"
+                    if result
+                    else "; <code>rack reproduce</code> with the same folder goes on"
+                )
+                return Assessment(
+                    Side(), Ruling.UNMADE, f"The experiment {text(name)} has not been made{reason}."
+                )
             if result.lacking:
                 return Assessment(Side(), Ruling.UNTESTABLE, f"{text(result.lacking)}.")
             found[name] = result.found
@@ -71,7 +85,11 @@ class Chapter:
     @property
     def experiments(self) -> tuple[Experiment, ...]:
         """All experiments that it needs, each once."""
-        return tuple({one.name: one for statement in self.statements for one in statement.experiments}.values())
+        return tuple(
+            {
+                one.name: one for statement in self.statements for one in statement.experiments
+            }.values()
+        )
 
     def section(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageSection:
         """Return the section with every claim judged."""

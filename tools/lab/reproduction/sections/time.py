@@ -10,12 +10,13 @@ from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, St
 
 def _goto(workshop: Workshop) -> Side:
     return Side.of(
-        f"A is a pose above the first object's goal, B the start. In a task, {code('by')} is the simulated time by "
-        "which an action must be done. The task's planner rehearses the whole program before anything moves and adds "
-        "up the longest times of planning, waiting for the grid, motion and settling. It refuses a time that it "
-        "cannot promise, and names the earliest that it can. We first run without times, then with "
-        f"{100 * TOO_EARLY:g} % of the time that took, then with the time that the refusal names, rounded up to a "
-        "tenth of a second."
+        f"A is a pose above the first object's goal, B the start. In a task, {code('by')} is the"
+        " simulated time by which an action must be done. The task's planner rehearses the whole"
+        " program before anything moves and adds up the longest times of planning, waiting for the"
+        " grid, motion and settling. It refuses a time that it cannot promise, and names the"
+        f" earliest that it can. We first run without times, then with {100 * TOO_EARLY:g} % of the"
+        " time that took, then with the time that the refusal names, rounded up to a tenth of a"
+        " second."
     )
 
 
@@ -32,16 +33,20 @@ def _goto_tested(findings: Findings) -> Assessment:
         for one in (soft, early, met)
     ]
     head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
-    side = Side.of(Columns(head, rows, f"At A: {findings[DEADLINE.name]['place']} m. Runs in lockstep."))
+    side = Side.of(
+        Columns(head, rows, f"At A: {findings[DEADLINE.name]['place']} m. Runs in lockstep.")
+    )
     is_refused = early["done_s"] is None and not early["moved"]
     is_met = met["done_s"] is not None and met["done_s"] <= met["by_s"]
     if is_refused and is_met:
         why = (
-            f"By {early['by_s']:g} s is refused before anything moves; by {met['by_s']:g} s is promised, and done at "
-            f"{met['done_s']:g} s. Without a time nothing is promised."
+            f"By {early['by_s']:g} s is refused before anything moves; by {met['by_s']:g} s is"
+            f" promised, and done at {met['done_s']:g} s. Without a time nothing is promised."
         )
         return Assessment(side, Ruling.HOLDS, why)
-    return Assessment(side, Ruling.FAILS, f"Refused when it must be: {is_refused}; met when promised: {is_met}.")
+    return Assessment(
+        side, Ruling.FAILS, f"Refused when it must be: {is_refused}; met when promised: {is_met}."
+    )
 
 
 CHAPTER = Chapter(
@@ -52,9 +57,12 @@ CHAPTER = Chapter(
         Statement(
             name="soft-and-real-time",
             title="GOTO A, and GOTO A BY t",
-            quote="A sequence of robot commands GOTO A, GOTO B, does not contain any timing information. ... However, "
-            "the command GOTO A BY t<sub>i</sub>, GOTO B BY t<sub>i+1</sub> ... demands real time handling. Now, a "
-            "solution must be supplied within an explicit time.",
+            quote=(
+                "A sequence of robot commands GOTO A, GOTO B, does not contain any timing"
+                " information. ... However, the command GOTO A BY t<sub>i</sub>, GOTO B BY"
+                " t<sub>i+1</sub> ... demands real time handling. Now, a solution must be supplied"
+                " within an explicit time."
+            ),
             experiments=(DEADLINE,),
             predicted=_goto,
             tested=_goto_tested,

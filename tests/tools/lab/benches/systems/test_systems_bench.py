@@ -50,7 +50,13 @@ def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: P
     config = load(path)
     layout = wire(config)
     found = prediction(config, rack_timing(config, layout), layout)
-    assert (found.levels, found.rates_hz, found.longest_cycle_ms, found.command_ms, found.fits) == ((), (), 0, 0, None)
+    assert (found.levels, found.rates_hz, found.longest_cycle_ms, found.command_ms, found.fits) == (
+        (),
+        (),
+        0,
+        0,
+        None,
+    )
     assert hold_for(config, rack_timing(config, layout), layout, 10.0) is None
 
 
@@ -67,10 +73,14 @@ def test_the_highest_level_that_responds_within_the_run_is_held() -> None:
 
 
 @pytest.mark.slow
-def test_a_rack_is_compared_by_its_runs(jointed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rack_is_compared_by_its_runs(
+    jointed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     pictures = tmp_path / "pictures"
-    done = rack("bench", "systems", jointed, "--seconds", 1, "--share", "--json", "--plot", pictures)
+    done = rack(
+        "bench", "systems", jointed, "--seconds", 1, "--share", "--json", "--plot", pictures
+    )
     found = json.loads(done.stdout)
     (one,) = found["systems"]
     assert done.returncode == (0 if one["worked"] else 1)
@@ -84,7 +94,8 @@ def test_a_rack_is_compared_by_its_runs(jointed: Path, tmp_path: Path, monkeypat
     assert ran["hold"]["fate"] == "acted on"
     assert ran["hold"]["measured_ms"] >= 25.0
     assert set(ran["bus"]) == set(ran["board_loads"]) == {"path", *NAMES, "arm"}
-    # A board of a joint reads one command and one status in each of 400 cycles a second, and writes at least as much.
+    # A board of a joint reads one command and one status in each of 400 cycles a second, and writes
+    # at least as much.
     assert all(ran["bus"][name]["accesses"] > 2 * 380 for name in NAMES)
     assert sum(ran["board_loads"].values()) == pytest.approx(sum(ran["loads"].values()))
     assert ran["plans"] == []
@@ -93,13 +104,16 @@ def test_a_rack_is_compared_by_its_runs(jointed: Path, tmp_path: Path, monkeypat
     kills = {kill["board"]: kill for kill in one["kills"]["detections"]}
     assert set(kills) == {"path", *NAMES, "arm", "clock"}
     assert one["kills"]["speed"] > 0
-    # In lockstep the clock waits for the end of what it killed; a message is stale after four of its writer's cycles.
+    # In lockstep the clock waits for the end of what it killed; a message is stale after four of
+    # its writer's cycles.
     assert {kill["rack"] for kill in kills.values()} == {0}
     assert {kills[name]["by"] for name in NAMES} == {"arm"}
     assert all(3 <= kills[name]["neighbour"] <= 5 for name in (*NAMES, "arm"))
 
 
-def test_a_config_with_mistakes_is_refused_before_any_rack_runs(jointed: Path, tmp_path: Path) -> None:
+def test_a_config_with_mistakes_is_refused_before_any_rack_runs(
+    jointed: Path, tmp_path: Path
+) -> None:
     done = rack("bench", "systems", jointed, tmp_path / "none.toml")
     assert done.returncode == 2
     assert "no such file" in done.stderr

@@ -1,4 +1,5 @@
-"""The same motion by every rack with a PUMA 560: one set of poses in every form, and its measurement."""
+"""The same motion by every rack with a PUMA 560: one set of poses in every form, and its
+measurement."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ def test_every_form_of_the_motion_has_the_same_poses() -> None:
     steps = read(TASKS / "three-motions.toml")["task"]["step"]
     assert [step["joints"] for step in steps if step["do"] == "move"] == three_poses().tolist()
     moved: list[tuple[float, ...]] = []
-    runpy.run_path(str(TASKS / "three_poses.py"), {"move": moved.append, "wait": lambda request: None})
+    runpy.run_path(
+        str(TASKS / "three_poses.py"), {"move": moved.append, "wait": lambda request: None}
+    )
     assert [list(pose) for pose in moved] == three_poses().tolist()
     tables = CONFIGS / "nist-state-table" / "tables"
     places = read(tables / "three_poses_move.toml")["plan"]["place"]
@@ -41,7 +44,9 @@ def test_every_form_of_the_motion_has_the_same_poses() -> None:
 
 
 def test_all_racks_move_the_same_arm_from_the_same_start_within_the_same_limits() -> None:
-    assert {"nasrem", "rccl", "chimera", "brown", "ibm", "nist-state-table", "penn"} <= set(_moving())
+    assert {"nasrem", "rccl", "chimera", "brown", "ibm", "nist-state-table", "penn"} <= set(
+        _moving()
+    )
     first, *others = (load(poses_config(name) or name).robot for name in _moving())
     for other in others:
         assert all(getattr(other, name) == getattr(first, name) for name in LIMITS)
@@ -49,16 +54,22 @@ def test_all_racks_move_the_same_arm_from_the_same_start_within_the_same_limits(
 
 def test_a_rack_has_a_motion_only_with_a_config_of_its_own() -> None:
     assert poses_config("nasrem") == CONFIGS / "nasrem-three-poses.toml"
-    assert poses_config(str(CONFIGS / "rccl" / "rccl.toml")) == CONFIGS / "rccl" / "three-poses.toml"
+    assert (
+        poses_config(str(CONFIGS / "rccl" / "rccl.toml")) == CONFIGS / "rccl" / "three-poses.toml"
+    )
     assert poses_config("fig2") is None
     assert poses_config("none.toml") is None
 
 
 @pytest.mark.slow
-def test_an_operator_stops_the_arm_on_its_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_operator_stops_the_arm_on_its_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(motion, "LONGEST_S", 4.2)
     monkeypatch.setattr(motion, "STOPPING_S", 1.0)
-    bench = PosesBench(CONFIGS / "nist-state-table" / "three-poses.toml", "test-three-poses", share=True)
+    bench = PosesBench(
+        CONFIGS / "nist-state-table" / "three-poses.toml", "test-three-poses", share=True
+    )
     found = bench.measure(tmp_path / "run")
     assert found.reached == len(three_poses())
     assert 0.0 < found.rms_mrad < found.peak_mrad < 2.0

@@ -5,7 +5,12 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import rack_timing
-from rack.tools.lab.benches.systems.realtime import ages_ms, board_loads, bus_traffic, plan_latencies
+from rack.tools.lab.benches.systems.realtime import (
+    ages_ms,
+    board_loads,
+    bus_traffic,
+    plan_latencies,
+)
 from rack.tools.recording.cycles import cycles_of
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
@@ -35,7 +40,9 @@ def test_a_board_counts_with_its_planner(recording: Recording) -> None:
     lasted_s = ticks * layout.clock_ns * 1e-9
     assert set(found) == {"servo", "primitive", "elemental_move", "task", "world"}
     counted = [tasks[name] for name in ("servo", "servo.planner")]
-    assert found["servo"].accesses * lasted_s == pytest.approx(sum(one["reads"] + one["writes"] for one in counted))
+    assert found["servo"].accesses * lasted_s == pytest.approx(
+        sum(one["reads"] + one["writes"] for one in counted)
+    )
     assert found["servo"].bytes * lasted_s == pytest.approx(
         sum(one["read_bytes"] + one["write_bytes"] for one in counted)
     )
@@ -49,6 +56,7 @@ def test_commands_age_until_the_lowest_level_reads_them(recording: Recording) ->
     down, up = (ages_ms(recording, timing, down=down) for down in (True, False))
     assert down is not None
     assert up is not None
-    # The primitive level writes every 20 ms, and its command is read from the end of its cycle on, for 20 ms.
+    # The primitive level writes every 20 ms, and its command is read from the end of its cycle on,
+    # for 20 ms.
     assert (down["min"], down["max"]) == (20.0, 37.5)
     assert (up["min"], up["max"]) == (2.5, 2.5)

@@ -13,7 +13,9 @@ from rack.tools.lab.benches.systems.prediction import SystemPrediction
 from rack.tools.lab.benches.systems.realtime import BusTraffic, PlanLatency
 from rack.tools.lab.benches.systems.tables import Systems
 
-PROMISED = SystemPrediction(("top", "low"), 2, 0, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True)
+PROMISED = SystemPrediction(
+    ("top", "low"), 2, 0, 3, (50.0, 400.0), 20.0, 40.0, 22.5, 22.5, 40.0, {0: 0.5}, True
+)
 TIMES = {"min": 20.0, "p50": 22.5, "p99": 22.5, "p99_9": 22.5, "max": 25.0}
 HOLD = HoldResponse("top", "acted on", 30.0, 42.5, 31.0)
 RAN = RealTimeFigures(
@@ -32,12 +34,18 @@ RAN = RealTimeFigures(
     board_loads={"top": 0.1, "low": 0.3},
 )
 KILLS = KilledBoards(
-    (KillDetection("top", 0, None, ""), KillDetection("low", 1, 9, "top"), KillDetection("host", 0, 4, "low")),
+    (
+        KillDetection("top", 0, None, ""),
+        KillDetection("low", 1, 9, "top"),
+        KillDetection("host", 0, 4, "low"),
+    ),
     2.5,
     8.0,
     "",
 )
-POSES = PosesRun(0.5, 5.0, 0.1, 0.4, 0.2, 3, Stop("top", 0.8, 398.0), Stop("emergency stop", 0.8, None))
+POSES = PosesRun(
+    0.5, 5.0, 0.1, 0.4, 0.2, 3, Stop("top", 0.8, 398.0), Stop("emergency stop", 0.8, None)
+)
 FOUND = SystemFigures("one", PROMISED, RAN, KILLS, POSES, "")
 
 
@@ -46,7 +54,9 @@ def _rows(found: Systems, rack: str) -> list[list[str]]:
 
 
 def test_a_rack_has_a_row_in_the_table_of_each_theme() -> None:
-    made, answered, stopped, first_plan, host, used, late, killed, moved = _rows(Systems((FOUND,), 1.0, None), "one")
+    made, answered, stopped, first_plan, host, used, late, killed, moved = _rows(
+        Systems((FOUND,), 1.0, None), "one"
+    )
     assert made == ["one", "2", "2", "0", "3", "1", "50", "400", "0.50", "yes"]
     spans = ["22.5/25"] * 2
     assert answered == ["one", "20", "40", "22.5", "25", "22.5/25", "40", "22.5/25", *spans]
@@ -60,9 +70,21 @@ def test_a_rack_has_a_row_in_the_table_of_each_theme() -> None:
 
 
 def test_what_a_rack_lacks_is_shown_as_such() -> None:
-    still = replace(RAN, commanded="", command_bound_ms=None, command_ms=None, hold=None, plans=(), late=None)
-    none = replace(FOUND, rack="none", predicted=replace(PROMISED, levels=(), rates_hz=()), realtime=still, poses=None)
-    lines = list(Systems((FOUND, none), 1.0, Absent("cyclictest", "no program", "apt-get install rt-tests")).lines())
+    still = replace(
+        RAN, commanded="", command_bound_ms=None, command_ms=None, hold=None, plans=(), late=None
+    )
+    none = replace(
+        FOUND,
+        rack="none",
+        predicted=replace(PROMISED, levels=(), rates_hz=()),
+        realtime=still,
+        poses=None,
+    )
+    lines = list(
+        Systems(
+            (FOUND, none), 1.0, Absent("cyclictest", "no program", "apt-get install rt-tests")
+        ).lines()
+    )
     assert "one: top > low" in lines
     assert "none: no level above another" in lines
     assert "no plan made in the run: none" in lines
@@ -73,21 +95,27 @@ def test_what_a_rack_lacks_is_shown_as_such() -> None:
 
 
 def test_no_line_is_wider_than_a_page() -> None:
-    long = replace(FOUND, rack="nist-state-table", predicted=replace(PROMISED, rates_hz=(50.0, 50.0, 400.0)))
+    long = replace(
+        FOUND, rack="nist-state-table", predicted=replace(PROMISED, rates_hz=(50.0, 50.0, 400.0))
+    )
     assert max(map(len, Systems((FOUND, long), 10.0, None).lines(120))) <= 120
 
 
 def test_a_rack_fails_by_its_run_and_a_late_hold_is_named() -> None:
     failed = replace(FOUND, failure="board lost: servo")
     late = replace(FOUND, rack="late", realtime=replace(RAN, hold=replace(HOLD, measured_ms=45.0)))
-    overtaken = replace(FOUND, realtime=replace(RAN, hold=replace(HOLD, fate="overtaken", measured_ms=None)))
+    overtaken = replace(
+        FOUND, realtime=replace(RAN, hold=replace(HOLD, fate="overtaken", measured_ms=None))
+    )
     assert Systems((FOUND, late, overtaken), 1.0, None).worked
     assert not Systems((FOUND, failed), 1.0, None).worked
     assert list(Systems((FOUND, failed), 1.0, None).lines())[-1] == "one: board lost: servo"
     *_, last = Systems((FOUND, late), 1.0, None).lines()
     assert last == "late: the response to the hold took longer than the longest on the grid"
     queued = replace(FOUND, realtime=replace(RAN, commanded="low"))
-    below = "one: down is measured from low: the wait in the queue above it does not count as response"
+    below = (
+        "one: down is measured from low: the wait in the queue above it does not count as response"
+    )
     assert below in Systems((queued,), 1.0, None).lines()
     assert any("overtaken" in line for line in Systems((overtaken,), 1.0, None).lines())
     assert RAN.held
