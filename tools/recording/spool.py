@@ -156,6 +156,9 @@ class Spool:
 
     def add(self, ring: str, rows: np.ndarray, lost: int) -> None:
         """Add rows from a ring."""
+        if lost and self._waiting[ring]:
+            # A frame's lost rows are those before its first.
+            self.flush(now=True)
         if len(rows):
             self._waiting[ring].append(rows)
         self._lost[ring] += lost

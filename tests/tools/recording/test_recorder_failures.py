@@ -18,9 +18,10 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from rack.backplane.segment import racks
+from rack.backplane.segment import Launch, racks
+from rack.backplane.trace import RECORD
 from rack.boards import Rack
-from rack.boards.config import RackConfig, load
+from rack.boards.config import RackConfig, load, wire
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
@@ -30,7 +31,7 @@ from rack.tools.recording import recorder_process
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.spool import SPOOL, mend
+from rack.tools.recording.spool import SPOOL, Spool, mend
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.analysis.tables import text as analysis_text
@@ -528,3 +529,18 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
         found.append(pq.read_metadata(folder / "signals.parquet").num_rows)
     assert found == sorted(found, reverse=True)
     assert found[0] > 200 > found[-1]
+
+
+def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(config: RackConfig, tmp_path: Path) -> None:
+    (tmp_path / CONFIG).write_text(config.text())
+    rows = np.zeros(300, dtype=RECORD)
+    rows["tick"] = np.arange(300)
+    spool = Spool(tmp_path, wire(config), Launch(*range(1, 1 + len(Launch._fields))))
+    spool.add("lower", rows[:100], 0)
+    spool.flush(now=True)
+    # Two drains that one flush writes, with rows lost between them.
+    spool.add("lower", rows[100:120], 0)
+    spool.add("lower", rows[220:], 100)
+    spool.flush(now=True)
+    spool.close()
+    assert [str(gap) for gap in Recording(tmp_path).gaps()] == ["ticks 120 to 219 of lower are not recorded"]
