@@ -211,20 +211,12 @@ class Recording:
 
     def untraced(self) -> dict[str, tuple[int, int]]:
         """Return the tasks with cycles that are not recorded: how many are, and of how many."""
-        ran = {
-            name: task["plans" if name.endswith(".planner") else "cycles"]
-            for name, task in self._counts.items()
-        }
+        traced = {task.name: len(self.trace(task.name)) for task in self.layout.tasks}
         return {
-            name: (len(self.cycles.get(name, ())), count)
-            for name, count in ran.items()
+            name: (rows, rows + self.lost[name])
+            for name, rows in traced.items()
             if self.lost.get(name)
         }
-
-    @property
-    def _counts(self) -> dict[str, dict[str, int]]:
-        found: dict[str, dict[str, int]] = self.ended.get("tasks", {})
-        return found
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what the files lack of the rings of a rack that has ended, by task and by

@@ -531,7 +531,9 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
     assert found[0] > 200 > found[-1]
 
 
-def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(config: RackConfig, tmp_path: Path) -> None:
+def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(
+    config: RackConfig, tmp_path: Path
+) -> None:
     (tmp_path / CONFIG).write_text(config.text())
     rows = np.zeros(300, dtype=RECORD)
     rows["tick"] = np.arange(300)
@@ -543,4 +545,26 @@ def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(config: RackConfig,
     spool.add("lower", rows[220:], 100)
     spool.flush(now=True)
     spool.close()
-    assert [str(gap) for gap in Recording(tmp_path).gaps()] == ["ticks 120 to 219 of lower are not recorded"]
+    assert [str(gap) for gap in Recording(tmp_path).gaps()] == [
+        "ticks 120 to 219 of lower are not recorded"
+    ]
+
+
+def test_a_recorder_that_comes_after_the_start_says_of_how_many_cycles_its_figures_are(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    (tmp_path / CONFIG).write_text(config.text())
+    with Rack(config) as rack:
+        # The rings hold two seconds.
+        rack.run(4.0)
+        with Recorder(rack.segment, tmp_path) as recorder:
+            recorder.drain()
+    recording = Recording(tmp_path)
+    taken = len(recording.cycles["lower"])
+    assert recording.untraced()["lower"] == (taken, 1600)
+    (gap,) = recording.gaps()
+    assert (gap.first, set(gap.rings)) == (
+        0,
+        {name for name, lost in recording.lost.items() if lost},
+    )
+    assert f"lower: judged by {taken:,} of 1,600 cycles" in analysis_text(Analysis.of(recording))
