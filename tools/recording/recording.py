@@ -195,12 +195,12 @@ class Recording:
             found = json.loads(self._cycles.metadata.metadata.get(b"gaps", b"[]"))
         for name, count in lost.items():
             if count > self._lost_before_the_end.get(name, 0):
-                recorded = name in self.cycles or name in self.mailboxes
-                found.append(
-                    (name, int(self.rows(name)["tick"][-1]) + 1 if recorded else 0, ticks - 1)
-                )
+                found.append((name, self._last_tick(name) + 1, ticks - 1))
         merged: list[Gap] = []
-        for ring, first, last in sorted(found, key=lambda gap: gap[1]):
+        # A row of the last tick itself may be missing: there is no tick after it.
+        for ring, first, last in sorted(
+            ((name, min(first, last), last) for name, first, last in found), key=lambda gap: gap[1]
+        ):
             if merged and first <= merged[-1].last + 1:
                 before = merged.pop()
                 rings = tuple(dict.fromkeys((*before.rings, ring)))
@@ -208,6 +208,12 @@ class Recording:
             else:
                 merged.append(Gap(first, last, (ring,)))
         return merged
+
+    def _last_tick(self, name: str) -> int:
+        """Return the tick of the newest row of a task or mailbox; -1 if there is none."""
+        if name in self.cycles:
+            return int(self.cycles[name]["tick"][-1])
+        return int(self.signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
     def untraced(self) -> dict[str, tuple[int, int]]:
         """Return the tasks with cycles that are not recorded: how many are, and of how many."""
