@@ -183,6 +183,11 @@ def adopt_orphans() -> None:
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
+def how_ended(status: int) -> str:
+    """Return how a process ended, by its exit status; those below 0 stand for signals."""
+    return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+
+
 def children_of(parent: int) -> set[int]:
     """Return the children of a process, those that have ended and are not reaped included."""
     pids = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")]

@@ -18,10 +18,10 @@ def extend_path(folders: Sequence[Path]) -> None:
     sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
 
 
-def find_class(reference: str, base: type[T]) -> type[T]:
+def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
     """Return the subclass of `base` that "package.module:Class" names. Raises `LookupError` with
-    the reason."""
-    module, name = module_and_name(reference)
+    the reason. `is_tried` is that of `module_and_name`."""
+    module, name = module_and_name(reference, is_tried)
     found = getattr(module, name, None)
     if not isinstance(found, type) or not issubclass(found, base):
         kinds = [

@@ -6,8 +6,9 @@ as such, the reference of its tests. Alternatives considered: a C extension (use
 compiler), `jit` at import (numba takes 0.4 s to import, and most commands compute nothing).
 
 Without `fastmath` the order of operations is the source's, so the bits do not depend on the
-processor. Compiled code is kept from run to run. numba itself notices a change in the function, not
-in those that it calls: so the cache of each state of the sources has its own folder.
+processor. Compiled code is kept from run to run. numba's own cache was rejected: it fails on a
+damaged file, runs code with flipped bits, and notices a change in the function, not in those that
+it calls.
 """
 
 from __future__ import annotations
@@ -16,19 +17,29 @@ import os
 import pickle
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
-from tempfile import TemporaryFile
-from types import FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, Generic, ParamSpec, TypeVar
 
+import numpy as np
+
 DIGEST = 16
+"""Bytes of a digest."""
 CURE = "XDG_CACHE_HOME=FOLDER names one that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
+
+
+def unheard(function: str) -> None:
+    """Tell nobody that a function is compiled."""
+
+
+on_compile: Callable[[str], object] = unheard
+"""Called with the name of each function before it is compiled, which takes seconds."""
 
 
 class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
@@ -36,7 +47,7 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     others marked so."""
 
     def __init__(self, function: Callable[_P, _R]) -> None:
-        self._function = function
+        self._function: Any = function
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -48,80 +59,134 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         """Return the compiled function; it is compiled, or read from the cache, at the first call
         with its types."""
         if self._machine is None:
-            self._machine = _jit(self._function)
+            self._machine = _jit(self)
         return self._machine
 
+    def source(self) -> Iterator[bytes]:
+        """Yield what determines the machine code: instructions, constants, and the values of names,
+        functions that are called included. Comments, docstrings and places in files do not."""
+        code = self._function.__code__
+        known = self._function.__globals__
+        yield from _instructions(code, self._function.__doc__)
+        yield repr(self._function.__defaults__).encode()
+        for name in code.co_names:
+            # Others are attributes, or Python's own.
+            if name in known:
+                yield name.encode()
+                yield from _value(known[name])
 
-def _jit(function: Any) -> Any:
+
+def _jit(marked: compiled[..., Any]) -> Any:
     """Compile a function; those that it calls, if marked, are replaced by their compiled selves."""
     from numba import njit
 
-    folder = _use_cache()
-    names = function.__code__.co_names
+    function: Any = marked._function
     known = function.__globals__
-    called = {name: known[name].load() for name in names if isinstance(known.get(name), compiled)}
+    called = {
+        name: known[name].load()
+        for name in function.__code__.co_names
+        if isinstance(known.get(name), compiled)
+    }
     bound = FunctionType(
         function.__code__, known | called, function.__name__, function.__defaults__
     )
     bound.__module__ = function.__module__
     bound.__qualname__ = function.__qualname__
-    function = njit(cache=bool(folder), error_model="numpy")(bound)
-    if folder:
-        _forgive(function._cache)
-    else:
-        _tell(bound)
-    return function
+    machine = njit(error_model="numpy")(bound)
+    name = f"{function.__module__}.{function.__qualname__}"
+    machine._cache = _Kept(name, _digest(b"".join(marked.source())))  # type: ignore[attr-defined]  # numba makes it
+    return machine
 
 
-NEWS: list[Callable[[str], object]] = []
-"""Called with the name of each function before it is compiled."""
+class _Kept:
+    """The compiled code of one function: a file for each tuple of types, which begins with its
+    digest. numba asks it before it compiles, and gives it the result.
 
+    Files are replaced whole, so processes that compile the same at once do not disturb each other.
+    """
 
-def _forgive(kept: Any) -> None:
-    """Let a function do without what is kept of it where that is damaged or cannot be written, and
-    say so."""
-    load = kept.load_overload
-    save = kept.save_overload
-    files = kept._cache_file
+    def __init__(self, name: str, source: bytes) -> None:
+        self._name = name
+        self._source = source.hex()
 
-    def save_sealed(name: str, found: Any) -> None:
-        content: bytes = files._dump(found)
-        with files._open_for_write(files._data_path(name)) as file:
-            file.write(_digest(content) + content)
+    def load_overload(self, types: Any, target: Any) -> Any:
+        """Return the code for these types; None if there is none, or not as it was written."""
+        from numba.core.compiler import CompileResult
 
-    def load_sealed(name: str) -> Any:
-        sealed = Path(files._data_path(name)).read_bytes()
-        # Damaged machine code must never run.
-        if _digest(sealed[DIGEST:]) != sealed[:DIGEST]:
-            raise ValueError(f"{name} is not what was written")
-        return pickle.loads(sealed[DIGEST:])
+        target.refresh()
+        path = self._path(types, target.codegen())
+        if path.exists():
+            content = path.read_bytes() if path.is_file() else b""
+            code = content[DIGEST:]
+            # Damaged machine code must never run.
+            if content[:DIGEST] == _digest(code):
+                return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
+            _say(f"{path}: damaged; compiled again")
+            _remove(path)
+        on_compile(self._name)
+        return None
 
-    def load_or_compile(signature: Any, context: Any) -> Any:
-        found = None
+    def save_overload(self, types: Any, result: Any) -> None:
+        """Keep the code for these types, and none of an earlier state of the function; say so if
+        it cannot be kept."""
+        from numba.core.serialize import dumps
+
+        if result.library.has_dynamic_globals:
+            # It holds addresses of this process.
+            return
+        path = self._path(types, result.codegen)
+        code: bytes = dumps(result._reduce())  # type: ignore[no-untyped-call]
+        part = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
         try:
-            found = load(signature, context)
-        except Exception as error:
-            _say(f"{files._index_path}: damaged ({error or type(error).__name__}); compiled again")
-            _remove(Path(files._index_path))
-        if found is None:
-            _tell(kept._py_func)
-        return found
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_bytes(_digest(code) + code)
+            part.replace(path)
+        except OSError as error:
+            _remove(part)
+            _say(
+                f"{path.parent}: compiled code cannot be kept, and every launch compiles:"
+                f" {error.strerror}; {CURE}"
+            )
+        for old in path.parent.glob(f"{self._name}-*"):
+            if not old.name.startswith(f"{self._name}-{self._source}-"):
+                _remove(old)
 
-    def save_if_possible(signature: Any, data: Any) -> None:
-        try:
-            save(signature, data)
-        except Exception as error:
-            _say(f"{kept.cache_path}: compiled code cannot be kept: {error}; {CURE}")
+    def _path(self, types: Any, codegen: Any) -> Path:
+        from numba import __version__
 
-    files._load_data = load_sealed
-    files._save_data = save_sealed
-    kept.load_overload = load_or_compile
-    kept.save_overload = save_if_possible
+        build = repr((__version__, sys.version, types, codegen.magic_tuple())).encode()
+        return _folder() / f"{self._name}-{self._source}-{_digest(build).hex()}"
 
 
-def _tell(function: FunctionType) -> None:
-    for tell in NEWS:
-        tell(function.__qualname__)
+def _instructions(code: CodeType, docstring: str | None = None) -> Iterator[bytes]:
+    yield code.co_code
+    yield repr((code.co_names, code.co_varnames)).encode()
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _instructions(constant)
+        elif constant != docstring:
+            yield repr(constant).encode()
+
+
+def _value(value: object) -> Iterator[bytes]:
+    match value:
+        case compiled():
+            yield from value.source()
+        case ModuleType(__name__="math" | "numpy" as name):
+            yield name.encode()
+        case np.ndarray():
+            yield repr((value.dtype, value.shape)).encode() + value.tobytes()
+        case bool() | int() | float() | str() | tuple() | np.dtype() | np.generic() | type():
+            yield repr(value).encode()
+        case _:
+            raise TypeError(f"{value!r} is no constant of compiled code")
+
+
+@cache
+def _folder() -> Path:
+    """Return the folder of the code that is compiled from this checkout."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
+    return home / _digest(bytes(Path(__file__).parent)).hex()
 
 
 def _digest(content: bytes) -> bytes:
@@ -141,36 +206,3 @@ def _say(text: str) -> None:
     """Print a line, once."""
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()
-
-
-@cache
-def _use_cache() -> str:
-    """Make numba cache its code in a folder for the present sources; remove the folders of earlier
-    ones.
-
-    Return the folder; an empty text if it cannot be written.
-    """
-    import numba
-
-    levels = Path(__file__).parent
-    sources = blake2b(digest_size=8)
-    for path in sorted(levels.rglob("*.py")):
-        sources.update(path.read_bytes())
-    here = blake2b(bytes(levels), digest_size=8).hexdigest()
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
-    folder = home / f"{here}-{sources.hexdigest()}"
-    try:
-        if not folder.exists():
-            for old in home.glob(f"{here}-*"):
-                shutil.rmtree(old, ignore_errors=True)
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        _say(
-            f"{folder}: compiled code cannot be kept, and every launch compiles: {error.strerror};"
-            f" {CURE}"
-        )
-        return ""
-    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba makes it from its environment
-    return str(folder)

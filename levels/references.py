@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import importlib
 import os
-import select
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import suppress
+from functools import cache
 from types import ModuleType
+
+from rack.backplane.process import die_with_parent, how_ended, readable
 
 SLOW_S = 2.0
 IMPORT_S = 60.0
-"""Time after which a user hears that a module is still being imported, and after which the process
-is ended."""
+"""Time after which a user hears that a module is still being imported, and after which it is
+refused."""
+IMPORTED = 117
+"""Exit status of a child that has come to the end of an import: few modules end with it."""
 
 MOVED = {
     "rack.boards.adapters": "rack.boards.host",
@@ -45,14 +48,18 @@ def current(reference: str) -> str:
     return reference
 
 
-def module_and_name(reference: str) -> tuple[ModuleType, str]:
+def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, str]:
     """Return the module that "package.module:Name" names, imported, and the name in it. Raises
-    `LookupError`."""
+    `LookupError`.
+
+    With `is_tried` no module of a user's can end this process, or hold it for ever.
+    """
     module, _, name = current(reference).partition(":")
-    is_ours = module in sys.modules or module.startswith("rack.")
+    is_new = module not in sys.modules and not module.startswith("rack.")
     try:
-        with nullcontext() if is_ours else _watched(module):
-            return importlib.import_module(module), name
+        if is_tried and is_new and (reason := _trial(module)):
+            raise ImportError(reason)
+        return importlib.import_module(module), name
     except (
         Exception,
         SystemExit,
@@ -60,40 +67,38 @@ def module_and_name(reference: str) -> tuple[ModuleType, str]:
         raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
 
 
-@contextmanager
-def _watched(module: str) -> Iterator[None]:
-    """Let a process watch the import of a user's module: one that ends this process, or loops,
-    could not be named."""
-    asked, told = os.pipe()
-    watcher = os.fork()
-    if watcher == 0:
-        os.close(told)
-        _watch(module, asked)
-        os._exit(0)
-    os.close(asked)
+# A config is checked for many mistakes, and each may need the module.
+@cache
+def _trial(module: str) -> str:
+    """Import a module in a child; return why it must not be imported here, if so. What it raises is
+    no such reason."""
+    parent = os.getpid()
     try:
-        yield
+        child = os.fork()
+    except OSError:
+        # The launch says which limit is reached.
+        return ""
+    if child == 0:
+        try:
+            # Signals of the terminal are the parent's to answer.
+            os.setsid()
+            die_with_parent(parent)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            with suppress(Exception, SystemExit):
+                importlib.import_module(module)
+            os._exit(IMPORTED)
+        finally:
+            os._exit(1)
+    ended = os.pidfd_open(child)
+    try:
+        if not readable(ended, SLOW_S):
+            sys.stderr.write(f"importing '{module}', for at most {IMPORT_S:g} s\n")
+            sys.stderr.flush()
+        is_over = readable(ended, IMPORT_S - SLOW_S)
     finally:
-        os.write(told, b"done")
-        os.close(told)
-        os.waitpid(watcher, 0)
-
-
-def _watch(module: str, asked: int) -> None:
-    """Wait until the parent has imported the module, or is gone; end it if it takes too long."""
-    # Ctrl-C reaches the whole group, but the parent decides how it ends.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if not select.select([asked], [], [], SLOW_S)[0]:
-        _say(f"importing '{module}', at most {IMPORT_S:g} s")
-        if not select.select([asked], [], [], IMPORT_S - SLOW_S)[0]:
-            _say(f"'{module}' was not imported within {IMPORT_S:g} s")
-            os.kill(os.getppid(), signal.SIGTERM)
-            if not select.select([asked], [], [], SLOW_S)[0]:
-                os.kill(os.getppid(), signal.SIGKILL)
-            return
-    if not os.read(asked, 1):
-        _say(f"'{module}' ended the process while it was imported")
-
-
-def _say(text: str) -> None:
-    os.write(2, f"{text}\n".encode())
+        os.kill(child, signal.SIGKILL)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        os.close(ended)
+    if not is_over:
+        return f"not done within {IMPORT_S:g} s"
+    return "" if status == IMPORTED else f"it ended the process: {how_ended(status)}"

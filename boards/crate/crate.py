@@ -131,13 +131,13 @@ class Crate:
         """Load what boards share with the crate. Mistakes in the config are left for the Rack to
         report."""
         sys.path[:] = wanted.path
-        compiled.NEWS[:] = [lambda function: self._line.send(Compiling(function))]
+        compiled.on_compile = lambda function: self._line.send(Compiling(function))
         for reference in wanted.classes:
             if reference not in self._preloaded and not self._is_preloaded(reference):
                 return
         if wanted.cell is not None:
             _compile_cell(wanted.cell)
-        compiled.NEWS.clear()
+        compiled.on_compile = compiled.unheard
         gc.freeze()
         gc.enable()
 
@@ -145,7 +145,8 @@ class Crate:
         """Import a class and preload it; return False if it failed to preload."""
         self._line.send(Preloading(reference))
         with suppress(LookupError):
-            kind = find_class(reference, object)
+            # The launcher tries it, and outlives the crate.
+            kind = find_class(reference, object, is_tried=False)
             try:
                 if issubclass(kind, Executor | Planner):
                     kind.preload()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ from rack.backplane.fault_table import FaultTable
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import digest
 from rack.backplane.operator_table import OperatorTable, RequestEntry
+from rack.backplane.process import how_ended
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
@@ -136,7 +136,8 @@ class Rack:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
-        crate.send(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
+        # A level's module may have ended it: then resolving says which.
+        crate.ask(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
         plan = resolve(self.config)
         self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
         plan.check_files()
@@ -323,12 +324,12 @@ class Rack:
     def _lose(self, end: Ended) -> None:
         """Record the end of a board, and restart it or give it up."""
         if hasattr(self, "_hosts") and end.name in self._hosts:
-            if not self._hosts.lose(end, _status(end.status)):
+            if not self._hosts.lose(end, how_ended(end.status)):
                 self._faults.append(
-                    f"host board '{end.name}' ended: {_status(end.status)}; no restarts left"
+                    f"host board '{end.name}' ended: {how_ended(end.status)}; no restarts left"
                 )
             return
-        text = f"board '{end.name}' ended: {_status(end.status)}"
+        text = f"board '{end.name}' ended: {how_ended(end.status)}"
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
         if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
             self._give_up(end.name, text)
@@ -430,7 +431,3 @@ class Rack:
 
 def _cell(config: RackConfig) -> CellConfig | None:
     return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)
-
-
-def _status(status: int) -> str:
-    return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"

@@ -12,6 +12,7 @@ here it ends the process, as the exception would have ended the board.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +49,10 @@ class native(compiled[..., None]):  # noqa: N801  # stands for a function
                 self._name, types.void(*[types.intp] * self._arguments)
             )
         return self._machine
+
+    def source(self) -> Iterator[bytes]:
+        """Yield what a caller's code depends on: it finds the function by name."""
+        yield repr((self._name, self._arguments)).encode()
 
 
 mj_step = native("mj_step", 2)

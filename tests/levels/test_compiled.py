@@ -1,81 +1,190 @@
-"""Compiled code that is kept: damaged, not writable, and who hears that a function is compiled."""
+"""Compiled code that is kept: what it is compiled from, damaged, not writable, and who hears that a
+function is compiled."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
-import sys
-from collections.abc import Callable
+import random
+import string
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-SCRIPT = """
-from rack.levels import compiled
+from rack.levels import compiled as module
+from rack.levels.compiled import compiled
+from tests.processes import FORKS, exit_status, fork
 
-@compiled.compiled
-def twice(number):
-    return number * 2.0
-
-compiled.NEWS.append(print)
-print(twice.load()(21.0))
-"""
-COMPILED, KEPT = ["twice", "42.0"], ["42.0"]
+PROCESSES = 4
+SCALE = 3.0
 
 
-def run(folder: Path) -> tuple[list[str], str]:
-    """Return what a process printed that uses the function, and what it said."""
-    (folder / "script.py").write_text(SCRIPT)
-    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache")}
-    done = subprocess.run(
-        [sys.executable, "script.py"],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines(), done.stderr
+def twice(value: float) -> float:
+    return 2.0 * value
 
 
-def as_folder(path: Path) -> None:
+def scaled(value: float) -> float:
+    return SCALE * value
+
+
+@pytest.fixture(autouse=True)
+def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Names of the functions compiled, in a cache of this test's own."""
+    names: list[str] = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "on_compile", names.append)
+    module._folder.cache_clear()
+    module._say.cache_clear()
+    yield names
+    module._folder.cache_clear()
+    module._say.cache_clear()
+
+
+def called(function: Callable[[float], float] = twice, value: float = 1.5) -> float:
+    """Call a compiled function as a process does that has not used it yet."""
+    return compiled(function).load()(value)
+
+
+def kept(tmp_path: Path) -> list[Path]:
+    """Return the files, or what is in their places."""
+    return sorted((tmp_path / "cache" / "nasrem-rack").glob("*/*"))
+
+
+@pytest.mark.slow
+def test_code_is_compiled_once_for_each_function_and_its_types(
+    heard: list[str], tmp_path: Path
+) -> None:
+    assert [called(), called()] == [3.0, 3.0]
+    assert heard == ["tests.levels.test_compiled.twice"]
+    assert called(value=np.int64(2)) == 4.0
+    assert called(scaled) == 4.5
+    assert len(heard) == len(kept(tmp_path)) == 3
+
+
+SOURCE = string.Template('''
+FACTOR = $factor
+
+@compiled
+def inner(value):
+    """$docstring"""
+    return $inner
+
+@compiled
+def outer(value):
+    # $comment
+    return FACTOR * inner(value)
+''')
+AS_IT_IS = {"factor": "2.0", "docstring": "Add.", "inner": "value + 1.0", "comment": "Both."}
+
+
+def outer_of(**changes: str) -> compiled[[float], float]:
+    """Return a function that uses a constant and calls another one, with changes in its source."""
+    text = SOURCE.substitute(AS_IT_IS | changes)
+    names: dict[str, compiled[[float], float]] = {"compiled": compiled}  # type: ignore[dict-item]
+    exec(compile(text, "outer.py", "exec"), names | {"__name__": "theirs"}, names)
+    outer = names["outer"]
+    # Globals of a module, not the locals of this call.
+    outer._function.__globals__.update(names)
+    return outer
+
+
+@pytest.mark.slow
+def test_what_decides_the_code_decides_whether_it_is_compiled(
+    heard: list[str], tmp_path: Path
+) -> None:
+    assert outer_of().load()(1.0) == 4.0
+    assert heard == ["theirs.outer", "theirs.inner"]
+    before = kept(tmp_path)
+    for same in ({"docstring": "Sum."}, {"comment": "Twice.\n\n"}):
+        assert outer_of(**same).load()(1.0) == 4.0
+    assert (len(heard), kept(tmp_path)) == (2, before)
+    assert outer_of(inner="value + 2.0").load()(1.0) == 6.0
+    assert heard[2:] == ["theirs.outer", "theirs.inner"]
+    assert outer_of(inner="value + 2.0", factor="3.0").load()(1.0) == 9.0
+    # The called one is the same.
+    assert heard[4:] == ["theirs.outer"]
+    # And none of an earlier state stays.
+    assert len(kept(tmp_path)) == 2
+
+
+@pytest.mark.parametrize("value", ["object()", "[1.0]", "__import__('random')"])
+def test_a_name_whose_value_may_change_unseen_is_refused(value: str) -> None:
+    with pytest.raises(TypeError, match="is no constant of compiled code"):
+        outer_of(factor=value).load()
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def overwritten(path: Path) -> None:
+    path.write_bytes(random.Random(1).randbytes(path.stat().st_size))
+
+
+def flipped(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def a_folder(path: Path) -> None:
     path.unlink()
-    path.mkdir()
+    (path / "more").mkdir(parents=True)
 
 
-DAMAGES: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "empty index": ("nbi", lambda path: path.write_bytes(b"")),
-    "truncated index": ("nbi", lambda path: path.write_bytes(path.read_bytes()[:30])),
-    "a folder for an index": ("nbi", as_folder),
-    "truncated code": ("nbc", lambda path: path.write_bytes(path.read_bytes()[:100])),
-    "one bit of the code": ("nbc", lambda path: path.write_bytes(path.read_bytes()[:-1] + b"\x00")),
-}
+def a_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
 
 
 @pytest.mark.slow
-def test_damaged_code_is_compiled_again_and_said(tmp_path: Path) -> None:
-    assert run(tmp_path) == (COMPILED, "")
-    assert run(tmp_path) == (KEPT, "")
-    for name, (kind, damage) in DAMAGES.items():
-        (file,) = (tmp_path / "cache").rglob(f"*.{kind}")
-        damage(file)
-        printed, said = run(tmp_path)
-        assert printed == COMPILED, name
-        assert "damaged (" in said, name
-        assert said.endswith("compiled again\n"), name
-        assert run(tmp_path) == (KEPT, ""), name
+@pytest.mark.parametrize("damage", [empty, cut, overwritten, flipped, a_folder, a_pipe])
+def test_damaged_code_is_compiled_again_and_said(
+    damage: Callable[[Path], None],
+    heard: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    called()
+    (file,) = kept(tmp_path)
+    damage(file)
+    assert called() == 3.0
+    assert capsys.readouterr().err == f"{file}: damaged; compiled again\n"
+    assert called() == 3.0
+    assert len(heard) == 2
+    assert kept(tmp_path) == [file]
+    assert file.is_file()
 
 
 @pytest.mark.slow
-def test_a_cache_that_cannot_be_written_is_said_once_with_its_cure(tmp_path: Path) -> None:
-    # A file in place of the folder: not even root can write into it.
-    (tmp_path / "cache").write_text("")
-    printed, said = run(tmp_path)
-    assert printed == COMPILED
-    (line,) = said.splitlines()
-    assert "compiled code cannot be kept, and every launch compiles" in line
+@pytest.mark.filterwarnings(FORKS)
+def test_processes_that_find_the_damage_at_once_all_get_the_code(
+    heard: list[str], tmp_path: Path
+) -> None:
+    called()
+    a_folder(kept(tmp_path)[0])
+    children = [fork(lambda: called() == 3.0) for _ in range(PROCESSES)]
+    assert [exit_status(child, 60.0) for child in children] == [0] * PROCESSES
+    assert called() == 3.0
+    assert (len(heard), len(kept(tmp_path))) == (1, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["cache", "cache/nasrem-rack"])
+def test_a_cache_that_cannot_be_written_is_said_once_with_its_cure(
+    place: str, heard: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A file in place of a folder: not even root can write into it.
+    file = tmp_path / place
+    file.parent.mkdir(exist_ok=True)
+    file.touch()
+    assert [called(), called(), called(scaled)] == [3.0, 3.0, 4.5]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "compiled code cannot be kept, and every launch compiles: " in line
     assert line.endswith("XDG_CACHE_HOME=FOLDER names one that can be written")
-    (tmp_path / "cache").unlink()
-    shutil.rmtree(tmp_path / "cache", ignore_errors=True)
+    assert len(heard) == 3

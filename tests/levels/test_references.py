@@ -1,8 +1,8 @@
-"""Names of earlier versions in configs."""
+"""Names of earlier versions in configs; modules of users that must not be imported."""
 
 from __future__ import annotations
 
-import signal
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +13,7 @@ from rack.boards import Rack
 from rack.boards.config import CONFIGS, load, loads, wire
 from rack.boards.config.schema import RackConfig
 from rack.levels.references import MOVED, current, module_and_name
-from tests.processes import BOUND_S, RACK
+from tests.processes import BOUND_S, FORKS, children_of, descriptors
 
 SYSTEMS = ("fig2", "nist-state-table", "rccl", "hic", "penn", "chimera", "cell/puma", "cell")
 
@@ -67,48 +67,59 @@ def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
     assert digests[0] == digests[1]
 
 
-def importing(folder: Path, source: str, *setup: str) -> subprocess.Popen[str]:
-    """Return a process that imports a user's module of this source."""
-    (folder / "theirs.py").write_text(source)
-    lines = (
-        "from rack.levels import references",
-        *setup,
-        "references.module_and_name('theirs:Level')",
-    )
-    return subprocess.Popen(
-        [sys.executable, "-c", "\n".join(lines)],
-        cwd=folder,
-        stderr=subprocess.PIPE,
+ENDING = {
+    "leaves": ("import os; os._exit(5)", "ImportError: it ended the process: exit status 5"),
+    "leaves_well": ("import os; os._exit(0)", "ImportError: it ended the process: exit status 0"),
+    "is_killed": (
+        "import os; os.kill(os.getpid(), 9)",
+        "ImportError: it ended the process: signal SIGKILL",
+    ),
+    "interrupts": ("raise KeyboardInterrupt", "ImportError: it ended the process: exit status 1"),
+    "exits": ("raise SystemExit(7)", "SystemExit: 7"),
+    "raises": ("1 / 0", "ZeroDivisionError: division by zero"),
+    "loops": ("while True: pass", "ImportError: not done within 0.5 s"),
+}
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("name", ENDING)
+def test_a_module_neither_ends_nor_holds_the_process_that_checks_a_config(
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("rack.levels.references.SLOW_S", 0.2)
+    monkeypatch.setattr("rack.levels.references.IMPORT_S", 0.5)
+    monkeypatch.syspath_prepend(tmp_path)
+    source, reason = ENDING[name]
+    (tmp_path / f"it_{name}.py").write_text(source)
+    children = children_of(os.getpid())
+    before = descriptors()
+    for _ in range(2):
+        with pytest.raises(LookupError) as error:
+            module_and_name(f"it_{name}:Level")
+        assert str(error.value) == f"cannot import 'it_{name}': {reason}"
+    assert children_of(os.getpid()) == children
+    assert descriptors() == before
+    # Once, though a config is checked for many mistakes.
+    said = "importing 'it_loops', for at most 0.5 s\n" if name == "loops" else ""
+    assert capfd.readouterr() == ("", said)
+
+
+def test_what_a_module_prints_is_printed_once(tmp_path: Path) -> None:
+    (tmp_path / "it_prints.py").write_text("print('here')")
+    lines = [
+        "import rack.levels.references as references",
+        "references.SLOW_S = 60.0",
+        "references.module_and_name('it_prints:Level')",
+    ]
+    # Unbuffered, as in the processes of a rack.
+    done = subprocess.run(
+        [sys.executable, "-u", "-c", "; ".join(lines)],
+        cwd=tmp_path,
+        capture_output=True,
         text=True,
-        start_new_session=True,
+        timeout=BOUND_S,
     )
-
-
-def test_a_module_that_ends_the_process_is_named(tmp_path: Path) -> None:
-    process = importing(tmp_path, "import os\nos._exit(5)\n")
-    assert process.communicate(timeout=BOUND_S) == (
-        None,
-        "'theirs' ended the process while it was imported\n",
-    )
-    assert process.returncode == 5
-
-
-def test_a_module_that_takes_long_is_named_and_ended(tmp_path: Path) -> None:
-    setup = "references.SLOW_S, references.IMPORT_S = 0.1, 0.2"
-    process = importing(tmp_path, "while True:\n    pass\n", setup)
-    said = process.communicate(timeout=BOUND_S)[1]
-    assert said == "importing 'theirs', at most 0.2 s\n'theirs' was not imported within 0.2 s\n"
-    assert process.returncode == -signal.SIGTERM
-
-
-@pytest.mark.slow
-def test_an_import_that_loops_is_interrupted_by_ctrl_c(tmp_path: Path, small: Path) -> None:
-    (tmp_path / "looping.py").write_text("while True:\n    pass\n")
-    text = small.read_text().replace("python_path = [", f'python_path = ["{tmp_path}", ')
-    small.write_text(text.replace("two_levels:Upper", "looping:Upper"))
-    process = subprocess.Popen([*RACK, "check", str(small)], stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    assert process.stderr.readline() == "importing 'looping', at most 60 s\n"
-    process.send_signal(signal.SIGINT)
-    assert process.wait(BOUND_S) == 130
-    process.stderr.close()
+    assert (done.stdout, done.stderr) == ("here\n", "")

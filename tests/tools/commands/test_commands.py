@@ -18,7 +18,8 @@ from rack.backplane.segment import racks
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.cli import COMMANDS
-from tests.processes import RACK
+from rack.tools.console.interrupt import descendants
+from tests.processes import RACK, runs, wait_until
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
@@ -190,6 +191,55 @@ def test_a_config_with_mistakes_is_refused_before_anything_starts(
     assert len(done.stderr.splitlines()) == 2
     assert not (tmp_path / "run").exists()
     assert rack_name not in racks()
+
+
+def upper_of(small: Path, source: str) -> Path:
+    """Let the upper level of the small rack be of a module of the user's."""
+    (small.parent / "own_upper.py").write_text(source)
+    text = small.read_text().replace('python_path = ["', f'python_path = ["{small.parent}", "')
+    small.write_text(text.replace("two_levels:Upper", "own_upper:Upper"))
+    return small
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [("run", "--no-record"), ("check",), ("gantt",)])
+def test_a_module_that_ends_its_process_is_a_mistake_of_the_config(
+    command: tuple[str, ...], small: Path, rack_name: str
+) -> None:
+    config = upper_of(small, "import os; os._exit(5)")
+    done = subprocess.run(
+        [*RACK, *command, str(config), "--set", f"name={rack_name}"],
+        cwd=small.parent,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+    )
+    reason = "cannot import 'own_upper': ImportError: it ended the process: exit status 5"
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f'board.upper.executor = "own_upper:Upper": {reason}\n'
+
+
+@pytest.mark.slow
+def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_name: str) -> None:
+    config = upper_of(small, "while True: pass")
+    process = subprocess.Popen(
+        [*RACK, "run", "--no-record", str(config), "--set", f"name={rack_name}"],
+        cwd=small.parent,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    try:
+        assert process.stderr.readline() == "importing 'own_upper', for at most 60 s\n"
+        family = list(descendants(process.pid))
+        # The crate, and the child that imports.
+        assert len(family) == 2
+        process.send_signal(signal.SIGINT)
+        assert process.wait(BOUND_S) == 128 + signal.SIGINT
+    finally:
+        process.kill()
+        process.communicate()
+    wait_until(lambda: not any(map(runs, family)))
 
 
 def test_a_refusal_is_json_too_when_json_was_asked_for(small: Path) -> None:
