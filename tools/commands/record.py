@@ -20,7 +20,8 @@ from rack.tools.live.folder import folder_of
 from rack.tools.live.watched import WatchedRack, watched
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
-from rack.tools.viewer.sink import FILE, ViewSink
+from rack.tools.viewer.parts import FILE
+from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
 Out = Annotated[

@@ -16,6 +16,7 @@ from rack.tools.console.progress import reading_progress
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
+from rack.tools.viewer.parts import FILE, parts_of
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
 Runs = Annotated[
@@ -69,9 +70,10 @@ def replay(runs: Runs, out: Out = None) -> None:
 
 
 def _own(run: Path) -> list[Path]:
-    """Return the viewer's files of a run: a restarted recorder leaves several."""
-    found = [run] if run.suffix == ".rrd" else sorted(run.glob("run*.rrd"))
-    return [path for path in found if path.is_file()]
+    """Return the viewer's files of a run: a long one has several, as has a restarted recorder."""
+    if run.suffix == ".rrd":
+        return [run] if run.is_file() else []
+    return parts_of(run / FILE)
 
 
 def _parts(run: Path) -> list[Path]:

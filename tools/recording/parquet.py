@@ -1,10 +1,11 @@
-"""The two parquet files of a run.
+"""The two parquet tables of a run.
 
 cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks.
-signals.parquet is what the tasks wrote to their mailboxes: one row a message. Each of its row
-groups holds rows of one mailbox, whose own columns are filled; those of all others are null. Its
-metadata hold when the rack was launched, and the checksum of the config.toml next to it: a config
-that is cut off at the end of a table is a valid config.
+signals.parquet is what the tasks wrote to their mailboxes: one row a message. It is a folder, which
+parquet's readers take for one table: a long run has many parts. Each row group holds rows of one
+mailbox, whose own columns are filled; those of all others are null. The metadata hold when the rack
+was launched, and the checksum of the config.toml next to it: a config that is cut off at the end of
+a table is a valid config.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import prod
 from pathlib import Path
+from shutil import rmtree
 
 import numpy as np
 import pyarrow as pa
@@ -36,6 +38,9 @@ MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
 """Rows are written in large blocks: a file's footer has an entry for every column of every
 block."""
+PART = "{:04}.parquet"
+PART_ENTRIES = 1 << 14
+"""Entries after which a part is finished: until then they are in memory, 0.7 kB each."""
 
 
 def config_check(folder: Path) -> str:
@@ -91,7 +96,7 @@ class CyclesFile:
 
 
 class SignalsFile:
-    """signals.parquet, being written."""
+    """signals.parquet, being written; one that a killed recorder has left is replaced."""
 
     def __init__(self, path: Path, layout: Layout, launch: Launch | None = None) -> None:
         self._columns = {mailbox.name: columns_of(mailbox) for mailbox in layout.mailboxes}
@@ -104,6 +109,16 @@ class SignalsFile:
         metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
         metadata |= {} if launch is None else {"launch": json.dumps(launch)}
         self._schema = pa.schema(fields, metadata=metadata)
+        self._folder = path
+        if path.exists():
+            rmtree(path)
+        path.mkdir()
+        self._parts = 0
+        self._begin_part()
+
+    def _begin_part(self) -> None:
+        self._parts += 1
+        self._entries = 0
         texts = [
             column.name
             for columns in self._columns.values()
@@ -111,7 +126,7 @@ class SignalsFile:
             if column.kind[1] == "S"
         ]
         self._writer = pq.ParquetWriter(
-            path,
+            self._folder / PART.format(self._parts),
             self._schema,
             compression="zstd",
             use_dictionary=["mailbox", *texts],
@@ -143,9 +158,13 @@ class SignalsFile:
         self._writer.write_batch(
             pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows)
         )
+        self._entries += len(arrays)
+        if self._entries >= PART_ENTRIES:
+            self._writer.close()
+            self._begin_part()
 
     def close(self, lost: Mapping[str, int]) -> None:
-        """Finish the file; store the rows lost by mailbox as metadata."""
+        """Finish the last part; store the rows lost by mailbox in its metadata."""
         for mailbox in self._waiting:
             self._flush(mailbox)
         self._writer.add_key_value_metadata({"lost": json.dumps(lost)})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -24,7 +25,7 @@ from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CONFIG, HEAD, columns_of, config_check
+from rack.tools.recording.parquet import CONFIG, HEAD, PART, columns_of, config_check
 from rack.tools.recording.spool import mend, rings
 
 
@@ -74,10 +75,11 @@ class Recording:
                     f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
                     " signals.parquet"
                 )
-        self._cycles = self._open("cycles.parquet", ("task", "tick"))
+        (self._cycles,) = self._open("cycles.parquet", ("task", "tick"))
         self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
+        self._schema = self._signals[0].schema_arrow
         # Earlier versions stored no checksum.
-        recorded = (self._signals.schema_arrow.metadata or {}).get(b"config", b"").decode()
+        recorded = (self._schema.metadata or {}).get(b"config", b"").decode()
         if recorded and recorded != config_check(folder):
             raise Failure(
                 f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2
@@ -92,13 +94,24 @@ class Recording:
             mistakes = "; ".join(str(error).splitlines())
             raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
-    def _open(self, name: str, columns: Sequence[str]) -> pq.ParquetFile:
+    def _open(self, name: str, columns: Sequence[str]) -> list[pq.ParquetFile]:
+        """Return the files of a table: one, or the parts in a folder, oldest first."""
         path = self._there(name)
-        with _naming(path):
-            file = pq.ParquetFile(path)
-        if absent := [column for column in columns if column not in file.schema_arrow.names]:
-            raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
-        return file
+        parts = [path]
+        if path.is_dir():
+            numbers = range(1, max(len([*path.iterdir()]), 1) + 1)
+            parts = [path / PART.format(number) for number in numbers]
+            if absent := [part.name for part in parts if not part.is_file()]:
+                raise Failure(f"{path}: {absent[0]} is missing", 2)
+        files = []
+        for part in parts:
+            with _naming(part):
+                files.append(pq.ParquetFile(part))
+            names = files[-1].schema_arrow.names
+            if absent := [column for column in columns if column not in names]:
+                why = f"not a recording of a rack: it has no column '{absent[0]}'"
+                raise Failure(f"{part}: {why}", 2)
+        return files
 
     def _text(self, name: str) -> str:
         path = self._there(name)
@@ -112,7 +125,7 @@ class Recording:
             raise Failure(f"{path}: {error.strerror}", 2) from None
 
     def _there(self, name: str) -> Path:
-        if not (self.folder / name).is_file():
+        if not (self.folder / name).exists():
             raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
         return self.folder / name
 
@@ -139,7 +152,7 @@ class Recording:
     def layout(self) -> Layout:
         """The rack's layout, without the fields of its messages: see `fields` and `signal`."""
         with _naming(self.folder / "signals.parquet"):
-            text = json.loads(self._signals.schema_arrow.metadata[b"layout"])
+            text = json.loads(self._schema.metadata[b"layout"])
             boxes = [mailbox_of({**m, "fields": ()}) for m in text["mailboxes"]]
             # Earlier versions recorded no host boards.
             tasks, hosts = (
@@ -151,15 +164,13 @@ class Recording:
     def whole_layout(self) -> Layout:
         """The rack's layout with the fields of its messages."""
         with _naming(self.folder / "signals.parquet"):
-            return layout_of(
-                {"hosts": (), **json.loads(self._signals.schema_arrow.metadata[b"layout"])}
-            )
+            return layout_of({"hosts": (), **json.loads(self._schema.metadata[b"layout"])})
 
     @property
     def launch(self) -> Launch:
         """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do
         not hold it."""
-        text = (self._signals.schema_arrow.metadata or {}).get(b"launch")
+        text = (self._schema.metadata or {}).get(b"launch")
         if text is None:
             why = (
                 "does not say when the rack was launched: it was recorded by an earlier version;"
@@ -180,7 +191,9 @@ class Recording:
     @cached_property
     def _lost_before_the_end(self) -> dict[str, int]:
         with _naming(self.folder):
-            texts = [file.metadata.metadata[b"lost"] for file in (self._cycles, self._signals)]
+            # The last part says what was lost of all.
+            files = (self._cycles, self._signals[-1])
+            texts = [file.metadata.metadata[b"lost"] for file in files]
             return {name: count for text in texts for name, count in json.loads(text).items()}
 
     def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
@@ -293,18 +306,13 @@ class Recording:
         "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox.
         Raises `KeyError`.
         """
-        schema = self._signals.schema_arrow
+        schema = self._schema
         name = field if field in schema.names else f"{mailbox}.{field}"
         column = schema.field(name)
-        groups = [
-            group
-            for group in range(self._signals.num_row_groups)
-            if self._mailbox_of(group) == mailbox
-        ]
         with _naming(self.folder / "signals.parquet"):
             read = [
-                self._signals.read_row_group(group, columns=[name]).column(0).combine_chunks()
-                for group in groups
+                file.read_row_group(group, columns=[name]).column(0).combine_chunks()
+                for file, group in self._groups_of.get(mailbox, ())
             ]
         shape = tuple(json.loads(column.metadata[b"shape"])) if column.metadata else ()
         values = [
@@ -339,21 +347,24 @@ class Recording:
 
     def fields(self, mailbox: str) -> set[str]:
         """Return the fields of a mailbox's messages."""
-        names = [
-            name for name in self._signals.schema_arrow.names if name.startswith(f"{mailbox}.")
-        ]
+        names = [name for name in self._schema.names if name.startswith(f"{mailbox}.")]
         return {name.removeprefix(f"{mailbox}.") for name in names}
 
-    @cached_property
+    @property
     def mailboxes(self) -> list[str]:
         """The mailboxes that hold messages."""
-        return list(
-            dict.fromkeys(self._mailbox_of(group) for group in range(self._signals.num_row_groups))
-        )
+        return list(self._groups_of)
 
-    def _mailbox_of(self, group: int) -> str:
-        # A row group holds rows of one mailbox only: its smallest name is its only one.
-        return str(self._signals.metadata.row_group(group).column(0).statistics.min)
+    @cached_property
+    def _groups_of(self) -> dict[str, list[tuple[pq.ParquetFile, int]]]:
+        """The row groups of each mailbox, oldest first: files and numbers."""
+        groups = defaultdict(list)
+        for file in self._signals:
+            for number in range(file.num_row_groups):
+                # A row group holds rows of one mailbox only: its smallest name is its only one.
+                name = str(file.metadata.row_group(number).column(0).statistics.min)
+                groups[name].append((file, number))
+        return dict(groups)
 
 
 @contextmanager

@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
+from shutil import rmtree
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -110,6 +111,7 @@ def mend(folder: Path) -> bool:
         for frame in _read_frames(file, layout):
             files.add(frame)
     files.close()
+    rmtree(folder / SIGNALS, ignore_errors=True)
     for name in (CYCLES, SIGNALS):
         (folder / f"{name}{MENDED}").replace(folder / name)
     path.unlink()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from rerun.chunk import RrdReader
 
+from rack.tools.viewer.parts import parts_of
 from rack.tools.viewer.stream import TICK
 
 
@@ -20,14 +21,16 @@ class Rows(NamedTuple):
 
 
 def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
-    """Return one component of an entity; curves are (rows, curves). Raises `KeyError` when the file
-    has none."""
-    chunks = (
-        RrdReader(str(file))
+    """Return one component of an entity, from a file and the parts that continue it; curves are
+    (rows, curves). Raises `KeyError` when they have none."""
+    chunks = [
+        chunk
+        for part in parts_of(file)
+        for chunk in RrdReader(str(part))
         .stream()
         .filter(content=entity, has_timeline=TICK, components=component)
         .to_chunks()
-    )
+    ]
     if not chunks:
         raise KeyError(f"{file}: no {component} of '{entity}'")
     batches = [chunk.to_record_batch() for chunk in chunks]

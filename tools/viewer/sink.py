@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -47,12 +46,12 @@ from rack.tools.viewer.levels import (
     move_name,
     request_name,
 )
+from rack.tools.viewer.parts import next_file
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
 
 SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
 """Messages whose numbers are not shown as curves."""
-FILE = "run.rrd"
 BLOCK_S = 1.0
 """Simulated time in one block: a call costs the same for 4 rows as for 400."""
 
@@ -60,13 +59,6 @@ BLOCK_S = 1.0
 PART_S = 180.0
 """Simulated time in one file. Until a file is finished, its index is in memory: 0.65 MB a second of
 the NASREM rack."""
-
-
-def next_file(folder: Path) -> Path:
-    """Return the file to write: run.rrd, then run-2.rrd and so on; a restarted recorder overwrites
-    none."""
-    names = chain([FILE], (f"run-{part}.rrd" for part in count(2)))
-    return next(folder / name for name in names if not (folder / name).is_file())
 
 
 class Ran(NamedTuple):

@@ -14,6 +14,7 @@ import pytest
 
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
+from rack.tools.recording.parquet import SignalsFile
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
@@ -25,7 +26,7 @@ READERS: tuple[Callable[[Path], object], ...] = (
     lambda folder: Analysis.of(Recording(folder), 100.0, lambda done: None),
     lambda folder: subject_of(str(folder), [], None),
 )
-PARQUET = ("cycles.parquet", "signals.parquet")
+PARQUET = ("cycles.parquet", "signals.parquet/0001.parquet")
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda data: b"",
     "cut": lambda data: data[: len(data) // 2],
@@ -72,7 +73,14 @@ def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
 @pytest.mark.parametrize("name", ["config.toml", *PARQUET])
 def test_a_file_that_is_not_there_is_named(damaged: Path, name: str) -> None:
     (damaged / name).unlink()
-    refused(damaged, name)
+    # Of a folder without its only part, the folder.
+    refused(damaged, name.partition("/")[0])
+
+
+def test_a_part_is_missing_where_its_number_is(damaged: Path) -> None:
+    part = damaged / PARQUET[1]
+    part.rename(part.with_name("0002.parquet"))
+    refused(damaged, "0001.parquet is missing")
 
 
 @pytest.mark.parametrize("name", PARQUET)
@@ -82,9 +90,50 @@ def test_a_parquet_file_of_something_else_is_named(damaged: Path, name: str) -> 
 
 
 def test_signals_without_their_layout_are_named(damaged: Path) -> None:
-    path = damaged / "signals.parquet"
+    path = damaged / PARQUET[1]
     pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
-    refused(damaged, path.name)
+    refused(damaged, path.parent.name)
+
+
+def messages(recording: Recording) -> dict[str, list[bytes]]:
+    return {box.name: recording.rows(box.name).tolist() for box in recording.whole_layout.timed}
+
+
+def test_the_one_file_of_an_earlier_version_is_read(damaged: Path) -> None:
+    parts = messages(Recording(damaged))
+    assert any(parts.values())
+    part = (damaged / PARQUET[1]).rename(damaged / "part")
+    (damaged / "signals.parquet").rmdir()
+    part.rename(damaged / "signals.parquet")
+    assert messages(Recording(damaged)) == parts
+
+
+def test_a_long_run_has_many_parts_which_are_one_table(
+    damaged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = Recording(damaged)
+    monkeypatch.setattr("rack.tools.recording.parquet.PART_ENTRIES", 1)
+    monkeypatch.setattr("rack.tools.recording.parquet.MESSAGE_ROWS", 16)
+    folder = tmp_path / "parts"
+    folder.mkdir()
+    for name in ("config.toml", "cycles.parquet"):
+        shutil.copy(damaged / name, folder / name)
+    # What a killed recorder has left is replaced.
+    for _ in range(2):
+        signals = SignalsFile(folder / "signals.parquet", recording.whole_layout)
+        for box in recording.whole_layout.timed:
+            rows = recording.rows(box.name)
+            for begin in range(0, len(rows), 16):
+                signals.add(box.name, rows[begin : begin + 16])
+        signals.close({"upper.status": 3})
+    assert len([*(folder / "signals.parquet").iterdir()]) > 10
+    again = Recording(folder)
+    assert messages(again) == messages(recording)
+    assert again.lost["upper.status"] == 3
+    ticks = [
+        pq.read_table(each / "signals.parquet")["tick"].to_pylist() for each in (damaged, folder)
+    ]
+    assert sorted(ticks[0]) == sorted(ticks[1])
 
 
 @pytest.mark.parametrize(
