@@ -51,6 +51,9 @@ $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
-	@# A type checker and an editor read no import hook: for them, `rack` as links.
+	@# `rack` as a package: type checkers and editors read no import hook, and a folder called rack in front of it, as a
+	@# clone is in the folder that holds it, is none. They follow the links; Python finds the files themselves.
 	@mkdir -p $(VENV)/src/rack && for floor in $(FLOORS); do ln -sfn ../../../$$floor $(VENV)/src/rack/$$floor; done
+	@echo '__path__ = [__file__.removesuffix("/$(VENV)/src/rack/__init__.py")]' > $(VENV)/src/rack/__init__.py
+	@for packages in $(VENV)/lib/python3*/site-packages; do echo ../../../src > $$packages/rack.pth; done
 	@touch $(STAMP)

@@ -47,7 +47,7 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     others marked so."""
 
     def __init__(self, function: Callable[_P, _R]) -> None:
-        self._function: Any = function
+        self._function = function
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -65,10 +65,11 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     def source(self) -> Iterator[bytes]:
         """Yield what determines the machine code: instructions, constants, and the values of names,
         functions that are called included. Comments, docstrings and places in files do not."""
-        code = self._function.__code__
-        known = self._function.__globals__
-        yield from _instructions(code, self._function.__doc__)
-        yield repr(self._function.__defaults__).encode()
+        function: Any = self._function
+        code = function.__code__
+        known = function.__globals__
+        yield from _instructions(code, function.__doc__)
+        yield repr(function.__defaults__).encode()
         for name in code.co_names:
             # Others are attributes, or Python's own.
             if name in known:

@@ -138,6 +138,8 @@ def mutated(
         shutil.copytree(
             ROOT / name, folder / "rack" / name, ignore=shutil.ignore_patterns("__pycache__")
         )
+    # A package: it goes before that of the environment.
+    (folder / "rack" / "__init__.py").touch()
     for file, old, new in patches:
         text = (folder / "rack" / file).read_text()
         if old not in text:

@@ -150,3 +150,10 @@ def test_nothing_but_rack_is_installed(installed: Path) -> None:
     with ZipFile(next(installed.parents[1].glob("*.whl"))) as wheel:
         tops = {name.partition("/")[0] for name in wheel.namelist()}
     assert {name for name in tops if not name.endswith(".dist-info")} == {"rack"}
+
+
+def test_a_folder_called_rack_is_not_taken_for_the_project(tmp_path: Path) -> None:
+    for floor in ("backplane", "boards", "levels", "tools"):
+        (tmp_path / "rack" / floor).mkdir(parents=True)
+    found = run(tmp_path, sys.executable, "-c", "import rack.tools.cli as cli; print(cli.__file__)")
+    assert found.strip() == str(ROOT / "tools" / "cli.py")
