@@ -131,7 +131,7 @@ class Message:
     raw: memoryview
     record: np.ndarray
 
-    def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Message:
+    def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Message:  # noqa: D102  # as the class
         return object.__new__(_class_for(dtype))
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:

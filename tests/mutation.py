@@ -105,7 +105,7 @@ class Mutations:
             self.lines[node.end_lineno - 1] + node.end_col_offset,
         )
 
-    def of(self, node: ast.AST) -> Iterator[Mutation]:
+    def of(self, node: ast.AST) -> Iterator[Mutation]:  # noqa: C901  # one match of all kinds
         """Yield the mutations of a node and of all below it that may matter."""
         match node:
             case ast.Compare(left=left, comparators=[right]):

@@ -1,0 +1,1 @@
+"""The common clock: releases, waiting, and what watches whether it runs."""

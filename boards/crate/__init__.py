@@ -1,0 +1,1 @@
+"""The Rack and its crate: launching boards, supervising them, ending them."""

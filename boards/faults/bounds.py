@@ -192,7 +192,6 @@ def skipped(parameter: str) -> Bound:
     The fastest boards find it in their next cycle; a release that was skipped comes in the first
     tick that is not.
     """
-
     return Bound(
         "the next cycle of the fastest boards",
         lambda case: max(

@@ -1,0 +1,1 @@
+"""Host boards: programs that take part through a bus adapter, without real time."""

@@ -1,0 +1,1 @@
+"""What runs on a board: its cycle, its task, its clock."""

@@ -63,7 +63,7 @@ def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
 
 
 @compiled
-def advance(  # flat arguments: a field of a named record takes 0.1 us
+def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 us
     begin: int,
     end_s: float,
     model: int,

@@ -102,7 +102,7 @@ class ContactWrench:
 
 
 @compiled
-def set_contact(
+def set_contact(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,
     data: int,  # evaluated at the state
     places: NDArray[

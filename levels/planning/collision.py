@@ -235,7 +235,7 @@ class CollisionChecker:
 
 
 @compiled
-def is_free(
+def is_free(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,  # address
     data: int,  # address
     q: Array,  # (joints,), rad: to be checked

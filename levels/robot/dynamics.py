@@ -186,7 +186,7 @@ def evaluate(
 
 
 @compiled
-def carry(
+def carry(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     mass: float,
     offset: Array,
     model: int,

@@ -73,6 +73,14 @@ def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
             raise RobotError(
                 f"robot.hand: actuator '{name}' is named {both.count(name)} times; once is valid"
             )
+    _check_fingers(robot, hand)
+    if not hand.least < hand.rest:
+        raise RobotError(
+            f"robot.hand.rest: {hand.rest:g} N; above robot.hand.least = {hand.least:g} N is valid"
+        )
+
+
+def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
     names = [finger.name for finger in hand.finger]
     for finger in hand.finger:
         if names.count(finger.name) > 1:
@@ -93,10 +101,6 @@ def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
             raise RobotError(
                 f"robot.hand.finger: joint '{joint}' must be of one finger; it is of {named}"
             )
-    if not hand.least < hand.rest:
-        raise RobotError(
-            f"robot.hand.rest: {hand.rest:g} N; above robot.hand.least = {hand.least:g} N is valid"
-        )
 
 
 def fit_tendons(

@@ -285,7 +285,7 @@ class SensorMonitor:
 
 
 @compiled
-def check(
+def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     table: Array,  # (19, joints): rows as below
     coarse: bool,
     sensed: Array,  # (joints,), rad
