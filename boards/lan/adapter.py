@@ -27,7 +27,7 @@ from rack.boards.lan.config import LanParams
 from rack.boards.lan.desk import Desk, Permit
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import RETRY_MS, LanLink
+from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
@@ -127,11 +127,11 @@ class LanAdapter(Adapter):
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
         barrier = self._barrier
-        way = self._barrier or link
+        carrier: Carrier = barrier or link
         for entry in self._imports.values():
-            entry.open(way, link.sealer, self._grid)
+            entry.open(carrier, link.sealer, self._grid)
         for export in self._exports.values():
-            export.open(way, link.sealer, self._grid)
+            export.open(carrier, link.sealer, self._grid)
         self._clocks.open(link, link.sealer)
         self._desk.open(link, self._launch)
         if barrier is not None:

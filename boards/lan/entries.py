@@ -17,8 +17,7 @@ from rack.boards.lan.counts import ImportCount, MessageOrder
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import Arrived, LanLink
-from rack.boards.lan.lockstep import Barrier
+from rack.boards.lan.link import Arrived, Carrier
 from rack.boards.lan.peers import NONE, PeerRack
 
 NEVER = -1
@@ -49,9 +48,9 @@ class Export:
         self.sent = int(record["sent"])
         self.serial = int(record["serial"])
 
-    def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
+    def open(self, carrier: Carrier, sealer: Sealer, grid: OwnGrid) -> None:
         """Publish it."""
-        self._put = way.publish(self._key)
+        self._put = carrier.publish(self._key)
         self._sealer = sealer
         self._grid = grid
         self.every = grid.cycles(self._rate_hz)
@@ -131,9 +130,9 @@ class Import:
         self._order.resume(*(int(record[name]) for name in ("launch", "number", "serial")))
         self._basis = None if record["age"] == NEVER else tick - int(record["age"])
 
-    def open(self, way: LanLink | Barrier, sealer: Sealer, grid: OwnGrid) -> None:
+    def open(self, carrier: Carrier, sealer: Sealer, grid: OwnGrid) -> None:
         """Subscribe to it."""
-        self._arrived = way.subscribe(self._key)
+        self._arrived = carrier.subscribe(self._key)
         self._sealer = sealer
         self._grid = grid
         self.every = grid.cycles(self._rate_hz)

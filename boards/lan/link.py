@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import zenoh
 
@@ -47,6 +47,17 @@ class Arrived(NamedTuple):
     key: str
     envelope: bytes | None
     payload: bytes
+
+
+class Carrier(Protocol):
+    """Carries exports and imports: the network itself, or in lockstep the steps of all racks."""
+
+    def publish(self, key: str) -> Callable[[bytes, bytes], None]:
+        """Return a function that sends payload and envelope under a key expression."""
+
+    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
+        """Return a function that yields what has come under a key expression since its last
+        call."""
 
 
 class Question(NamedTuple):

@@ -92,7 +92,7 @@ class Partner:
 class Barrier:
     """The end of an adapter's cycles, common to all racks in lockstep.
 
-    Exports and imports use it in place of the network: they `publish` and `subscribe`.
+    It is the `Carrier` of exports and imports, in place of the network.
     """
 
     def __init__(

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -212,9 +211,9 @@ def measure(
     `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run
     fails.
     """
-    with ExitStack() as stack:
-        commands = stack.enter_context(both_racks(against))
-        runs = CycleRuns(seconds, Path(stack.enter_context(TemporaryDirectory())), share)
+    commands = both_racks(against)
+    with TemporaryDirectory() as folder:
+        runs = CycleRuns(seconds, Path(folder), share)
         progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
         for turn, (kind, command) in turns(
             [(kind, command) for kind in KINDS for command in commands], rounds
@@ -246,9 +245,7 @@ class CycleRuns:
         self._runs += 1
         folder = self._folder / str(self._runs)
         folder.mkdir()
-        config: str | Path = (
-            kind.config if kind.config != EMPTY else write_empty_rack(folder, command.package)
-        )
+        config: str | Path = kind.config if kind.config != EMPTY else write_empty_rack(folder)
         options = [
             "--set",
             f"name=bench-{os.getpid()}",
@@ -257,9 +254,7 @@ class CycleRuns:
             "--seconds",
             self._seconds,
         ]
-        options += ["--lockstep"] * kind.lockstep + ["--share"] * (
-            self._share and bool(command.package)
-        )
+        options += ["--lockstep"] * kind.lockstep + ["--share"] * self._share
         command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
         traces = traces_of(Recording(folder / "run"))
         for board, trace in traces.items():

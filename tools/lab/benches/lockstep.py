@@ -87,21 +87,21 @@ def measure(
 
     Raises `Failure` if a run fails, or if the levels without a rack did other work.
     """
-    with both_racks(against) as commands:
-        names = [command.name for command in commands]
-        progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
-        found: dict[tuple[str, str], list[float]] = {}
-        for rack, seconds in racks.items():
-            progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
-            with TemporaryDirectory() as folder:
-                ticks = _check(rack, seconds, Path(folder) / "run")
-            progress.end(EXPECTED_S, "equal")
-            ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
-            ways[BARE] = partial(_run_bare, rack, ticks)
-            for turn, who in turns(list(ways), rounds):
-                progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
-                found.setdefault((rack, who), []).append(ways[who]())
-                progress.end(EXPECTED_S)
+    commands = both_racks(against)
+    names = [command.name for command in commands]
+    progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
+    found: dict[tuple[str, str], list[float]] = {}
+    for rack, seconds in racks.items():
+        progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+        with TemporaryDirectory() as folder:
+            ticks = _check(rack, seconds, Path(folder) / "run")
+        progress.end(EXPECTED_S, "equal")
+        ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
+        ways[BARE] = partial(_run_bare, rack, ticks)
+        for turn, who in turns(list(ways), rounds):
+            progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
+            found.setdefault((rack, who), []).append(ways[who]())
+            progress.end(EXPECTED_S)
     return speeds(found, names)
 
 

@@ -56,7 +56,7 @@ def test_it_is_made_anew_once_the_program_has_changed(
 
 @pytest.mark.parametrize("name", ["report.json", "report.md", *RECORDED])
 def test_it_is_made_anew_if_a_file_is_missing(folder: Path, name: str) -> None:
-    (folder / name).unlink()
+    (folder / name).rename(folder / "elsewhere")
     assert stored_report(folder) is None
 
 
