@@ -7,6 +7,7 @@
 
 - `Rack` launches the boards of a config, supervises them and ends them; `Outcome` says how a run
   ended.
+- `OneProcess` runs their levels in one process, tick by tick: for the test of a level.
 - `Event` is one occurrence in a run; `Rack(config, on_event=...)` passes each to your program as it
   happens.
 - `load` reads a config by name or path, with overrides; `RackConfig` is the result.
@@ -26,6 +27,7 @@ from rack.backplane.exports import on_first_use
 if TYPE_CHECKING:
     from rack.boards.config import load
     from rack.boards.config.schema import RackConfig
+    from rack.boards.crate.one_process import OneProcess
     from rack.boards.crate.rack import Rack
     from rack.boards.errors import BoardError, ConfigError, LaunchError, Mistake
     from rack.boards.events import Cause, Event, EventKind, Outcome
@@ -38,6 +40,7 @@ __all__ = [
     "EventKind",
     "LaunchError",
     "Mistake",
+    "OneProcess",
     "Outcome",
     "Rack",
 ]
@@ -48,6 +51,7 @@ _PLACES = {
     "rack.boards.crate.rack": ("Rack",),
     "rack.boards.errors": ("BoardError", "ConfigError", "LaunchError", "Mistake"),
     "rack.boards.events": ("Cause", "Event", "EventKind", "Outcome"),
+    "rack.boards.crate.one_process": ("OneProcess",),
 }
 
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these

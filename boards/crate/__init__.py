@@ -1,1 +1,1 @@
-"""The Rack and its crate: launching boards, supervising them, ending them."""
+"""The Rack and its crate: boards launched, supervised, ended; or their levels, in one process."""

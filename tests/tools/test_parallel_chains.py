@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, resolve
+from rack.boards.config import load
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.bare import run_bare
-from rack.tools.lab.benches.lockstep import differences
+from rack.tools.lab.benches.lockstep import differences, run_bare
 from rack.tools.lab.benches.response import run_commands
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
@@ -133,8 +132,7 @@ def test_the_levels_alone_write_what_they_write_in_the_rack(
 ) -> None:
     config = load(jointed, [f"name={rack_name}"])
     recording = run_commands(config, (), tmp_path / "run", 0.5)
-    resolved = resolve(config)
-    bare = apart(run_bare, resolved.layout, resolved.tasks, 200)
+    bare = apart(run_bare, config, 200)
     assert list(differences(recording, bare)) == []
 
 

@@ -1,44 +1,124 @@
-"""A rack's work without the rack: the same `process` and `plan` calls in one process, one after
-another.
+"""The levels of a rack in one process: the same `process` and `plan` calls, one after another.
+
+For the test of a level of one's own, and to see what a rack's work is without the rack:
+
+    from rack.boards import OneProcess
+
+    with OneProcess.from_file("metered.toml") as rack:
+        rack.run(2.0)
+        assert rack.newest("power.status").energy > 0.0
 
 Levels, ports and delays are those of the resolved config; a message becomes visible by ticks alone,
 as under protocol time-slice, so every level reads what it reads in a rack in lockstep, and does the
-same. No clock, no shared memory, no checks and no trace: this is the limit that a rack can
-approach, but not pass on one processor.
+same. No clock, no shared memory, no checks and no trace; nobody commands it, and no fault strikes.
 """
 
 from __future__ import annotations
 
 import gc
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-
-import numpy as np
+from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.boards.classes import find_class
+from rack.boards.config import RackConfig, load, resolve
+from rack.boards.errors import LaunchError
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
-from rack.tools.console.answer import Failure
 
 
-@dataclass(frozen=True)
-class BareRun:
-    """A finished run. `processor_s` is the time of its ticks.
+class OneProcess:
+    """A rack in one process, in a context: leaving it closes its levels. `tick` is the tick that is
+    due next.
 
-    `last` is the newest message of each mailbox that was visible before the end, `serials` its
-    number; without one, a mailbox is left out.
+    Raises `ConfigError` for an invalid config; `LaunchError` for a host board, and for a mailbox
+    whose messages depend on boards: a queue, whose writer depends on its reader, an exchange, an
+    interrupt.
     """
 
-    ticks: int
-    processor_s: float
-    serials: Mapping[str, int]
-    last: Mapping[str, np.ndarray]
+    def __init__(self, config: RackConfig) -> None:
+        plan = resolve(config)
+        if boards := [spec.name for spec in plan.layout.mailboxes if needs_boards(spec)]:
+            why = "a queue, an exchange or interrupts, which only a rack with boards has"
+            raise LaunchError(f"{', '.join(boards)}: {why}")
+        if plan.hosts:
+            names = ", ".join(host.board for host in plan.hosts)
+            raise LaunchError(f"{names}: a host board, which is a process of its own")
+        self.tick = 0
+        self._clock_ns = plan.layout.clock_ns
+        self._posts = {spec.name: Post(spec) for spec in plan.layout.mailboxes}
+        self._tasks = [LoneTask(plan.layout, wiring, self._posts) for wiring in plan.tasks]
+        self._cycles = [(*task.spec.grid, task.cycle) for task in self._tasks]
+
+    @classmethod
+    def from_file(cls, config: str | Path, overrides: Sequence[str] = ()) -> Self:
+        """Return the rack of a config, by name or path, with overrides as in `load`."""
+        return cls(load(config, overrides))
+
+    def __enter__(self) -> Self:
+        try:
+            for task in self._tasks:
+                task.level.self_test()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the levels."""
+        for task in self._tasks:
+            task.level.close()
+
+    def run(self, seconds: float) -> None:
+        """Run for simulated `seconds`; raises what a level raises."""
+        self.run_ticks(round(seconds * 1e9 / self._clock_ns))
+
+    def run_ticks(self, ticks: int) -> None:
+        """Run for so many ticks."""
+        with _undisturbed():
+            for tick in range(self.tick, self.tick + ticks):
+                self.tick = tick + 1
+                for every, phase, cycle in self._cycles:
+                    if tick % every == phase:
+                        cycle(tick)
+
+    def newest(self, mailbox: str) -> Message:
+        """Return a copy of the newest message that was visible in the last tick. Raises
+        `LookupError`: there was none, or no such mailbox."""
+        post = self._posts.get(mailbox)
+        if post is None:
+            raise LookupError(f"no mailbox '{mailbox}'; there are: {', '.join(self._posts)}")
+        newest = post.newest(self.tick - 1)
+        if newest is None:
+            raise LookupError(f"'{mailbox}' is empty at tick {self.tick - 1}")
+        message = Message(post.dtype)
+        message.raw[:] = newest[1]
+        return message
+
+    @property
+    def serials(self) -> Mapping[str, int]:
+        """The number of the newest message of each mailbox that has one, as in `newest`."""
+        newest = {name: post.newest(self.tick - 1) for name, post in self._posts.items()}
+        return {name: found[0] for name, found in newest.items() if found is not None}
+
+
+def needs_boards(spec: MailboxSpec) -> bool:
+    """Say whether what a mailbox holds depends on boards, and not on ticks alone."""
+    return bool(spec.exchanges or spec.capacity or spec.interrupt is not None)
 
 
 class Post:
@@ -90,14 +170,11 @@ class PostReader:
         return self._readings[Verdict.NEW]
 
 
-class BareTask:
+class LoneTask:
     """An executor or a planner with its ports."""
 
-    def __init__(
-        self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post], ticks: int
-    ) -> None:
+    def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post]) -> None:
         self.spec = layout.task(wiring.task)
-        self._ticks = ticks
         self._values = Ports()
         # Where each reading goes: the ports themselves, or the dict of a port that reads many
         # mailboxes.
@@ -142,10 +219,8 @@ class BareTask:
         assert isinstance(self.level, Planner), "an executor executes"
         if self.level.wanted(self._values, tick):
             self._busy_until = tick + self.spec.every * self.spec.within_cycles
-            # A rack does not wait for a plan that comes after its end.
-            if self._busy_until < self._ticks:
-                self.level.plan(self._values, self._messages.plan, tick)
-                self._write(tick)
+            self.level.plan(self._values, self._messages.plan, tick)
+            self._write(tick)
 
     def _read(self, tick: int) -> None:
         for values, key, read in self._readers:
@@ -154,57 +229,6 @@ class BareTask:
     def _write(self, tick: int) -> None:
         for post in self._posts:
             post.write(tick, self.spec.every)
-
-
-def run_bare(layout: Layout, wirings: Sequence[TaskWiring], ticks: int) -> BareRun:
-    """Run every level of a rack for so many ticks; nobody commands it, and no fault strikes it.
-
-    Raises `Failure` for a rack with a queue, whose writer depends on its reader: without mailboxes
-    there is none; and for one with an exchange or with interrupts, which belong to the board.
-    """
-    if exchanged := [spec.name for spec in layout.mailboxes if spec.exchanges]:
-        raise Failure(
-            f"{', '.join(exchanged)}: read at a rate of its own; only racks without any run without"
-            " boards"
-        )
-    if queues := [spec.name for spec in layout.mailboxes if spec.capacity]:
-        raise Failure(f"{', '.join(queues)}: a queue; only racks without any run without mailboxes")
-    if served := [spec.name for spec in layout.mailboxes if spec.interrupt is not None]:
-        raise Failure(
-            f"{', '.join(served)}: interrupts its readers; only racks without any run without"
-            " boards"
-        )
-    posts = {spec.name: Post(spec) for spec in layout.mailboxes}
-    tasks = [BareTask(layout, wiring, posts, ticks) for wiring in wirings]
-    try:
-        for task in tasks:
-            task.level.self_test()
-        cycles = [(*task.spec.grid, task.cycle) for task in tasks]
-        with _undisturbed():
-            start_ns = time.process_time_ns()
-            _run(cycles, ticks)
-            processor_s = (time.process_time_ns() - start_ns) * 1e-9
-    finally:
-        for task in tasks:
-            task.level.close()
-    found = {
-        name: newest
-        for name, post in posts.items()
-        if (newest := post.newest(ticks - 1)) is not None
-    }
-    return BareRun(
-        ticks=ticks,
-        processor_s=processor_s,
-        serials={name: serial for name, (serial, _) in found.items()},
-        last={name: np.frombuffer(data, posts[name].dtype)[0] for name, (_, data) in found.items()},
-    )
-
-
-def _run(cycles: Sequence[tuple[int, int, Callable[[int], None]]], ticks: int) -> None:
-    for tick in range(ticks):
-        for every, phase, cycle in cycles:
-            if tick % every == phase:
-                cycle(tick)
 
 
 @contextmanager
