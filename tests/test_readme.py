@@ -1,4 +1,5 @@
-"""The README is true: its example level runs, as it stands there, and so do its commands."""
+"""The README and the floors' pages are true: their commands run, as does the example level, as it
+stands there."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from rack.tools.cli import COMMANDS as ALL
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
 
@@ -17,6 +19,10 @@ OWN_NAME = f"readme-{os.getpid()}"
 TO_ITS_END = "k1607"
 """The rack of which the whole run is made and recorded."""
 README = Path(__file__).parent.parent / "README.md"
+FLOORS = ("backplane", "boards", "levels", "configs", "tools")
+PAGES = [README, *(README.parent / floor / "README.md" for floor in FLOORS)]
+TEXT = "\n".join(page.read_text() for page in PAGES)
+MOST_LINES, MOST_WORDS, MOST_PAGE_LINES = 150, 1500, 300
 BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
@@ -27,12 +33,12 @@ ELSEWHERE = re.compile(
 )
 """Commands that need a run, or a running rack, of another line: they have tests of their own in
 tests/tools."""
-COMMANDS = [
-    (line.partition("#")[0].split()[1:], int("exit status 1" in line))
-    for block in SHELL.findall(README.read_text())
+COMMANDS = {
+    line.partition("#")[0].strip(): int("exit status 1" in line)
+    for block in SHELL.findall(TEXT)
     for line in block.splitlines()
     if line.startswith("rack ") and not ELSEWHERE.search(line)
-]
+}
 
 
 def words_of(command: list[str]) -> list[str]:
@@ -57,34 +63,47 @@ def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "status"), COMMANDS, ids=[" ".join(words) for words, _ in COMMANDS]
-)
-def test_command_of_the_readme_works(words: list[str], status: int, tmp_path: Path) -> None:
-    ended = rack(*words_of(words), folder=tmp_path)
+@pytest.mark.parametrize(("line", "status"), COMMANDS.items(), ids=COMMANDS)
+def test_command_of_the_pages_works(line: str, status: int, tmp_path: Path) -> None:
+    ended = rack(*words_of(line.split()[1:]), folder=tmp_path)
     assert ended.returncode == status, ended.stderr
 
 
-def test_readme_shows_the_commands() -> None:
+def test_the_pages_show_the_commands() -> None:
     assert {"run", "check", "list", "clean", "bench", "gantt"} <= {
-        words[0] for words, _ in COMMANDS
+        line.split()[1] for line in COMMANDS
     }
+    table = README.read_text().partition("## Commands")[2]
+    assert {name for name, _, _ in ALL} == set(re.findall(r"`(\w+)`(?:,| \|)", table))
+
+
+def test_the_readme_is_a_front_door_and_pages_have_an_end() -> None:
+    text = README.read_text()
+    assert len(text.splitlines()) <= MOST_LINES
+    assert len(text.split()) <= MOST_WORDS
+    assert all(len(page.read_text().splitlines()) <= MOST_PAGE_LINES for page in PAGES)
+    pictures = README.parent / ".github" / "pictures"
+    assert all(picture.stat().st_size < 2_000_000 for picture in pictures.iterdir())
 
 
 def test_the_example_level_is_the_one_in_configs() -> None:
-    shown = dict(BLOCK.findall(README.read_text()))
-    assert shown
-    assert shown == {
-        name: (README.parent / "configs" / "examples" / "own-level" / name).read_text()
-        for name in shown
-    }
+    shown = BLOCK.findall(TEXT)
+    assert {name for name, _ in shown} == {"power.py", "metered.toml"}
+    own_level = README.parent / "configs" / "examples" / "own-level"
+    for name, block in shown:
+        assert block == (own_level / name).read_text()
+
+
+def pages() -> list[Path]:
+    """Return all pages of the project."""
+    root = README.parent
+    return [*root.glob("*.md"), *PAGES[1:], *(root / "configs").rglob("*.md")]
 
 
 def test_every_file_that_the_pages_link_to_exists() -> None:
-    pages = [*README.parent.glob("*.md"), *(README.parent / "configs").rglob("*.md")]
     links = [
         (page, link)
-        for page in pages
+        for page in pages()
         for link in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())
     ]
     assert links
@@ -107,7 +126,7 @@ def test_the_map_names_every_room_and_no_other() -> None:
 
 @pytest.mark.slow
 def test_the_python_way_in_runs_as_the_readme_has_it(tmp_path: Path) -> None:
-    script = re.search(r"```python\n(from rack\.boards.*?)```", README.read_text(), re.DOTALL)
+    script = re.search(r"```python\n(from rack\.boards.*?)```", TEXT, re.DOTALL)
     assert script
     named = (
         script[1]
@@ -125,7 +144,7 @@ def test_a_run_reads_back_as_the_readme_has_it(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     nasrem_run(tmp_path_factory).rename(tmp_path / "run")
-    block = re.search(r"```python\n(from pathlib.*?)```", README.read_text(), re.DOTALL)
+    block = re.search(r"```python\n(from pathlib.*?)```", TEXT, re.DOTALL)
     assert block
     # pandas is the reader's choice, not a dependency.
     lines = [line for line in block[1].splitlines() if "pd" not in line]
@@ -139,13 +158,13 @@ def test_a_run_reads_back_as_the_readme_has_it(
 
 def test_every_name_that_a_page_links_to_code_is_in_that_file() -> None:
     named = [
-        (page.name, name, link)
-        for page in README.parent.glob("*.md")
+        (page, name, link)
+        for page in pages()
         for name, link in re.findall(r"\[`(\w+)`\]\(([\w/.-]+\.py)\)", page.read_text())
     ]
     assert named
     assert not [
         entry
         for entry in named
-        if not re.search(rf"\b{entry[1]}\b", (README.parent / entry[2]).read_text())
+        if not re.search(rf"\b{entry[1]}\b", (entry[0].parent / entry[2]).read_text())
     ]

@@ -71,9 +71,9 @@ def test_the_viewer_listens_to_this_machine_alone() -> None:
     assert found == [f"{LOOPBACK}:{port:04X}"]
 
 
-def test_the_packages_are_those_that_ci_installs_and_the_readme_names() -> None:
+def test_the_packages_are_those_that_ci_installs_and_the_page_names() -> None:
     drawing = re.search(r'drawing="(.*)"', (ROOT / ".ci" / "run").read_text())
     assert drawing is not None
     assert tuple(drawing[1].split()) == PACKAGES
-    readme = (ROOT / "README.md").read_text()
-    assert all(name in readme for name in PACKAGES)
+    page = (ROOT / "tools" / "README.md").read_text()
+    assert all(name in page for name in PACKAGES)
