@@ -11,6 +11,7 @@ import typer
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, config_names
+from rack.tools.lab.benches.harness import print_found, show
 from rack.tools.lab.benches.options import (
     Against,
     Config,
@@ -20,8 +21,6 @@ from rack.tools.lab.benches.options import (
     Rounds,
     Seconds,
     Share,
-    print_found,
-    show,
 )
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
@@ -68,7 +67,8 @@ def cycle(
 
     Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns
     with another checkout. The servo board is also compared with bare mj_step calls: the physics of
-    its recorded run, replayed alone. TREE runs in its own environment, TREE/.venv.
+    its recorded run, replayed alone. What TREE needs and this environment lacks, give in
+    PYTHONPATH.
     """
     from rack.tools.lab.benches.cycle import measure
 
@@ -89,8 +89,8 @@ def lockstep(
     """Measure how fast nasrem, k1607 and fig4 run in lockstep.
 
     Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one
-    process without a rack. Its messages must be those of the rack, bit for bit. TREE runs in its
-    own environment, TREE/.venv.
+    process without a rack. Its messages must be those of the rack, bit for bit. What TREE needs and
+    this environment lacks, give in PYTHONPATH.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,8 +24,8 @@ from rack.tools.lab.benches import relay
 from rack.tools.lab.benches.chain import LONGEST, PRIORITY, Chain
 from rack.tools.lab.benches.chain_figures import RATE_HZ, Boards, ChainFigures
 from rack.tools.lab.benches.checkout import RackCommand, both_racks
-from rack.tools.lab.benches.comparison import turns
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
+from rack.tools.lab.benches.harness import turns
 from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
 
 COUNTS = (1, 2, 5, 10, 15, LONGEST)
@@ -47,12 +47,13 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
     absent = absent_cyclictest()
     cores = tuple(sorted(os.sched_getaffinity(0)))
     peers = () if absent else cores
-    racks = both_racks(against)
-    with TemporaryDirectory(prefix="rack-bench-") as folder:
-        own = Path(folder)
-        # Another checkout may lack these levels.
-        shutil.copy(relay.__file__, own / f"{LEVELS}.py")
-        chains = [_ChainRuns(Chain(count, RATE_HZ), runs, peers, racks, own) for count in counts]
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-bench-")))
+        racks = stack.enter_context(both_racks(against))
+        chains = [
+            _ChainRuns(Chain(count, RATE_HZ), runs, peers, list(_configs(count, racks, folder)))
+            for count in counts
+        ]
         progress.total(sum(chain.lasts_s for chain in chains))
         for chain in chains:
             progress.begin(f"boards: {chain.chain.boards}")
@@ -66,30 +67,42 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
         )
 
 
+def _configs(
+    boards: int, racks: Sequence[RackCommand], folder: Path
+) -> Iterator[tuple[RackCommand, Path]]:
+    """Write the config of a chain in lockstep for every tree, with levels that import that tree's
+    packages."""
+    source = Path(relay.__file__).read_text()
+    for number, rack in enumerate(racks):
+        own = folder / str(number)
+        own.mkdir(exist_ok=True)
+        (own / f"{LEVELS}.py").write_text(source.replace("from rack.", f"from {rack.package}"))
+        path = own / f"chain{boards}.toml"
+        path.write_text(Chain(boards, RATE_HZ, "lockstep").text(LEVELS, [own]))
+        yield rack, path
+
+
 class _ChainRuns:
-    """All runs of one chain; `peers` are the cores of `cyclictest`, `racks` run it in lockstep, by
-    a config in `folder`, which holds its levels."""
+    """All runs of one chain; `peers` are the cores of `cyclictest`, `configs` those for lockstep,
+    by tree."""
 
     def __init__(
         self,
         chain: Chain,
         runs: Runs,
         peers: tuple[int, ...],
-        racks: Sequence[RackCommand],
-        folder: Path,
+        configs: list[tuple[RackCommand, Path]],
     ) -> None:
         self.chain = chain
-        self._path = folder / f"chain{chain.boards}.toml"
-        self._path.write_text(Chain(chain.boards, RATE_HZ, "lockstep").text(LEVELS, [folder]))
         self._settings = runs
         self._grid = WakeGrid(
             peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY
         )
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []
-        self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack in racks}
+        self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack, _ in configs}
         self._contestants: list[Callable[[], None]] = [self._run, *([self._peer] if peers else [])]
-        self._contestants += [partial(self._lockstep, rack) for rack in racks]
+        self._contestants += [partial(self._lockstep, rack, path) for rack, path in configs]
 
     @property
     def lasts_s(self) -> float:
@@ -112,11 +125,12 @@ class _ChainRuns:
     def _peer(self) -> None:
         self._late.append(cyclictest(self._grid))
 
-    def _lockstep(self, rack: RackCommand) -> None:
+    def _lockstep(self, rack: RackCommand, path: Path) -> None:
         seconds = self._settings.seconds * min(STRETCH, LONGEST / self.chain.boards)
         options = ["--lockstep", "--no-record", "--json", "--seconds", seconds]
-        options += ["--share"] if self._settings.share else []
-        found = json.loads(rack.run("run", self._path, *options, bound_s=BOUND_S))
+        # Older trees have no such option: they run in any case.
+        options += ["--share"] if self._settings.share and rack.package else []
+        found = json.loads(rack.run("run", path, *options, bound_s=BOUND_S))
         self._lockstep_us[rack.name].append(found["wall_s"] * 1e6 / found["outcome"]["ticks"])
 
     @property

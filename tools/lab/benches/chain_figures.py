@@ -10,16 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import decimal, table
-from rack.tools.lab.benches.comparison import Absent
+from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
 from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond
+from rack.tools.lab.benches.harness import Absent
 
 RATE_HZ = 400
-RACK = "#4477aa"
-OTHER = "#ee6677"
-PEER = "#222222"
-SPREAD = "#bbccdd"
 
 
 @dataclass(frozen=True)
@@ -166,57 +162,27 @@ class Boards:
         ]
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write costs and misses by number of boards as PNG and SVG into `folder`; return their
-        paths."""
-        paths = paths_of(folder / "boards")
-        with picture(paths, 9.0, 4.0, layout="constrained") as drawn:
-            costs, shares = drawn.subplots(1, 2)
-            series = {
-                "real time: processor time": (
-                    [one.processor_us for one in self.figures],
-                    self.fit,
-                    RACK,
-                    "o",
-                )
-            }
-            for tree, colour in zip(self.trees, (PEER, OTHER), strict=False):
-                found = [one.lockstep_us[tree] for one in self.figures]
-                series[f"lockstep: time of a tick, {tree}"] = (
-                    found,
-                    self.lockstep_fit(tree),
-                    colour,
-                    "s",
-                )
-            for label, (found, fit, colour, mark) in series.items():
-                label += f"\n{fit.board_us:.1f} us a board, R² {fit.r2:.4f}" if fit else ""
-                costs.plot(self.counts, found, mark, color=colour, label=label)
-                if fit:
-                    ends = np.array([0, self.counts[-1]])
-                    costs.plot(ends, fit.base_us + fit.board_us * ends, color=colour, linewidth=0.8)
-            costs.set_ylim(0, None)
-            costs.set_ylabel("us a tick")
-            shares.plot(
-                self.counts,
-                [100 * one.missed for one in self.figures],
-                "o-",
-                color=RACK,
-                label="boards: missed",
-            )
-            if self.absent is None:
-                late = [100 * (one.late or 0.0) for one in self.figures]
-                shares.plot(
-                    self.counts, late, "s-", color=PEER, label="cyclictest: late by a cycle"
-                )
-            shares.set_ylim(
-                0, max(0.5, 130 * max(max(one.missed, one.late or 0.0) for one in self.figures))
-            )
-            shares.set_ylabel("% of the cycles")
-            for axes in (costs, shares):
-                axes.set_xlim(0, self.counts[-1] + 1)
-                axes.set_xlabel("boards")
-                axes.set_xticks(self.counts)
-                axes.grid(color=SPREAD, linewidth=0.4)
-                axes.spines[["top", "right"]].set_visible(False)
-                axes.legend(frameon=False, loc="upper left")
-            drawn.suptitle(self.title, fontsize="medium")
-        return paths
+        """Write costs and misses by number of boards into `folder`; return the paths."""
+        counts = self.counts
+        costs = [*_fitted("processor", counts, [one.processor_us for one in self.figures])]
+        for tree in self.trees:
+            found = [one.lockstep_us[tree] for one in self.figures]
+            costs += _fitted(f"lockstep, {tree}", counts, found)
+        missed = [100 * one.missed for one in self.figures]
+        shares = [Series("boards: missed", counts, missed, "o-")]
+        if self.absent is None:
+            late = [100 * (one.late or 0.0) for one in self.figures]
+            shares.append(Series("cyclictest: late by a cycle", counts, late, "s-", BASELINE))
+        panels = (
+            Diagram("", "boards", costs, "us a tick", is_linear=True),
+            Diagram("", "boards", shares, "% of the cycles"),
+        )
+        return draw(folder / "boards", self.title, panels)
+
+
+def _fitted(label: str, counts: Sequence[int], costs_us: Sequence[float]) -> Iterator[Series]:
+    """Yield costs by number of boards, and the line through them."""
+    yield Series(label, counts, costs_us)
+    if fit := Fit.of(counts, costs_us):
+        ends = [0, counts[-1]]
+        yield Series(fit.words, ends, [fit.base_us + fit.board_us * end for end in ends], "-")

@@ -24,7 +24,6 @@ from rack.levels.timing.trace_times import lateness_ns, skipped
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.chain import PRIORITY, Chain
-from rack.tools.lab.benches.comparison import Absent, Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.cyclictest import (
     CYCLICTEST,
     WakeGrid,
@@ -32,6 +31,7 @@ from rack.tools.lab.benches.cyclictest import (
     cyclictest,
     permits_fifo,
 )
+from rack.tools.lab.benches.harness import Absent, Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.linuxcnc import LINUXCNC, absent_linuxcnc, linuxcnc
 from rack.tools.lab.benches.observed import SETTLE_NS, Runs, observe
 from rack.tools.lab.benches.sleeper import sleep_loop

@@ -12,34 +12,29 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Occupation, unit_times
-from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import decimal, table
+from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
 from rack.tools.lab.benches.checkout import THIS, RackCommand, both_racks
-from rack.tools.lab.benches.comparison import Comparison, Sample, shown, turns
 from rack.tools.lab.benches.empty import write_empty_rack
+from rack.tools.lab.benches.harness import Comparison, Sample, shown, turns
 from rack.tools.lab.benches.physics import SERVO, ReplayPace, replay
 from rack.tools.recording.recording import Recording
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 PARTS = ("wake", "read", "process", "write", "bookkeeping")
 """Parts of a cycle, in the order of time; where a trace does not separate the last one, it is in
 the first."""
-COLOURS = ("#bbbbbb", "#88ccee", "#ddcc77", "#44aa99", "#aa4499")
-PHYSICS = "#882255"
-HATCH = "////"
 STEADY_TICKS = 40
 """Ticks at the start that are not judged: a new process touches its memory for the first time."""
 EMPTY = "empty"
@@ -114,71 +109,29 @@ class CycleCosts:
         yield from self.comparison.lines(width)
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write cycle.png and cycle.svg, a panel a board, into `folder`; return their paths."""
-        from matplotlib.patches import Patch
+        """Write the parts of cycles as bars, a panel a board, into `folder`; return the paths."""
+        rows = list(dict.fromkeys(one.who for one in self.parts))
+        cases = dict.fromkeys(one.case for one in self.parts)
+        panels = [
+            Diagram("", f"{case}, us", list(self._bars(case, rows)), is_linear=True)
+            for case in cases
+        ]
+        return draw(folder / self.comparison.name, self.comparison.title, panels, rows)
 
-        cases = list(dict.fromkeys(one.case for one in self.parts))
-        columns = len(cases) // 2
-        paths = paths_of(folder / self.comparison.name)
-        with picture(paths, 1.4 + 2.1 * columns, 4.1, layout="constrained") as figure:
-            # A row of panels for real time, one for lockstep.
-            axes = figure.subplots(2, columns, squeeze=False, sharey=True).flatten()
-            for panel, case in zip(axes, cases, strict=True):
-                self._draw(panel, case)
-            bars = [
-                Patch(color=colour, label=part) for part, colour in zip(PARTS, COLOURS, strict=True)
-            ]
-            bars.append(
-                Patch(facecolor="white", edgecolor=PHYSICS, hatch=HATCH, label="bare mj_step in it")
-            )
-            figure.legend(handles=bars, loc="outside upper center", ncols=len(bars), frameon=False)
-            figure.supxlabel(
-                f"{self.comparison.title}, us: medians of its parts; (ratio)", fontsize="medium"
-            )
-        return paths
-
-    def _draw(self, axes: Axes, case: str) -> None:
-        """Draw a bar a contestant, made of the parts of its cycle; of the servo's also the physics
-        in it."""
+    def _bars(self, case: str, rows: list[str]) -> Iterator[Series]:
+        """Yield the bars of each part of a cycle; of the servo's also the physics in it."""
         own = [one for one in self.parts if one.case == case]
+        places = [rows.index(one.who) for one in own]
+        starts = [0.0] * len(own)
+        for part in PARTS:
+            ends = [start + one.parts[part] for start, one in zip(starts, own, strict=True)]
+            yield Series(part, ends, places, "bar", starts=starts)
+            starts = ends
         physics = self.comparison.sample(_with_physics(case), _bare(case))
-        ends = [sum(one.parts.values()) for one in own]
-        for row, (one, end) in enumerate(zip(own, ends, strict=True)):
-            left = 0.0
-            for part, colour in zip(PARTS, COLOURS, strict=True):
-                axes.barh(row, one.parts[part], left=left, height=0.6, color=colour)
-                if part == "process" and physics is not None:
-                    axes.barh(
-                        row,
-                        physics.median,
-                        left=left,
-                        height=0.6,
-                        facecolor="none",
-                        edgecolor=PHYSICS,
-                        hatch=HATCH,
-                        linewidth=0.0,
-                    )
-                left += one.parts[part]
-            axes.annotate(
-                self._words(one),
-                (end, row),
-                (3, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=7,
-            )
-        axes.set_yticks(range(len(own)), [one.who for one in own])
-        axes.set_ylim(len(own) - 0.5, -0.5)
-        axes.set_xlim(0.0, 1.35 * max(ends))
-        axes.set_title(case, fontsize="small", loc="left")
-        axes.tick_params(axis="y", length=0)
-        axes.spines[["top", "right", "left"]].set_visible(False)
-
-    def _words(self, one: BoardParts) -> str:
-        sample = self.comparison.sample(one.case, one.who)
-        assert sample is not None, "parts and samples are of the same traces"
-        ratio = self.comparison.ratio(sample)
-        return shown(sample.median) + ("" if ratio is None else f" ({decimal(ratio, 2)})")
+        if physics is not None:
+            processing = [one.parts["wake"] + one.parts["read"] for one in own]
+            ends = [start + physics.median for start in processing]
+            yield Series("bare mj_step in it", ends, places, "span", BASELINE, processing)
 
 
 def _with_physics(case: str) -> str:
@@ -211,9 +164,9 @@ def measure(
     `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run
     fails.
     """
-    commands = both_racks(against)
-    with TemporaryDirectory() as folder:
-        runs = CycleRuns(seconds, Path(folder), share)
+    with ExitStack() as stack:
+        commands = stack.enter_context(both_racks(against))
+        runs = CycleRuns(seconds, Path(stack.enter_context(TemporaryDirectory())), share)
         progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
         for turn, (kind, command) in turns(
             [(kind, command) for kind in KINDS for command in commands], rounds
@@ -245,7 +198,9 @@ class CycleRuns:
         self._runs += 1
         folder = self._folder / str(self._runs)
         folder.mkdir()
-        config: str | Path = kind.config if kind.config != EMPTY else write_empty_rack(folder)
+        config: str | Path = (
+            kind.config if kind.config != EMPTY else write_empty_rack(folder, command.package)
+        )
         options = [
             "--set",
             f"name=bench-{os.getpid()}",
@@ -254,7 +209,9 @@ class CycleRuns:
             "--seconds",
             self._seconds,
         ]
-        options += ["--lockstep"] * kind.lockstep + ["--share"] * self._share
+        options += ["--lockstep"] * kind.lockstep + ["--share"] * (
+            self._share and bool(command.package)
+        )
         command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
         traces = traces_of(Recording(folder / "run"))
         for board, trace in traces.items():

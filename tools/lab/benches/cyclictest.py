@@ -19,7 +19,7 @@ import numpy as np
 
 from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.comparison import Absent, absent_program
+from rack.tools.lab.benches.harness import Absent, absent_program
 
 CYCLICTEST = "cyclictest"
 LONGEST_US = 100_000

@@ -10,8 +10,8 @@ BOARDS = 6
 LEVEL = '''\
 """A level with an empty cycle."""
 
-from rack.backplane.message import Field, MessageType
-from rack.levels.level import Executor, Input, Ports
+from {package}backplane.message import Field, MessageType
+from {package}levels.level import Executor, Input, Ports
 
 NUMBER = MessageType("number", 1, (Field("number", "i8", "1", "nothing in particular"),))
 
@@ -19,8 +19,8 @@ NUMBER = MessageType("number", 1, (Field("number", "i8", "1", "nothing in partic
 class Empty(Executor):
     """Reads a message, writes one, and processes nothing."""
 
-    inputs = {"read": Input(NUMBER, "below.written")}
-    outputs = {"written": NUMBER}
+    inputs = {{"read": Input(NUMBER, "below.written")}}
+    outputs = {{"written": NUMBER}}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Process nothing."""
@@ -45,11 +45,14 @@ reads = {{ read = "b{before}.written" }}
 """
 
 
-def write_empty_rack(folder: Path, boards: int = BOARDS) -> Path:
+def write_empty_rack(folder: Path, package: str, boards: int = BOARDS) -> Path:
     """Write a rack of so many boards in a ring, on two cores by turns, and its level into a folder;
-    return its config."""
+    return its config.
+
+    `package` is what imports of rack begin with, "rack." or nothing.
+    """
     module = "empty_level"
-    (folder / f"{module}.py").write_text(LEVEL)
+    (folder / f"{module}.py").write_text(LEVEL.format(package=package))
     tables = [
         BOARD.format(number=at, slot=2 + at, core=at % 2, module=module, before=(at - 1) % boards)
         for at in range(boards)

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import decimal, table
+from rack.tools.lab.benches.chart import Diagram, Series, draw
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44")
-GRID = "#bbccdd"
-LINEAR_MS = 0.1
-"""Times below it are on a linear scale: an exact exchange has no jitter."""
 NARROW = ("overtaken", "sent", "age p50", "jitter p50", "protocol")
 """Columns of the links that a narrow terminal leaves out, in this order."""
 
@@ -43,6 +36,10 @@ class LinkFigures:
     sent: int
     lost: int
     overtaken: int
+
+    def lost_percent(self) -> float:
+        """Return the share of messages that never arrived, %."""
+        return 100.0 * self.lost / max(self.sent, 1)
 
 
 @dataclass(frozen=True)
@@ -158,58 +155,30 @@ class HandBench:
         return list(dict.fromkeys(link.message for one in self.figures for link in one.links))
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write hand.png and hand.svg into `folder`; return their paths."""
-        paths = paths_of(folder / "hand")
-        with picture(paths, 11.0, 1.4 + 0.6 * len(self.messages), layout="constrained") as drawn:
-            axes = drawn.subplots(1, 3, sharey=True, width_ratios=(3, 3, 2))
-            self._draw(axes[0], "age", "age when read, ms")
-            self._draw(axes[1], "jitter", "jitter of arrival, ms")
-            self._draw_lost(axes[2])
-            axes[0].set_yticks(range(len(self.messages)), self.messages)
-            axes[0].invert_yaxis()
-            for each in axes:
-                each.grid(axis="x", color=GRID, linewidth=0.4)
-                each.spines[["top", "right"]].set_visible(False)
-            drawn.legend(
-                *axes[0].get_legend_handles_labels(),
-                loc="outside lower center",
-                ncols=4,
-                frameon=False,
-            )
-        return paths
+        """Write ages, jitter and losses, a row a type of messages, into `folder`; return the
+        paths."""
+        panels = [
+            Diagram("", "age when read, longest, ms", self._series(lambda link: link.age_max_ms)),
+            Diagram(
+                "", "jitter of arrival, most, ms", self._series(lambda link: link.jitter_max_ms)
+            ),
+            Diagram("", "lost, % of messages", self._series(LinkFigures.lost_percent)),
+        ]
+        return draw(folder / "hand", "", panels, self.messages)
 
-    def _draw(self, axes: Axes, what: str, label: str) -> None:
-        """Draw a line from the median to the largest of one figure, in the row of each message."""
+    def _series(self, value: Callable[[LinkFigures], float | None]) -> list[Series]:
+        """Return a series of marks for each rack and mode."""
+        found = []
         for number, one in enumerate(self.figures):
-            rows = [(self._row(number, link), link) for link in one.links]
-            spans = [
-                (row, getattr(link, f"{what}_p50_ms"), getattr(link, f"{what}_max_ms"))
-                for row, link in rows
-                if getattr(link, f"{what}_p50_ms") is not None
+            lower = (number + 0.5) / len(self.figures) - 0.5
+            known = [
+                (figure, self.messages.index(link.message) + 0.8 * lower)
+                for link in one.links
+                if (figure := value(link)) is not None
             ]
-            at, middle, most = zip(*spans, strict=True) if spans else ((), (), ())
-            colour = COLOURS[number % len(COLOURS)]
-            axes.hlines(at, middle, most, color=colour, linewidth=2)
-            axes.plot(middle, at, "o", color=colour, markersize=5, label=one.name)
-        from matplotlib.ticker import StrMethodFormatter
-
-        axes.set_xscale("symlog", linthresh=LINEAR_MS)
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.set_xlabel(label)
-        axes.set_xlim(left=0.0)
-
-    def _draw_lost(self, axes: Axes) -> None:
-        for number, one in enumerate(self.figures):
-            colour = COLOURS[number % len(COLOURS)]
-            for link in one.links:
-                part = 100.0 * link.lost / max(link.sent, 1)
-                axes.barh(self._row(number, link), part, 0.8 / len(self.figures), color=colour)
-        axes.set_xlabel("lost, % of messages")
-        axes.set_xlim(0.0, max(1.0, axes.get_xlim()[1]))
-
-    def _row(self, number: int, link: LinkFigures) -> float:
-        offset = (number - 0.5 * (len(self.figures) - 1)) / (len(self.figures) + 1)
-        return self.messages.index(link.message) + offset
+            values = [figure for figure, _ in known]
+            found.append(Series(one.name, values, [row for _, row in known]))
+        return found
 
 
 def _rack_row(one: HandFigures) -> Sequence[str]:

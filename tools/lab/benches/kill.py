@@ -16,7 +16,7 @@ from rack.boards.events import Event
 from rack.levels.robot.cell import build_cell
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.comparison import Sample
+from rack.tools.lab.benches.harness import Sample
 
 DETECTED = "detected"
 SAFE = "brakes engaged"

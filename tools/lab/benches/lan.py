@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.comparison import Absent, absent_package, turns
 from rack.tools.lab.benches.cyclictest import (
     CYCLICTEST,
     WakeGrid,
@@ -24,6 +23,7 @@ from rack.tools.lab.benches.cyclictest import (
     cyclictest,
     permits_fifo,
 )
+from rack.tools.lab.benches.harness import Absent, absent_package, turns
 from rack.tools.lab.benches.lan_ends import COORDINATOR
 from rack.tools.lab.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.lab.benches.lan_group import HEAD_START_NS, Group

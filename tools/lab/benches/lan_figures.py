@@ -6,23 +6,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from rack.tools.console.pictures import paths_of, picture
-from rack.tools.lab.benches.comparison import Absent, Comparison, Sample
+import numpy as np
+
+from rack.tools.lab.benches.chart import PALETTE, Diagram, Series, draw
+from rack.tools.lab.benches.harness import Absent, Comparison, Sample
 from rack.tools.lab.benches.lan_ends import LEASE_MS, ORDER_BYTES, STATUS_BYTES
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 BASELINES = {"round trip": "UDP", "age": "UDP", "on the wire": "UDP", "processor": "UDP"}
 """Whom the others are compared with; in all else, with cyclonedds."""
-COLOURS = {
-    "rack, TLS": "#4477aa",
-    "rack, TCP": "#66ccee",
-    "UDP": "#222222",
-    "cyclonedds": "#ccbb44",
-}
 TITLE = (
     f"a coordinator sends an order of {ORDER_BYTES} B to every rack, and each of these a status of"
     f" {STATUS_BYTES} B; lease {LEASE_MS} ms"
@@ -112,48 +105,25 @@ class LanFigures:
             )
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write lan.png and lan.svg into `folder`: medians and p99 by the number of racks; return
-        their paths."""
-        paths = paths_of(folder / "lan")
-        # A panel for each quantity at each rate.
-        panels = list(
-            dict.fromkeys((point.what, point.rate_hz, point.unit) for point in self.values)
-        )
-        columns = min(4, len(panels))
-        rows = -(-len(panels) // columns)
-        with picture(paths, 0.6 + 2.8 * columns, 1.0 + 2.1 * rows, layout="constrained") as figure:
-            axes = figure.subplots(rows, columns, squeeze=False).flatten()
-            for panel, (what, rate_hz, unit) in zip(axes, panels, strict=False):
-                self._draw(panel, what, rate_hz)
-                panel.set_title(
-                    f"{what}{f', {rate_hz:g} Hz' if rate_hz else ''}", fontsize="small", loc="left"
-                )
-                panel.set_ylabel(unit)
-            for panel in axes[len(panels) :]:
-                panel.set_visible(False)
-            figure.suptitle(
-                f"{self.comparison.title}\nline: median; dashes: p99; by the number of racks",
-                fontsize=8,
-            )
-        return paths
+        """Write medians and p99 by the number of racks, a panel a quantity and rate; return the
+        paths."""
+        kinds = dict.fromkeys((point.what, point.rate_hz, point.unit) for point in self.values)
+        title = f"{self.comparison.title}\nline: median; dashes: p99"
+        return draw(folder / "lan", title, [self._diagram(*kind) for kind in kinds])
 
-    def _draw(self, axes: Axes, what: str, rate_hz: float) -> None:
-        found = [
-            (point.who, point.racks, Sample(point.case, point.who, values, point.unit))
-            for point, values in self.values.items()
-            if (point.what, point.rate_hz) == (what, rate_hz)
-        ]
-        for who in dict.fromkeys(who for who, _, _ in found):
+    def _diagram(self, what: str, rate_hz: float, unit: str) -> Diagram:
+        everyone = list(dict.fromkeys(point.who for point in self.values))
+        series = []
+        for who, colour in zip(everyone, PALETTE, strict=False):
             own = sorted(
-                (racks, sample.median, sample.p99) for one, racks, sample in found if one == who
+                point
+                for point in self.values
+                if (point.what, point.rate_hz, point.who) == (what, rate_hz, who)
             )
-            racks, medians, p99s = zip(*own, strict=True)
-            colour = COLOURS.get(who, "#888888")
-            axes.plot(racks, medians, "o-", color=colour, markersize=3, linewidth=1, label=who)
-            axes.plot(racks, p99s, "--", color=colour, linewidth=0.7)
-        axes.set_xscale("log", base=2)
-        axes.set_yscale("log")
-        counts = sorted({number for _, number, _ in found})
-        axes.set_xticks(counts, map(str, counts))
-        axes.legend(frameon=False, fontsize=6)
-        axes.spines[["top", "right"]].set_visible(False)
+            racks = [point.racks for point in own]
+            medians = [float(np.median(self.values[point])) for point in own]
+            p99s = [float(np.percentile(self.values[point], 99.0)) for point in own]
+            series.append(Series(who, racks, medians, "o-", colour))
+            series.append(Series("", racks, p99s, "--", colour))
+        rate = f", {rate_hz:g} Hz" if rate_hz else ""
+        return Diagram(f"{what}{rate}", "racks", series, unit)

@@ -20,7 +20,7 @@ from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.checkout import RackCommand, both_racks
-from rack.tools.lab.benches.comparison import Comparison, Sample, interleaved
+from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
 from rack.tools.lab.benches.kill import Killing
 
 BOUND_S = 60.0
@@ -55,8 +55,7 @@ def measure(
     """
     rounds, kills = counts
     progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
-    trees = both_racks(against)
-    with tempfile.TemporaryDirectory() as folder:
+    with both_racks(against) as trees, tempfile.TemporaryDirectory() as folder:
         progress.begin("launches and commands")
         samples = list(_samples(name, trees, ShortRuns(Path(folder), share), rounds))
         progress.end(rounds * ROUND_S)
@@ -87,7 +86,8 @@ class ShortRuns(NamedTuple):
 
     def run(self, rack: RackCommand, config: str, out: Path) -> Path:
         """Make a run; return its folder."""
-        options = ["--share"] if self.share else []
+        # A checkout of before the namespace does not know the option, and never refuses.
+        options = ["--share"] if self.share and rack.package else []
         name = ("--set", f"name=bench-run-{os.getpid()}")
         rack.run(
             "run",
@@ -118,7 +118,7 @@ def _samples(name: str, trees: list[RackCommand], runs: ShortRuns, rounds: int) 
     contestants: dict[Key, Callable[[], float]] = {
         (LAUNCH, tree.name): partial(runs.launch_s, tree, name) for tree in trees
     }
-    python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"), own.environment)
+    python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"), own.environment, "")
     for case, arguments in commands.items():
         contestants[case, own.name] = partial(_command_s, own, arguments)
         contestants[case, INTERPRETER] = partial(_command_s, python, ())

@@ -22,8 +22,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.comparison import Absent, absent_program
 from rack.tools.lab.benches.cyclictest import WakeGrid
+from rack.tools.lab.benches.harness import Absent, absent_program
 
 LINUXCNC = "LinuxCNC thread"
 PACKAGE = "linuxcnc-uspace"

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from rack.boards import OneProcess
-from rack.boards.config import RackConfig, load
+from rack.boards.config import load, resolve
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.bare import BareRun, run_bare
 from rack.tools.lab.benches.checkout import RackCommand, both_racks, this_rack
-from rack.tools.lab.benches.comparison import Comparison, Sample, shown, turns
+from rack.tools.lab.benches.harness import Comparison, Sample, shown, turns
 from rack.tools.recording.recording import Recording
 
 RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
@@ -36,20 +35,6 @@ BARE = "no rack"
 EXPECTED_S = 10.0
 """About how long a run takes."""
 BOUND_S = 600.0
-
-
-@dataclass(frozen=True)
-class BareRun:
-    """A finished run of levels alone. `processor_s` is the time of its ticks.
-
-    `last` is the newest message of each mailbox that was visible before the end, `serials` its
-    number; without one, a mailbox is left out.
-    """
-
-    ticks: int
-    processor_s: float
-    serials: Mapping[str, int]
-    last: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -102,21 +87,21 @@ def measure(
 
     Raises `Failure` if a run fails, or if the levels without a rack did other work.
     """
-    commands = both_racks(against)
-    names = [command.name for command in commands]
-    progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
-    found: dict[tuple[str, str], list[float]] = {}
-    for rack, seconds in racks.items():
-        progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
-        with TemporaryDirectory() as folder:
-            ticks = _check(rack, seconds, Path(folder) / "run")
-        progress.end(EXPECTED_S, "equal")
-        ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
-        ways[BARE] = partial(_run_bare, rack, ticks)
-        for turn, who in turns(list(ways), rounds):
-            progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
-            found.setdefault((rack, who), []).append(ways[who]())
-            progress.end(EXPECTED_S)
+    with both_racks(against) as commands:
+        names = [command.name for command in commands]
+        progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
+        found: dict[tuple[str, str], list[float]] = {}
+        for rack, seconds in racks.items():
+            progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+            with TemporaryDirectory() as folder:
+                ticks = _check(rack, seconds, Path(folder) / "run")
+            progress.end(EXPECTED_S, "equal")
+            ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
+            ways[BARE] = partial(_run_bare, rack, ticks)
+            for turn, who in turns(list(ways), rounds):
+                progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
+                found.setdefault((rack, who), []).append(ways[who]())
+                progress.end(EXPECTED_S)
     return speeds(found, names)
 
 
@@ -166,17 +151,8 @@ def _ms_a_second(rack: str, ticks: int, took_s: float) -> float:
 
 
 def _bare(rack: str, ticks: int) -> BareRun:
-    return apart(run_bare, load(rack, ["clock.mode=lockstep"]), ticks)
-
-
-def run_bare(config: RackConfig, ticks: int) -> BareRun:
-    """Run a rack's levels in this process for so many ticks."""
-    with OneProcess(config) as rack:
-        start_ns = time.process_time_ns()
-        rack.run_ticks(ticks)
-        processor_s = (time.process_time_ns() - start_ns) * 1e-9
-        last = {name: rack.newest(name).record[()].copy() for name in rack.serials}
-        return BareRun(ticks, processor_s, rack.serials, last)
+    resolved = resolve(load(rack, ["clock.mode=lockstep"]))
+    return apart(run_bare, resolved.layout, resolved.tasks, ticks)
 
 
 def _check(rack: str, seconds: float | None, folder: Path) -> int:

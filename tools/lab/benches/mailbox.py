@@ -26,7 +26,7 @@ from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.comparison import (
+from rack.tools.lab.benches.harness import (
     Absent,
     Comparison,
     Sample,

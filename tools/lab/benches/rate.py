@@ -22,10 +22,9 @@ from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import obtained_core
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.console.answer import Failure
-from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import decimal, figure, table
-from rack.tools.lab.benches.comparison import Absent, turns
+from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
 from rack.tools.lab.benches.cyclictest import (
     BEYOND,
     CYCLICTEST,
@@ -35,14 +34,13 @@ from rack.tools.lab.benches.cyclictest import (
     cyclictest,
     overdue,
 )
+from rack.tools.lab.benches.harness import Absent, turns
 from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
 
 RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
 STEP_MS = 0.5
 """Longest time step of the simulated arm, that of the bundled racks."""
 LAUNCH_S = 3.0
-RACK = "#4477aa"
-PEER = "#222222"
 Late = np.ndarray | None
 
 
@@ -186,50 +184,19 @@ class Rates:
         ]
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write missed cycles and load by rate as PNG and SVG into `folder`; return their paths."""
-        from matplotlib.ticker import ScalarFormatter
-
+        """Write missed cycles and load by rate into `folder`; return the paths."""
         rates = [one.rate_hz for one in self.figures]
-        paths = paths_of(folder / "rate")
-        with picture(paths, 6.4, 5.2, layout="constrained") as drawn:
-            shares, load = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-            shares.plot(
-                rates,
-                [100 * one.missed for one in self.figures],
-                "o-",
-                color=RACK,
-                label="rack: missed",
-            )
-            if self.absent is None:
-                late = [100 * (one.late or 0.0) for one in self.figures]
-                shares.plot(rates, late, "s-", color=PEER, label="cyclictest: late by a cycle")
-                permitted = [share + 100 * BEYOND for share in late]
-                shares.plot(
-                    rates,
-                    permitted,
-                    ":",
-                    color=PEER,
-                    linewidth=0.8,
-                    label=f"{BEYOND:.1%} beyond it",
-                )
-            # Linear below the bound: 0 has its place.
-            shares.set_yscale("symlog", linthresh=100 * BEYOND)
-            shares.set_ylim(0, max(1.0, *(200 * one.missed for one in self.figures)))
-            shares.yaxis.set_major_formatter(ScalarFormatter())
-            shares.set_ylabel("% of the cycles")
-            shares.legend(frameon=False, loc="upper left")
-            parts = [one.processor_us * one.rate_hz * 1e-4 for one in self.figures]
-            load.plot(rates, parts, "o-", color=RACK)
-            load.axhline(100.0, color=PEER, linewidth=0.8, linestyle=":")
-            load.set_ylim(0, 1.1 * max(100.0, *parts))
-            load.set_ylabel("processor time of a\ncycle, % of its period")
-            load.set_xlabel("servo rate, Hz")
-            load.set_xticks(rates, [f"{rate:g}" for rate in rates])
-            for axes in (shares, load):
-                axes.grid(color="#bbccdd", linewidth=0.4)
-                axes.spines[["top", "right"]].set_visible(False)
-            drawn.suptitle(self.title, fontsize="medium")
-        return paths
+        shares = [Series("rack: missed", rates, [100 * one.missed for one in self.figures], "o-")]
+        if self.absent is None:
+            late = [100 * (one.late or 0.0) for one in self.figures]
+            shares.append(Series("cyclictest: late by a cycle", rates, late, "s-", BASELINE))
+        loads = [one.processor_us * one.rate_hz * 1e-4 for one in self.figures]
+        load = [Series("", rates, loads, "o-")]
+        panels = (
+            Diagram("", "servo rate, Hz", shares, "% of the cycles"),
+            Diagram("", "servo rate, Hz", load, "processor time of a cycle, % of its period"),
+        )
+        return draw(folder / "rate", self.title, panels)
 
 
 def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Rates:

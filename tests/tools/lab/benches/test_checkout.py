@@ -1,9 +1,9 @@
-"""The command line of another checkout: it runs in its own environment."""
+"""The command line of another checkout: it runs its own files, in every process that it starts."""
 
 from __future__ import annotations
 
 import json
-import sys
+import os
 from pathlib import Path
 
 import pytest
@@ -12,66 +12,102 @@ from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.checkout import checkout, this_rack
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
-PROGRAM = """#!{python}
-import os, sys
+MAIN = """
+import subprocess, sys
 
-if "fail" in sys.argv:
-    sys.exit("first line\\nthe reason")
-if "wait" in sys.argv:
-    sys.stdin.close()
-    import threading
-    threading.Event().wait()
-print(sys.argv, os.environ.get("PYTHONPATH"))
+def main():
+    if "fail" in sys.argv:
+        sys.exit("first line\\nthe reason")
+    if "lack" in sys.argv:
+        import no_such_package
+    if "wait" in sys.argv:
+        sys.stdin.close()
+        import threading
+        threading.Event().wait()
+    import given
+    child = "import {package}cli; print({package}cli.__file__)"
+    done = subprocess.run([sys.executable, "-c", child], capture_output=True)
+    print(sys.argv, __file__, done.stdout.decode())
 """
 
 
-def tree_of(folder: Path) -> Path:
-    """Make what looks like a checkout with its environment."""
-    program = folder / ".venv" / "bin" / "rack"
-    program.parent.mkdir(parents=True)
-    program.write_text(PROGRAM.format(python=sys.executable))
-    program.chmod(0o755)
-    (folder / "pyproject.toml").touch()
+def tree_of(folder: Path, package: str, mapping: str = "") -> Path:
+    (folder / "tools").mkdir(parents=True)
+    (folder / "tools" / "__init__.py").touch()
+    (folder / "tools" / "cli.py").write_text(MAIN.format(package=package))
+    (folder / "pyproject.toml").write_text(
+        f'[project.scripts]\nrack = "{package}cli:main"\n{mapping}'
+    )
     return folder
 
 
-def test_a_checkout_runs_in_its_own_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("layout", ["bare", "in one namespace"])
+def test_a_checkout_and_its_children_run_their_own_files(
+    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    other = checkout(tree_of(tmp_path / "other"))
-    program = tmp_path / "other" / ".venv" / "bin" / "rack"
-    assert other.run("run", 3, bound_s=BOUND_S) == f"['{program}', 'run', '3'] None\n"
-    assert other.name == "other"
+    (tmp_path / "extra").mkdir()
+    (tmp_path / "extra" / "given.py").touch()
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "extra"))
+    # Started from another tree, whose packages have the same names.
+    monkeypatch.chdir(ROOT)
+    mapping = '[tool.setuptools.package-dir]\n"rack.tools" = "tools"\n'
+    bare = layout == "bare"
+    package, mapping = ("tools.", "") if bare else ("rack.tools.", mapping)
+    tree = tree_of(tmp_path / "other", package, mapping)
+    with checkout(tree) as found:
+        argv, own, child = found.run("run", 3, bound_s=BOUND_S).rsplit(maxsplit=2)
+        assert argv == "['rack', 'run', '3']"
+        assert [Path(own).resolve(), Path(child).resolve()] == [tree / "tools" / "cli.py"] * 2
+        assert (found.name, found.package) == ("other", "" if bare else "rack.")
+        links = [
+            path
+            for path in found.environment["PYTHONPATH"].split(os.pathsep)
+            if "rack-bench-" in path
+        ]
+    assert not any(Path(link).exists() for link in links)
 
 
 def test_this_tree_is_a_checkout_too() -> None:
-    assert checkout(ROOT).run("--help", bound_s=BOUND_S) == this_rack().run(
-        "--help", bound_s=BOUND_S
-    )
+    with checkout(ROOT) as found:
+        assert found.run("--help", bound_s=BOUND_S) == this_rack().run("--help", bound_s=BOUND_S)
 
 
 @pytest.mark.slow
 def test_a_command_that_fails_or_hangs_is_one_line(tmp_path: Path) -> None:
-    other = checkout(tree_of(tmp_path / "other"))
-    with pytest.raises(Failure, match=r"^other: rack fail now: the reason$"):
-        other.run("fail", "now", bound_s=BOUND_S)
-    with pytest.raises(Failure, match=r"^other: rack wait: still running after 0.5 s$"):
-        other.run("wait", bound_s=0.5)
+    with checkout(tree_of(tmp_path / "other", "tools.")) as found:
+        with pytest.raises(Failure, match=r"^other: rack fail now: the reason$"):
+            found.run("fail", "now", bound_s=BOUND_S)
+        with pytest.raises(
+            Failure, match=r"^other: rack lack: .*no_such_package'; give the folder .* PYTHONPATH$"
+        ):
+            found.run("lack", bound_s=BOUND_S)
+        with pytest.raises(Failure, match=r"^other: rack wait: still running after 0.5 s$"):
+            found.run("wait", bound_s=0.5)
 
 
 def test_a_path_that_is_no_checkout_is_refused_in_one_line(tmp_path: Path) -> None:
-    bare = tmp_path / "bare"
-    bare.mkdir()
-    (bare / "pyproject.toml").touch()
-    for tree, reason in (
-        (tmp_path / "nowhere", "not a checkout of rack: no such folder"),
-        (tmp_path, "not a checkout of rack: it has no pyproject.toml"),
-        (bare, f"no environment; to make it: make -C {bare} .venv/installed"),
-    ):
-        with pytest.raises(Failure) as refused:
-            checkout(tree)
-        assert str(refused.value) == f"{tree}: {reason}"
+    project = tmp_path / "pyproject.toml"
+    mistakes = [
+        (tmp_path / "nowhere", None, "nowhere: not a checkout of rack: no such folder"),
+        (tmp_path, None, "not a checkout of rack: it has no pyproject.toml"),
+        (tmp_path, "[project", "pyproject.toml: Expected ']'"),
+        (tmp_path, "[project.scripts]\nother = 'a:b'", "its pyproject.toml has no script 'rack'"),
+        (
+            tmp_path,
+            (
+                "[project.scripts]\nrack ="
+                " 'rack.tools.cli:main'\n[tool.setuptools.package-dir]\n'rack.tools' = 'tools'"
+            ),
+            "it has no folder tools",
+        ),
+    ]
+    for tree, text, reason in mistakes:
+        if text is not None:
+            project.write_text(text)
+        with pytest.raises(Failure) as refused, checkout(tree):
+            pass
+        assert reason in str(refused.value)
+        assert len(str(refused.value).splitlines()) == 1
         assert refused.value.status == 2
 
 

@@ -15,8 +15,8 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import clock
 from rack.tools.lab.benches.clock import AWAKE, BARE, BOTH_WAYS, board, measure, suiting
-from rack.tools.lab.benches.comparison import Sample
 from rack.tools.lab.benches.cyclictest import CYCLICTEST, WakeGrid
+from rack.tools.lab.benches.harness import Sample
 from rack.tools.lab.benches.linuxcnc import LINUXCNC
 from rack.tools.lab.benches.observed import Runs
 from tests.machine import needs_fifo

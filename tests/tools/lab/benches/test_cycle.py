@@ -113,7 +113,7 @@ def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> Non
 
 
 def test_an_empty_rack_is_a_ring_of_boards_on_two_cores(tmp_path: Path) -> None:
-    config = load(write_empty_rack(tmp_path))
+    config = load(write_empty_rack(tmp_path, "rack."))
     assert len(config.board) == BOARDS
     assert {board.reads["read"] for board in config.board.values()} == {
         (f"{name}.written",) for name in config.board

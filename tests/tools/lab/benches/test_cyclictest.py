@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.comparison import Absent
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
+from rack.tools.lab.benches.harness import Absent
 from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 

@@ -12,7 +12,7 @@ import pytest
 
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import lan
-from rack.tools.lab.benches.comparison import Absent
+from rack.tools.lab.benches.harness import Absent
 from rack.tools.lab.benches.lan import LanRuns, measure
 from rack.tools.lab.benches.lan_ends import (
     COORDINATOR,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.comparison import Absent
 from rack.tools.lab.benches.cyclictest import WakeGrid, permits_fifo
+from rack.tools.lab.benches.harness import Absent
 from rack.tools.lab.benches.linuxcnc import absent_linuxcnc, lateness_us, linuxcnc
 from tests.tools.lab.benches import peers
 

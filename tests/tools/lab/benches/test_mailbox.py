@@ -22,12 +22,12 @@ from rack.backplane.message import Message
 from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.comparison import EXTRA, Absent, Sample, absent_package
+from rack.tools.lab.benches.harness import EXTRA, Absent, Sample, absent_package
 from rack.tools.lab.benches.mailbox import CASES, MESSAGE, SIZES, Case, Exchange, compare, measure
 from rack.tools.lab.benches.transports import PEERS, REFERENCES, Peer, Transport, raw_copy
 from tests.processes import BOUND_S, RACK
 from tests.tools.command_line import ROOT
-from tests.tools.lab.benches.test_comparison import Hidden
+from tests.tools.lab.benches.test_harness import Hidden
 
 NET = ("tcp", "tcp6", "udp", "udp6")
 

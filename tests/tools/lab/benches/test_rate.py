@@ -12,7 +12,7 @@ import pytest
 from rack.boards.config import load, loads, wire
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.comparison import Absent
+from rack.tools.lab.benches.harness import Absent
 from rack.tools.lab.benches.observed import Runs
 from rack.tools.lab.benches.rate import RATES_HZ, STEP_MS, RateFigures, Rates, at_rate, measure
 from tests.boards.conftest import PLAIN

@@ -11,8 +11,8 @@ from typing import Any
 
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.console.tables import decimal, figure, table
-from rack.tools.lab.benches.comparison import Absent, shown
 from rack.tools.lab.benches.cyclictest import BEYOND
+from rack.tools.lab.benches.harness import Absent, shown
 from rack.tools.lab.benches.systems.figures import SystemFigures
 from rack.tools.lab.benches.systems.kills import KillDetection, KilledBoards
 from rack.tools.lab.benches.systems.motion import Stop

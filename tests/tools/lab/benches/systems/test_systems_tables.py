@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rack.tools.lab.benches.comparison import Absent
+from rack.tools.lab.benches.harness import Absent
 from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures
 from rack.tools.lab.benches.systems.hold import HoldResponse
 from rack.tools.lab.benches.systems.kills import KillDetection, KilledBoards

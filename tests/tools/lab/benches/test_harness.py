@@ -14,7 +14,7 @@ from types import ModuleType
 
 import pytest
 
-from rack.tools.lab.benches.comparison import (
+from rack.tools.lab.benches.harness import (
     EXTRA,
     Absent,
     Comparison,

@@ -1,47 +1,78 @@
-"""What a bench finds: contestants in the same cases, measured by turns, as figures, ratios and
-pictures.
+"""What the benches of `rack bench` share. Each answers one question of a user, which its help says.
 
-A machine's speed drifts by a factor of two within a day, so no time means much alone: every
-contestant is measured in the same minutes as the baseline of its case, and judged by the ratio of
-medians.
+A bench is a function `measure(..., progress)` that returns a `BenchResult`: a record of what it has
+found. `show` calls it, with the progress on the terminal, and prints the record as text or as one
+JSON document; with --plot it also writes pictures, whose panels are data (see `chart`).
+
+A machine's speed drifts by a factor of two within a day, so no time means much alone. Contestants
+are measured by turns (`interleaved`) in an order that changes from round to round, and each is
+judged by the ratio of its median to that of the baseline in the same case. A `Comparison` is the
+record of a bench for which that is all. A peer that this machine lacks is `Absent`: it is named,
+and the others are measured all the same.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
-from rack.tools.console.pictures import paths_of, picture
-from rack.tools.console.tables import decimal, table
+from rack.tools.console.answer import print_json
+from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
+from rack.tools.lab.benches.chart import BASELINE, PALE, PALETTE, Diagram, Series, draw
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from rack.tools.console.progress import Progress
 
 EXTRA = "pip install .[bench]"
 """Brings the peers that are Python packages."""
-COLUMNS = 4
-"""Panels next to each other in a picture, at most."""
-ROW_IN = 0.34
-"""Height of a contestant's row."""
-WIDE = 15.0
-"""Ratio of the largest to the smallest value from which an axis is logarithmic."""
-MEDIAN = "#4477aa"
-BASELINE = "#222222"
-SPREAD = "#bbccdd"
-"""Colours that people with any kind of colour vision can distinguish (after Paul Tol's)."""
 KEY = "dot: median (ratio to the black one of the case); line: best to p99"
-_PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
-LABEL: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 6.5, "bbox": _PAPER}
 _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
+
+
+class BenchResult(Protocol):
+    """What a bench has found, as far as it is shown."""
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield it as text for people, fitted to `width`."""
+
+    def plot(self, folder: Path) -> list[Path]:
+        """Write its pictures into `folder`; return their paths."""
+
+
+Found = TypeVar("Found", bound=BenchResult)
+
+
+def show(measure: Callable[[Progress], Found], plot: Path | None, as_json: bool) -> Found:
+    """Measure, with the progress on the terminal; print what was found and, if asked for, plot it.
+    Return it."""
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(progress)
+    print_found(found.document(), found.lines(terminal_width()), as_json)
+    if plot is not None:
+        plot.mkdir(parents=True, exist_ok=True)
+        paths = found.plot(plot)
+        if not as_json:
+            print(f"pictures: {', '.join(map(str, paths))}")
+    return found
+
+
+def print_found(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
+    """Print what was found: for people, or as one JSON document."""
+    print_json(document) if as_json else print_wrapped("\n".join(lines))
 
 
 @dataclass(frozen=True)
@@ -206,64 +237,23 @@ class Comparison:
         return [sample.case, sample.who, str(sample.count), *figures, sample.unit, *ratios]
 
     def plot(self, folder: Path) -> list[Path]:
-        """Write the comparison as PNG and SVG, a panel a case, into `folder`; return their
-        paths."""
-        cases = self.cases
-        who = self.contestants
-        columns = min(COLUMNS, len(cases))
-        rows = -(-len(cases) // columns)
-        paths = paths_of(folder / self.name)
-        size = 1.6 + 2.6 * columns, 0.9 + rows * (0.75 + ROW_IN * len(who))
-        with picture(paths, *size, layout="constrained") as figure:
-            axes = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten()
-            for panel, case in zip(axes, cases, strict=False):
-                self._draw(panel, case)
-            for panel in axes[len(cases) :]:
-                panel.set_visible(False)
-            axes[0].set_ylim(len(who) - 0.4, -0.6)
-            axes[0].set_yticks(range(len(who)), who)
-            figure.suptitle(f"{self.title}\n{KEY}", fontsize="medium")
-        return paths
+        """Write the comparison into `folder`, a panel a case; return the paths."""
+        panels = [self._diagram(case) for case in self.cases]
+        return draw(folder / self.name, f"{self.title}\n{KEY}", panels, self.contestants)
 
-    def _draw(self, axes: Axes, case: str) -> None:
-        """Draw one case: a dot at each median, a line from best to p99, and a rule at the
-        baseline's median."""
-        from matplotlib.ticker import StrMethodFormatter
-
+    def _diagram(self, case: str) -> Diagram:
+        """Return a dot at each median, and a line from best to p99."""
         own = [sample for sample in self.samples if sample.case == case]
-        alike = [sample for sample in self.samples if sample.unit == own[0].unit]
-        # A best of 0 has no place on a logarithmic axis.
-        low = min(sample.best or sample.median for sample in alike)
-        high = max(sample.p99 for sample in alike)
-        for sample in own:
-            row = self.contestants.index(sample.who)
+        rows = [self.contestants.index(sample.who) for sample in own]
+        p99s = [sample.p99 for sample in own]
+        series = [Series("", p99s, rows, "span", PALE, [sample.best for sample in own])]
+        for sample, row in zip(own, rows, strict=True):
             is_baseline = self.baselines.get(case) == sample.who
-            axes.hlines(row, sample.best, sample.p99, color=SPREAD, linewidth=3)
-            axes.plot(
-                sample.median, row, "o", color=BASELINE if is_baseline else MEDIAN, markersize=5
-            )
-            if is_baseline:
-                axes.axvline(sample.median, color=BASELINE, linewidth=0.8, linestyle=":")
-            axes.annotate(
-                self._words(sample),
-                (sample.median, row),
-                (0, 5),
-                textcoords="offset points",
-                **LABEL,
-            )
-        is_wide = low > 0 and high > WIDE * low
-        axes.set_xscale("log" if is_wide else "linear")
-        axes.set_xlim(*((low / 1.6, high * 1.6) if is_wide else (0.0, 1.15 * high)))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.set_title(case, fontsize="small", loc="left")
-        axes.set_xlabel(own[0].unit)
-        axes.grid(axis="x", color=SPREAD, linewidth=0.4)
-        axes.tick_params(axis="y", length=0)
-        axes.spines[["top", "right", "left"]].set_visible(False)
-
-    def _words(self, sample: Sample) -> str:
-        ratio = self.ratio(sample)
-        return shown(sample.median) + ("" if ratio is None else f"  ({ratio:.2f})")
+            colour = BASELINE if is_baseline else PALETTE[0]
+            ratio = self.ratio(sample)
+            note = shown(sample.median) + ("" if ratio is None else f"  ({ratio:.2f})")
+            series.append(Series("", [sample.median], [row], "o", colour, notes=[note]))
+        return Diagram(case, own[0].unit, series)
 
 
 def shown(value: float) -> str:
@@ -281,11 +271,22 @@ def turns(names: Sequence[_Name], rounds: int) -> Iterator[tuple[int, _Name]]:
 
 
 def interleaved(
-    contestants: Mapping[_Name, Callable[[], _Result]], rounds: int
+    contestants: Mapping[_Name, Callable[[], _Result]],
+    rounds: int,
+    progress: Progress | None = None,
+    each_s: float = 0.0,
 ) -> dict[_Name, list[_Result]]:
     """Call every contestant once a round, in changing order; return the results of each, oldest
-    first."""
+    first.
+
+    Progress, if given, is told of each call, which takes about `each_s`.
+    """
     found: dict[_Name, list[_Result]] = {name: [] for name in contestants}
-    for _, name in turns(list(contestants), rounds):
+    for turn, name in turns(list(contestants), rounds):
+        if progress is not None:
+            label = name if isinstance(name, str) else ", ".join(map(str, name))
+            progress.begin(f"{label}: round {turn + 1} of {rounds}")
         found[name].append(contestants[name]())
+        if progress is not None:
+            progress.end(each_s)
     return found
