@@ -3,30 +3,84 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from random import Random
+from typing import NamedTuple
 
-from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.words import Block, System, TaskState
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.boards.events import Event
+from rack.boards.events import Event, Outcome
+from rack.boards.faults.kind import DIED
 from rack.levels.robot.cell import build_cell
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
+from rack.tools.faults.campaigns.plan import Kill
+from rack.tools.faults.campaigns.trial import Killer
+from rack.tools.faults.ending import Strike, strikes
+from rack.tools.faults.evidence import BRAKES
 from rack.tools.lab.benches.harness import Sample
 
 DETECTED = "detected"
 SAFE = "brakes engaged"
-SETTLE_S = 1.0
-"""Time between kills, after which the arm moves again."""
+KILL_S = 2.5
+"""Time between kills: the board is back, and the arm moves again."""
 PHASES_S = 0.1
 """Kills are spread over all phases of the slower cycles."""
-REACT_S = 10.0
-"""Longest wait for a reaction, and for the board's return."""
-LOOK_S = 0.02
+RUNS = 3
+"""Most runs, until as many kills as wanted have been judged."""
+
+
+class KillEvents(NamedTuple):
+    """A kill, and the events from it until the next one."""
+
+    strike: Strike
+    events: tuple[Event, ...]
+
+    def first(self, code: str) -> Event | None:
+        """Return the first event of a code."""
+        return next((event for event in self.events if event.code == code), None)
+
+
+class KilledRun(NamedTuple):
+    """A run with kills. `offset_ns` turns CLOCK_MONOTONIC into the time of events."""
+
+    kills: tuple[KillEvents, ...]
+    outcome: Outcome
+    lasted_ns: int
+    offset_ns: int
+    epoch_ns: int
+
+
+def run_killing(
+    config: RackConfig, seconds: float, share: bool = True, kills: Sequence[Kill] = ()
+) -> KilledRun:
+    """Run a rack that no board ends, killed by the faults of its config and by `kills` from
+    outside."""
+    boards = {
+        name: table.model_copy(update={"ends_run": False}) for name, table in config.board.items()
+    }
+    with Rack(config.model_copy(update={"board": boards}), share=share) as rack:
+        killer = Killer(rack.segment, kills)
+        rack.start(seconds)
+        began_ns = time.monotonic_ns()
+        while rack.watch(killer.due_in_s()):
+            killer.advance()
+        lasted_ns = time.monotonic_ns() - began_ns
+        assert rack.outcome is not None, "the run is over"
+        struck = [strike for strike in strikes(rack.segment, (), killer.done) if strike.tick >= 0]
+        ends = [*(strike.tick for strike in struck[1:]), rack.outcome.ticks]
+        return KilledRun(
+            kills=tuple(
+                KillEvents(strike, tuple(e for e in rack.events if strike.tick <= e.tick < end))
+                for strike, end in zip(struck, ends, strict=True)
+            ),
+            outcome=rack.outcome,
+            lasted_ns=lasted_ns,
+            offset_ns=time.time_ns() - time.monotonic_ns(),
+            epoch_ns=rack.segment.words[System.EPOCH_NS],
+        )
 
 
 class Killing:
@@ -51,90 +105,54 @@ class Killing:
         self._patience = cell.patience.ticks(config.every(servo), config.clock_ns * 1e-9)
         self._random = Random(kills)
 
-    def samples(self, board: str, expected_s: float) -> Iterator[Sample]:
+    def samples(self, board: str) -> Iterator[Sample]:
         """Kill a board again and again; yield the times to its detection and to safe torque, in ms
         and in cycles."""
         self._progress.begin(f"kills of {board}")
-        found: dict[str, list[float]] = {DETECTED: [], SAFE: []}
-        config = self._braking(board)
-        seen: list[Event] = []
-        with Rack(config, seen.append) as rack:
-            rack.start()
-            while len(found[SAFE]) < self._kills:
-                _watch(rack, SETTLE_S + self._random.uniform(0.0, PHASES_S), lambda: False)
-                reaction = self._kill(rack, board, seen)
-                # On a busy machine the brakes may have engaged for another reason, just before the
-                # kill.
-                if reaction[SAFE] > 0.0:
-                    for what, seconds in reaction.items():
-                        found[what].append(seconds)
-            rack.stop("measured")
-            while rack.watch(LOOK_S):
-                continue
-        self._progress.end(self._kills * expected_s)
-        cycle_s = config.every(self.boards[0]) * rack.segment.words[System.PERIOD_NS] * 1e-9
-        for what, times in found.items():
-            yield Sample(f"{board} killed", what, tuple(1e3 * seconds for seconds in times), "ms")
-        for what, times in found.items():
-            yield Sample(
-                f"{board} killed, in cycles",
-                what,
-                tuple(seconds / cycle_s for seconds in times),
-                "cycles",
-            )
+        table = self._config.board[board].model_copy(update={"on_loss": "brake"})
+        config = self._config.model_copy(update={"board": {**self._config.board, board: table}})
+        found: list[tuple[float, float]] = []
+        for _ in range(RUNS):
+            found += self._reactions_s(config, board, self._kills - len(found))
+            if len(found) == self._kills:
+                break
+        else:
+            raise Failure(f"'{board}' was killed {self._kills} times: {len(found)} reactions")
+        self._progress.end(self._kills * KILL_S)
+        cycle_s = config.every(self.boards[0]) * config.clock_ns * 1e-9
+        for case, unit, part_s in (("", "ms", 1e-3), (", in cycles", "cycles", cycle_s)):
+            for who, times in zip((DETECTED, SAFE), zip(*found, strict=True), strict=True):
+                values = tuple(time_s / part_s for time_s in times)
+                yield Sample(f"{board} killed{case}", who, values, unit)
 
-    def _braking(self, board: str) -> RackConfig:
-        """Return the config without an end, in which the loss of this board engages the brakes."""
-        boards = {
-            name: table.model_copy(update={"ends_run": False})
-            for name, table in self._config.board.items()
-        }
-        boards[board] = boards[board].model_copy(update={"on_loss": "brake"})
-        return self._config.model_copy(update={"board": boards})
+    def _reactions_s(
+        self, config: RackConfig, board: str, count: int
+    ) -> Iterator[tuple[float, float]]:
+        """Yield the times to detection and to engaged brakes, of each kill that engaged them, s."""
+        instants = [
+            KILL_S * (1 + number) + self._random.uniform(0.0, PHASES_S) for number in range(count)
+        ]
+        ticks = [second * 1e9 / config.clock_ns for second in instants]
+        kills = [Kill(board, int(tick), tick % 1.0) for tick in ticks]
+        run = run_killing(config, KILL_S * (count + 1), kills=kills)
+        for kill in run.kills:
+            died = kill.first(DIED)
+            braked = kill.first(BRAKES)
+            if died is not None and braked is not None:
+                killed_ns = kill.strike.time_ns
+                braked_ns = self._braked_ns(run, braked)
+                # On a busy machine they may have engaged for another reason, just before.
+                if braked_ns > killed_ns:
+                    died_ns = died.time_ns - run.offset_ns
+                    yield (died_ns - killed_ns) * 1e-9, (braked_ns - killed_ns) * 1e-9
 
-    def _kill(self, rack: Rack, board: str, seen: list[Event]) -> dict[str, float]:
-        """Kill a board and wait until it is back; return the times of the reactions, s."""
-        seen.clear()
-        block = rack.segment.block(board)
-        killed_ns = time.monotonic_ns()
-        offset_ns = time.time_ns() - time.monotonic_ns()
-        tick = rack.segment.words[System.TICK]
-        os.kill(block[Block.PID], signal.SIGKILL)
-
-        def first(code: str) -> Event | None:
-            return next(
-                (event for event in seen if event.code == code and event.tick >= tick), None
-            )
-
-        def is_over() -> bool:
-            return (
-                bool(first("died") and first("brakes_closed"))
-                and block[Block.STATE] == TaskState.RUNNING
-            )
-
-        _watch(rack, REACT_S, is_over)
-        died = first("died")
-        braked = first("brakes_closed")
-        if died is None or braked is None:
-            raise Failure(f"'{board}' was killed: no reaction within {REACT_S:g} s")
-        return {
-            DETECTED: (died.time_ns - offset_ns - killed_ns) * 1e-9,
-            SAFE: (self._braked_ns(rack, braked, offset_ns) - killed_ns) * 1e-9,
-        }
-
-    def _braked_ns(self, rack: Rack, braked: Event, offset_ns: int) -> int:
+    def _braked_ns(self, run: KilledRun, braked: Event) -> int:
         """Return when the brakes engaged, CLOCK_MONOTONIC, ns.
 
         A servo level that was away reports them late: the arm itself engaged them once it had
         waited long enough.
         """
         if not braked.value:
-            return braked.time_ns - offset_ns
-        return SystemClock(rack.segment).time_of(braked.tick - int(braked.value) + self._patience)
-
-
-def _watch(rack: Rack, seconds: float, is_over: Callable[[], bool]) -> None:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until and not is_over():
-        if not rack.watch(LOOK_S):
-            raise Failure(f"the rack ended during the measurement: {rack.outcome}")
+            return braked.time_ns - run.offset_ns
+        tick = braked.tick - int(braked.value) + self._patience
+        return run.epoch_ns + tick * self._config.clock_ns

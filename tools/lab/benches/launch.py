@@ -21,7 +21,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.checkout import RackCommand, both_racks
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
-from rack.tools.lab.benches.kill import Killing
+from rack.tools.lab.benches.kill import KILL_S, Killing
 
 BOUND_S = 60.0
 """Longest time that a command may take."""
@@ -30,8 +30,7 @@ RUN_S = 0.25
 LAUNCH = "launch"
 INTERPRETER = "python, numpy"
 ROUND_S = 8.0
-KILL_S = 2.5
-"""Expected time of a round of launches and commands, and of a kill."""
+"""Expected time of a round of launches and commands."""
 
 Key = tuple[str, str]
 """Case and contestant."""
@@ -60,7 +59,7 @@ def measure(
         samples = list(_samples(name, trees, ShortRuns(Path(folder), share), rounds))
         progress.end(rounds * ROUND_S)
     killing = Killing(name, kills, progress)
-    samples += [sample for board in killing.boards for sample in killing.samples(board, KILL_S)]
+    samples += [sample for board in killing.boards for sample in killing.samples(board)]
     cases = dict.fromkeys(sample.case for sample in samples if sample.who == INTERPRETER)
     baselines = dict.fromkeys(cases, INTERPRETER)
     if against is not None:

@@ -58,7 +58,7 @@ def test_a_kill_is_detected_before_the_brakes_are_engaged(of: str) -> None:
     killing = Killing("nasrem", 2, Progress())
     assert killing.boards == ("servo", "primitive")
     board = killing.boards[of == "its commands"]
-    samples = {(sample.who, sample.unit): sample for sample in killing.samples(board, 1.0)}
+    samples = {(sample.who, sample.unit): sample for sample in killing.samples(board)}
     assert {who for who, _ in samples} == {DETECTED, SAFE}
     assert all(sample.count == 2 for sample in samples.values())
     # nasrem's servo level cycles every 2.5 ms.

@@ -3,24 +3,19 @@ neighbour does."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
-from rack.boards import Rack
 from rack.boards.config import RackConfig
-from rack.boards.events import Event
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import DIED
-from rack.tools.faults.ending import Strike, strikes
 from rack.tools.faults.evidence import is_about
+from rack.tools.lab.benches.kill import KillEvents, run_killing
 
 FIRST_S = 1.0
 BETWEEN_S = 1.25
 """Simulated time of the first kill, and between two: a lost board is back after half a second."""
-LOOK_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -69,45 +64,33 @@ def kill_each(config: RackConfig, layout: Layout, share: bool) -> KilledBoards:
         FaultConfig(kind="kill", board=name, tick=first + at * between)
         for at, name in enumerate(names)
     ]
-    boards = {
-        name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
-    }
-    killing = config.model_copy(update={"board": boards, "fault": tuple(kills)})
-    seen: list[Event] = []
-    with Rack(killing, seen.append, share) as rack:
-        rack.start(kills_s(layout))
-        began_ns = time.monotonic_ns()
-        while rack.watch(LOOK_S):
-            continue
-        assert rack.outcome is not None, "the run is over"
-        struck = [
-            strike
-            for strike in strikes(rack.segment, (), ())
-            if strike.kind == "kill" and strike.tick >= 0
-        ]
-        outcome = rack.outcome
-        lasted_ns = time.monotonic_ns() - began_ns
+    killing = config.model_copy(update={"fault": tuple(kills)})
+    run = run_killing(killing, kills_s(layout), share)
+    end = run.outcome
+    failure = "" if end.worked else f"{end.cause}: {'; '.join(end.faults) or end.reason}"
     return KilledBoards(
-        detections=tuple(_detection(strike, seen, between) for strike in struck),
+        detections=tuple(map(_detection, run.kills)),
         tick_ms=config.clock_ns * 1e-6,
-        speed=outcome.ticks * config.clock_ns / lasted_ns,
-        failure=""
-        if outcome.worked
-        else f"{outcome.cause}: {'; '.join(outcome.faults) or outcome.reason}",
+        speed=end.ticks * config.clock_ns / run.lasted_ns,
+        failure=failure,
     )
 
 
-def _detection(strike: Strike, seen: Sequence[Event], until: int) -> KillDetection:
-    after = [event for event in seen if strike.tick <= event.tick < strike.tick + until]
-    ends = [event.tick for event in after if event.kind == DIED and event.board == strike.board]
-    found = [event for event in after if event.kind == "detection" and is_about(event, strike)]
-    others = [
-        event for event in found if event.board.partition(".")[0] != strike.board.partition(".")[0]
-    ]
+def _detection(kill: KillEvents) -> KillDetection:
+    strike = kill.strike
+    board = strike.board.partition(".")[0]
+    died = next((e for e in kill.events if e.kind == DIED and e.board == strike.board), None)
+    others = (
+        event
+        for event in kill.events
+        if event.kind == "detection"
+        and is_about(event, strike)
+        and event.board.partition(".")[0] != board
+    )
     first = min(others, key=lambda event: event.tick, default=None)
     return KillDetection(
         board=strike.board,
-        rack=min(ends) - strike.tick if ends else None,
+        rack=None if died is None else died.tick - strike.tick,
         neighbour=None if first is None else first.tick - strike.tick,
         by="" if first is None else first.board,
     )
