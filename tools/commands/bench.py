@@ -67,8 +67,8 @@ def cycle(
 
     Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns
     with another checkout. The servo board is also compared with bare mj_step calls: the physics of
-    its recorded run, replayed alone. What TREE needs and this environment lacks, give in
-    PYTHONPATH.
+    its recorded run, replayed alone. TREE runs in its own
+    environment, TREE/.venv.
     """
     from rack.tools.lab.benches.cycle import measure
 
@@ -89,8 +89,8 @@ def lockstep(
     """Measure how fast nasrem, k1607 and fig4 run in lockstep.
 
     Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one
-    process without a rack. Its messages must be those of the rack, bit for bit. What TREE needs and
-    this environment lacks, give in PYTHONPATH.
+    process without a rack. Its messages must be those of the rack, bit for bit. TREE runs in its own
+    environment, TREE/.venv.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,10 +19,9 @@ import numpy as np
 
 from rack.boards.config import loads
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches import relay
 from rack.tools.lab.benches.chain import LONGEST, PRIORITY, Chain
 from rack.tools.lab.benches.chain_figures import RATE_HZ, Boards, ChainFigures
-from rack.tools.lab.benches.checkout import RackCommand, both_racks
+from rack.tools.lab.benches.checkout import RackCommand, rack_commands
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.lab.benches.harness import turns
 from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
@@ -35,8 +33,6 @@ BOUND_S = 120.0
 STRETCH = 10
 """A short chain runs longer in lockstep, at most so many times: else its start would be a part of
 its cost."""
-LEVELS = "relay_levels"
-"""Module of the levels in another checkout."""
 
 
 def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: Progress) -> Boards:
@@ -47,12 +43,10 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
     absent = absent_cyclictest()
     cores = tuple(sorted(os.sched_getaffinity(0)))
     peers = () if absent else cores
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-bench-")))
-        racks = stack.enter_context(both_racks(against))
+    racks = rack_commands(against)
+    with TemporaryDirectory(prefix="rack-bench-") as folder:
         chains = [
-            _ChainRuns(Chain(count, RATE_HZ), runs, peers, list(_configs(count, racks, folder)))
-            for count in counts
+            _ChainRuns(Chain(count, RATE_HZ), runs, peers, racks, Path(folder)) for count in counts
         ]
         progress.total(sum(chain.lasts_s for chain in chains))
         for chain in chains:
@@ -67,42 +61,28 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
         )
 
 
-def _configs(
-    boards: int, racks: Sequence[RackCommand], folder: Path
-) -> Iterator[tuple[RackCommand, Path]]:
-    """Write the config of a chain in lockstep for every tree, with levels that import that tree's
-    packages."""
-    source = Path(relay.__file__).read_text()
-    for number, rack in enumerate(racks):
-        own = folder / str(number)
-        own.mkdir(exist_ok=True)
-        (own / f"{LEVELS}.py").write_text(source.replace("from rack.", f"from {rack.package}"))
-        path = own / f"chain{boards}.toml"
-        path.write_text(Chain(boards, RATE_HZ, "lockstep").text(LEVELS, [own]))
-        yield rack, path
-
-
 class _ChainRuns:
-    """All runs of one chain; `peers` are the cores of `cyclictest`, `configs` those for lockstep,
-    by tree."""
+    """All runs of one chain; `peers` are the cores of `cyclictest`, `racks` run in lockstep."""
 
     def __init__(
         self,
         chain: Chain,
         runs: Runs,
         peers: tuple[int, ...],
-        configs: list[tuple[RackCommand, Path]],
+        racks: Sequence[RackCommand],
+        folder: Path,
     ) -> None:
         self.chain = chain
         self._settings = runs
         self._grid = WakeGrid(
             peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY
         )
+        path = chain._replace(mode="lockstep").write(folder)
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []
-        self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack, _ in configs}
+        self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack in racks}
         self._contestants: list[Callable[[], None]] = [self._run, *([self._peer] if peers else [])]
-        self._contestants += [partial(self._lockstep, rack, path) for rack, path in configs]
+        self._contestants += [partial(self._lockstep, rack, path) for rack in racks]
 
     @property
     def lasts_s(self) -> float:
@@ -128,8 +108,7 @@ class _ChainRuns:
     def _lockstep(self, rack: RackCommand, path: Path) -> None:
         seconds = self._settings.seconds * min(STRETCH, LONGEST / self.chain.boards)
         options = ["--lockstep", "--no-record", "--json", "--seconds", seconds]
-        # Older trees have no such option: they run in any case.
-        options += ["--share"] if self._settings.share and rack.package else []
+        options += ["--share"] if self._settings.share else []
         found = json.loads(rack.run("run", path, *options, bound_s=BOUND_S))
         self._lockstep_us[rack.name].append(found["wall_s"] * 1e6 / found["outcome"]["ticks"])
 

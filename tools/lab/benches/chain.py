@@ -11,13 +11,15 @@ from typing import Any, NamedTuple
 from rack.backplane.layout import Wake
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, Mode
 from rack.boards.config.toml import to_toml
+from rack.tools.lab.benches import relay
 
 LONGEST = LAST_SLOT - CLOCK_SLOT
 """Boards that a crate takes."""
 CLOCK_PRIORITY = 90
 PRIORITY = 80
 """SCHED_FIFO priorities, as in the bundled configs."""
-MODULE = "rack.tools.lab.benches.relay"
+LEVELS = "relay_levels"
+"""Module of the levels in another checkout."""
 
 
 class Chain(NamedTuple):
@@ -34,7 +36,7 @@ class Chain(NamedTuple):
         """The boards, in the order of the message."""
         return [f"board{number}" for number in range(1, self.boards + 1)]
 
-    def text(self, module: str = MODULE, path: Sequence[Path] = ()) -> str:
+    def text(self, module: str = relay.__name__, path: Sequence[Path] = ()) -> str:
         """Return the rack's config; its levels are in `module`, which is imported from `path`."""
         cores = sorted(os.sched_getaffinity(0))
         clock = {"period_ms": 1e3 / self.rate_hz, "mode": self.mode, "wake": self.wake}
@@ -46,6 +48,13 @@ class Chain(NamedTuple):
                 "board": dict(self._boards(module, cores)),
             }
         )
+
+    def write(self, folder: Path) -> Path:
+        """Write the config, and its levels for any checkout, into a folder; return its path."""
+        (folder / f"{LEVELS}.py").write_text(Path(relay.__file__).read_text())
+        path = folder / f"chain{self.boards}.toml"
+        path.write_text(self.text(LEVELS, [folder]))
+        return path
 
     def _boards(self, module: str, cores: Sequence[int]) -> Iterator[tuple[str, dict[str, Any]]]:
         before = None

@@ -12,8 +12,8 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -25,10 +25,11 @@ from rack.levels.timing.trace_times import Occupation, unit_times
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.chain import Chain
+from rack.tools.lab.benches.chain_figures import RATE_HZ
 from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
-from rack.tools.lab.benches.checkout import THIS, RackCommand, both_racks
-from rack.tools.lab.benches.empty import write_empty_rack
-from rack.tools.lab.benches.harness import Comparison, Sample, shown, turns
+from rack.tools.lab.benches.checkout import THIS, RackCommand, rack_commands
+from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.physics import SERVO, ReplayPace, replay
 from rack.tools.recording.recording import Recording
 
@@ -38,6 +39,8 @@ the first."""
 STEADY_TICKS = 40
 """Ticks at the start that are not judged: a new process touches its memory for the first time."""
 EMPTY = "empty"
+BOARDS = 6
+"""Boards of the empty rack: those of four levels, a world model and a loose planner."""
 LAUNCH_S = 5.0
 """About how long launching a rack, and reporting on it, take in addition to its time."""
 BOUND_S = 120.0
@@ -164,18 +167,16 @@ def measure(
     `share`: run even on cores that another rack's real-time boards hold. Raises `Failure` if a run
     fails.
     """
-    with ExitStack() as stack:
-        commands = stack.enter_context(both_racks(against))
-        runs = CycleRuns(seconds, Path(stack.enter_context(TemporaryDirectory())), share)
+    commands = rack_commands(against)
+    with TemporaryDirectory() as folder:
+        runs = CycleRuns(seconds, Path(folder), share)
         progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
-        for turn, (kind, command) in turns(
-            [(kind, command) for kind in KINDS for command in commands], rounds
-        ):
-            progress.begin(
-                f"{kind.config}, {kind.mode}, {command.name}: round {turn + 1} of {rounds}"
-            )
-            runs.run(kind, command)
-            progress.end(seconds + LAUNCH_S)
+        contestants = {
+            (kind.config, kind.mode, command.name): partial(runs.run, kind, command)
+            for kind in KINDS
+            for command in commands
+        }
+        interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
         return costs(runs.found, commands[-1].name if len(commands) > 1 else None)
 
 
@@ -198,20 +199,10 @@ class CycleRuns:
         self._runs += 1
         folder = self._folder / str(self._runs)
         folder.mkdir()
-        config: str | Path = (
-            kind.config if kind.config != EMPTY else write_empty_rack(folder, command.package)
-        )
-        options = [
-            "--set",
-            f"name=bench-{os.getpid()}",
-            "--out",
-            folder / "run",
-            "--seconds",
-            self._seconds,
-        ]
-        options += ["--lockstep"] * kind.lockstep + ["--share"] * (
-            self._share and bool(command.package)
-        )
+        config = kind.config if kind.config != EMPTY else Chain(BOARDS, RATE_HZ).write(folder)
+        options = ["--set", f"name=bench-{os.getpid()}", "--seconds", self._seconds]
+        options += ["--lockstep"] * kind.lockstep + ["--share"] * self._share
+        options += ["--out", folder / "run"]
         command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
         traces = traces_of(Recording(folder / "run"))
         for board, trace in traces.items():

@@ -19,7 +19,7 @@ from rack.boards import Rack
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.checkout import RackCommand, both_racks
+from rack.tools.lab.benches.checkout import RackCommand, rack_commands
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
 from rack.tools.lab.benches.kill import KILL_S, Killing
 
@@ -54,7 +54,8 @@ def measure(
     """
     rounds, kills = counts
     progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
-    with both_racks(against) as trees, tempfile.TemporaryDirectory() as folder:
+    trees = rack_commands(against)
+    with tempfile.TemporaryDirectory() as folder:
         progress.begin("launches and commands")
         samples = list(_samples(name, trees, ShortRuns(Path(folder), share), rounds))
         progress.end(rounds * ROUND_S)
@@ -85,21 +86,9 @@ class ShortRuns(NamedTuple):
 
     def run(self, rack: RackCommand, config: str, out: Path) -> Path:
         """Make a run; return its folder."""
-        # A checkout of before the namespace does not know the option, and never refuses.
-        options = ["--share"] if self.share and rack.package else []
-        name = ("--set", f"name=bench-run-{os.getpid()}")
-        rack.run(
-            "run",
-            config,
-            *name,
-            *options,
-            "--seconds",
-            RUN_S,
-            "--out",
-            out,
-            "--json",
-            bound_s=BOUND_S,
-        )
+        options = ["--share"] if self.share else []
+        options += ["--set", f"name=bench-run-{os.getpid()}", "--seconds", f"{RUN_S}", "--json"]
+        rack.run("run", config, *options, "--out", out, bound_s=BOUND_S)
         return out
 
 
@@ -117,7 +106,7 @@ def _samples(name: str, trees: list[RackCommand], runs: ShortRuns, rounds: int) 
     contestants: dict[Key, Callable[[], float]] = {
         (LAUNCH, tree.name): partial(runs.launch_s, tree, name) for tree in trees
     }
-    python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"), own.environment, "")
+    python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"))
     for case, arguments in commands.items():
         contestants[case, own.name] = partial(_command_s, own, arguments)
         contestants[case, INTERPRETER] = partial(_command_s, python, ())

@@ -25,8 +25,8 @@ from rack.tools.console.progress import Progress
 from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.bare import BareRun, run_bare
-from rack.tools.lab.benches.checkout import RackCommand, both_racks, this_rack
-from rack.tools.lab.benches.harness import Comparison, Sample, shown, turns
+from rack.tools.lab.benches.checkout import RackCommand, rack_commands
+from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
 from rack.tools.recording.recording import Recording
 
 RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
@@ -87,22 +87,18 @@ def measure(
 
     Raises `Failure` if a run fails, or if the levels without a rack did other work.
     """
-    with both_racks(against) as commands:
-        names = [command.name for command in commands]
-        progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
-        found: dict[tuple[str, str], list[float]] = {}
-        for rack, seconds in racks.items():
-            progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
-            with TemporaryDirectory() as folder:
-                ticks = _check(rack, seconds, Path(folder) / "run")
-            progress.end(EXPECTED_S, "equal")
-            ways = {command.name: partial(_run, command, rack, seconds) for command in commands}
-            ways[BARE] = partial(_run_bare, rack, ticks)
-            for turn, who in turns(list(ways), rounds):
-                progress.begin(f"{rack}, {who}: round {turn + 1} of {rounds}")
-                found.setdefault((rack, who), []).append(ways[who]())
-                progress.end(EXPECTED_S)
-    return speeds(found, names)
+    commands = rack_commands(against)
+    progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
+    found: dict[tuple[str, str], list[float]] = {}
+    for rack, seconds in racks.items():
+        progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+        with TemporaryDirectory() as folder:
+            ticks = _check(rack, seconds, Path(folder) / "run")
+        progress.end(EXPECTED_S, "equal")
+        runs = {(rack, each.name): partial(_run, each, rack, seconds) for each in commands}
+        runs[rack, BARE] = partial(_run_bare, rack, ticks)
+        found |= interleaved(runs, rounds, progress, EXPECTED_S)
+    return speeds(found, [command.name for command in commands])
 
 
 def speeds(found: Mapping[tuple[str, str], list[float]], names: list[str]) -> LockstepSpeeds:
@@ -158,7 +154,7 @@ def _bare(rack: str, ticks: int) -> BareRun:
 def _check(rack: str, seconds: float | None, folder: Path) -> int:
     """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
     for."""
-    this_rack().run(*_arguments(rack, seconds), "--out", str(folder), bound_s=BOUND_S)
+    rack_commands(None)[0].run(*_arguments(rack, seconds), "--out", str(folder), bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])
     differing = list(differences(recording, _bare(rack, ticks)))

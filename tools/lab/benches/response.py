@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rack.boards import Rack
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.recording.recorder.recorder import LOCKSTEP_S, REALTIME_S, Recorder
+from rack.tools.lab.benches.observed import record
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, plot, response_of
 
@@ -233,16 +232,8 @@ def run_commands(
 ) -> Recording:
     """Run a rack with these commands for simulated `seconds`, or until its task ends; return its
     recording."""
-    folder.mkdir(parents=True)
     wanted = config.model_copy(update={"command": (*config.command, *commands)})
-    (folder / "config.toml").write_text(wanted.text())
-    period_s = LOCKSTEP_S if config.clock.mode == "lockstep" else REALTIME_S
-    with Rack(wanted) as rack, Recorder(rack.segment, folder) as recorder:
-        rack.start(seconds)
-        while rack.watch(period_s):
-            recorder.drain()
-        recorder.drain()
-    return Recording(folder)
+    return record(wanted, seconds, folder).recording
 
 
 def holds_of_moving_arm(recording: Recording, response: OperatorResponse) -> list[AnsweredCommand]:

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from rack.backplane.trace import RECORD
-from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.cycle import PACED, PARTS, ROW, Found, Trace, costs, measure, parts_of
-from rack.tools.lab.benches.empty import BOARDS, write_empty_rack
 from rack.tools.lab.benches.physics import Replay, ReplayPace, replay
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
@@ -110,15 +108,6 @@ def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> Non
     assert share.count > 100
     assert [path.name for path in found.plot(tmp_path)] == ["cycle.png", "cycle.svg"]
     assert any("servo and its physics" in line for line in found.lines(100))
-
-
-def test_an_empty_rack_is_a_ring_of_boards_on_two_cores(tmp_path: Path) -> None:
-    config = load(write_empty_rack(tmp_path, "rack."))
-    assert len(config.board) == BOARDS
-    assert {board.reads["read"] for board in config.board.values()} == {
-        (f"{name}.written",) for name in config.board
-    }
-    assert {board.core for board in config.board.values()} == {0, 1}
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.checkout import this_rack
+from rack.tools.lab.benches.checkout import rack_commands
 from rack.tools.lab.benches.kill import DETECTED, SAFE, Killing
 from rack.tools.lab.benches.launch import BOUND_S, ShortRuns, fastest, first_cycle_ns
 
@@ -42,7 +42,7 @@ def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(
     small: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "runs").mkdir()
-    assert 0.0 < ShortRuns(tmp_path / "runs").launch_s(this_rack(), str(small)) < BOUND_S
+    assert 0.0 < ShortRuns(tmp_path / "runs").launch_s(rack_commands(None)[0], str(small)) < BOUND_S
     assert not list((tmp_path / "runs").iterdir())
 
 
