@@ -31,7 +31,7 @@ from rack.tools.lab.benches.chart import BASELINE, PALE, PALETTE, Diagram, Serie
 if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
 
-EXTRA = "pip install .[bench]"
+EXTRA = "pip install 'nasrem-rack[lab]'"
 """Brings the peers that are Python packages."""
 KEY = "dot: median (ratio to the black one of the case); line: best to p99"
 _Name = TypeVar("_Name")
