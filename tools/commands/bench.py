@@ -89,8 +89,8 @@ def lockstep(
     """Measure how fast nasrem, k1607 and fig4 run in lockstep.
 
     Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one
-    process without a rack. Its messages must be those of the rack, bit for bit. TREE runs in its own
-    environment, TREE/.venv.
+    process without a rack. Its messages must be those of the rack, bit for bit. TREE runs in its
+    own environment, TREE/.venv.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure
 
@@ -99,18 +99,15 @@ def lockstep(
 
 
 @bench.command()
-def recording(config: Config = "nasrem", as_json: Json = False) -> None:
-    """Measure the cost of recording: misses and lateness.
+def recording(config: Config = "nasrem", plot: Plot = None, as_json: Json = False) -> None:
+    """Measure the cost of recording: lateness, misses, processor time.
 
-    One rack runs without a recorder, with one, and with a live viewer, by turns.
+    One rack runs without a recorder, with one, and with a live viewer, by turns; ratios are to
+    without.
     """
-    from rack.tools.console.tables import terminal_width
-    from rack.tools.lab.benches.recording import lines_of, measure
+    from rack.tools.lab.benches.recording import measure
 
-    costs = measure(config)
-    print_found(
-        {"recording": [asdict(cost) for cost in costs]}, lines_of(costs, terminal_width()), as_json
-    )
+    show(lambda progress: measure(config, progress), plot, as_json)
 
 
 @bench.command()

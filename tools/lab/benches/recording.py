@@ -1,15 +1,15 @@
-"""Measures what recording costs the boards: misses and lateness without a recorder, with it, and
-with a live viewer."""
+"""What recording costs the boards: one rack without a recorder, with it, and with a live viewer, by
+turns."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import NamedTuple
 
 import numpy as np
@@ -19,86 +19,89 @@ from rack.backplane.ring import Ring
 from rack.backplane.trace import trace_ring
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.levels.timing.trace_times import Distribution, counts, distribution, lateness_ns
+from rack.levels.timing.trace_times import counts, lateness_ns
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import decimal, figure, table
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
 PHASES = ("without", "recording", "live viewer")
-PHASE_S = 6.0
+READINGS = 6
 SETTLE_S = 1.0
 """Time for a recorder to attach and a viewer to draw: the cost of starting them is not measured."""
 ROUNDS = 3
 
 
-@dataclass(frozen=True)
-class RecordingCost:
-    """All rounds of one phase: cycles, missed and skipped ones, of all tasks; lateness of the
-    fastest task in ms.
+class PhaseCost(NamedTuple):
+    """What one turn of a phase has shown: lateness of the fastest task, and shares in %."""
 
-    `recorder_percent` is the recorder's share of one core; 0 without one.
-    """
-
-    phase: str
-    cycles: int
-    missed: int
-    skipped: int
-    lateness_ms: Distribution | None
-    recorder_percent: float
+    lateness_ms: list[float]
+    missed: float
+    processor: float
 
 
-class _Sample(NamedTuple):
-    """Trace records of every task, read again and again, and the recorder's share of a core."""
-
-    readings: list[list[np.ndarray]]
-    recorder_percent: float
-
-
-def measure(name: str) -> list[RecordingCost]:
-    """Return the cost on the rack of a config; phases are interleaved, as the machine's speed
-    drifts.
+def measure(name: str, progress: Progress) -> Comparison:
+    """Return the cost on the rack of a config.
 
     Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
     config = load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"])
-    endless = {
+    boards = {
         name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
     }
-    config = config.model_copy(update={"board": endless})
-    found: dict[str, list[_Sample]] = {phase: [] for phase in PHASES}
-    with tempfile.TemporaryDirectory() as folder, Rack(config) as rack:
+    each_s = READINGS + SETTLE_S
+    progress.total(ROUNDS * len(PHASES) * each_s)
+    endless = config.model_copy(update={"board": boards})
+    with TemporaryDirectory(prefix="rack-bench-") as folder, Rack(endless) as rack:
         rack.start()
         # The fastest task first: its lateness is shown.
         tasks = sorted(rack.segment.layout.tasks, key=lambda task: task.every)
         rings = [trace_ring(rack.segment, task.name) for task in tasks]
-        _watch(rack, SETTLE_S)
-        for turn in range(ROUNDS):
-            for phase in PHASES:
-                with _recorder(rack, phase, Path(folder) / f"{phase}-{turn}") as pid:
-                    _watch(rack, SETTLE_S)
-                    _drained(rings)
-                    used_ns = _processor_ns(pid)
-                    began_ns = time.monotonic_ns()
-                    readings = [_reading(rack, rings) for _ in range(round(PHASE_S))]
-                    share = (
-                        100.0 * (_processor_ns(pid) - used_ns) / (time.monotonic_ns() - began_ns)
-                    )
-                    found[phase].append(_Sample(readings, share))
+        phases = {phase: partial(_measure, rack, rings, phase, folder) for phase in PHASES}
+        found = interleaved(phases, ROUNDS, progress, each_s)
         rack.stop("measured")
         while rack.watch(0.5):
             continue
-    return [_cost(phase, samples) for phase, samples in found.items()]
+    return costs(tasks[0].name, found)
 
 
-def _reading(rack: Rack, rings: Sequence[Ring]) -> list[np.ndarray]:
-    # The rings hold two seconds.
-    _watch(rack, 1.0)
-    return _drained(rings)
+def costs(task: str, found: dict[str, list[PhaseCost]]) -> Comparison:
+    """Return the comparison of the turns of each phase with those without a recorder."""
+    samples = [
+        Sample(case, phase, tuple(values), unit)
+        for case, unit, values_of in (
+            (f"lateness of {task}", "ms", lambda cost: cost.lateness_ms),
+            ("cycles missed or skipped, of all tasks", "%", lambda cost: [cost.missed]),
+            ("the recorder's processor time, of a core", "%", lambda cost: [cost.processor]),
+        )
+        for phase, turns in found.items()
+        if (values := [value for cost in turns for value in values_of(cost)])
+    ]
+    baselines = {sample.case: PHASES[0] for sample in samples}
+    return Comparison("recording", "What recording costs", tuple(samples), baselines)
 
 
-def _drained(rings: Sequence[Ring]) -> list[np.ndarray]:
-    """Return the trace records since the last call, task by task."""
+def _measure(rack: Rack, rings: Sequence[Ring], phase: str, scratch: str) -> PhaseCost:
+    with _recorder(rack, phase, Path(mkdtemp(dir=scratch))) as pid:
+        _read(rack, rings)
+        used_ns = _processor_ns(pid)
+        began_ns = time.monotonic_ns()
+        readings = [_read(rack, rings) for _ in range(READINGS)]
+        used_ns = _processor_ns(pid) - used_ns
+        lasted_ns = time.monotonic_ns() - began_ns
+    cycles = np.concatenate([rows for reading in readings for rows in reading])
+    late_ns = lateness_ns(np.concatenate([reading[0] for reading in readings]))
+    missed = 100.0 * sum(counts(cycles)) / max(1, len(cycles))
+    return PhaseCost((late_ns * 1e-6).tolist(), missed, 100.0 * used_ns / lasted_ns)
+
+
+def _read(rack: Rack, rings: Sequence[Ring]) -> list[np.ndarray]:
+    """Return the trace records of the next second, task by task: the rings hold two."""
+    until = time.monotonic() + SETTLE_S
+    while (left := until - time.monotonic()) > 0:
+        if not rack.watch(left):
+            raise Failure(f"the rack ended during the measurement: {rack.outcome}")
     return [ring.drain().rows for ring in rings]
 
 
@@ -109,7 +112,6 @@ def _recorder(rack: Rack, phase: str, folder: Path) -> Iterator[int | None]:
     if phase == PHASES[0]:
         yield None
         return
-    folder.mkdir()
     recorder = RecorderProcess()
     port = free_port() if phase == PHASES[2] else None
     window = None
@@ -124,55 +126,5 @@ def _recorder(rack: Rack, phase: str, folder: Path) -> Iterator[int | None]:
         recorder.finish()
 
 
-def _watch(rack: Rack, seconds: float) -> None:
-    until = time.monotonic() + seconds
-    while (left := until - time.monotonic()) > 0:
-        if not rack.watch(left):
-            raise Failure(f"the rack ended during the measurement: {rack.outcome}")
-
-
 def _processor_ns(pid: int | None) -> int:
     return 0 if pid is None else processor_ns(pid)
-
-
-def _cost(phase: str, samples: Sequence[_Sample]) -> RecordingCost:
-    readings = [reading for sample in samples for reading in sample.readings]
-    cycles = np.concatenate([rows for reading in readings for rows in reading])
-    missed, skipped = counts(cycles)
-    return RecordingCost(
-        phase=phase,
-        cycles=len(cycles),
-        missed=missed,
-        skipped=skipped,
-        lateness_ms=distribution(
-            lateness_ns(np.concatenate([reading[0] for reading in readings])) * 1e-6
-        ),
-        recorder_percent=round(float(np.mean([sample.recorder_percent for sample in samples])), 2),
-    )
-
-
-def lines_of(costs: Sequence[RecordingCost], width: int | None = None) -> Iterator[str]:
-    """Yield a table for people, fitted to `width`."""
-    head = [
-        "phase",
-        "cycles",
-        "missed",
-        "skipped",
-        "late p50, ms",
-        "p99",
-        "p99.9",
-        "max",
-        "recorder, % of a core",
-    ]
-    rows = [
-        [
-            cost.phase,
-            str(cost.cycles),
-            str(cost.missed),
-            str(cost.skipped),
-            *(figure(cost.lateness_ms, name) for name in ("p50", "p99", "p99_9", "max")),
-            decimal(cost.recorder_percent, 1),
-        ]
-        for cost in costs
-    ]
-    yield from table(head, rows, width, ("cycles", "p99.9", "late p50, ms"))
