@@ -44,8 +44,7 @@ def mailbox(
 
     Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes
     and queues of multiprocessing, and zenoh. The ratio is to the best of these peers. A raw copy is
-    the least that can be done, and zenoh within one session never leaves its process: these two are
-    no peers.
+    the least that can be done, and no peer.
     """
     from rack.tools.lab.benches.mailbox import CASES, measure
 

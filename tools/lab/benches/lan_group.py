@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from contextlib import suppress
+from multiprocessing import Pipe
 from pathlib import Path
-from subprocess import PIPE
+from subprocess import TimeoutExpired
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import Any, Self
+from typing import Self
 
-from rack.backplane.process import readable
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.lan_ends import COORDINATOR, LanPlace, rack_name
-from rack.tools.lab.benches.lan_machine import ANSWER_S, FIND_S, TLS, LanFound, LanTask, LanWindow
+from rack.tools.lab.benches.lan_machine import (
+    ANSWER_S,
+    FIND_S,
+    TLS,
+    LanFound,
+    LanNotice,
+    LanTask,
+    LanWindow,
+)
 from rack.tools.lab.benches.network import Lab
 
 HEAD_START_NS = 300_000_000
 """Time from the order to measure to the first cycle."""
+RUN = "from rack.tools.lab.benches.lan_machine import main; main()"
+"""Not as a program: then its records would have other classes, those of `__main__`."""
 REACT_S = 15.0
 """Longest wait for a death or a return to be seen."""
 
@@ -79,7 +87,7 @@ class Group:
         """Measure on all machines at a rate; return what each has found."""
         self.begin(rate_hz, cycles)
         bound_s = HEAD_START_NS * 1e-9 + (cycles + 1) / rate_hz + ANSWER_S + FIND_S
-        found = [LanFound(**member.found(bound_s)) for member in self._members]
+        found = [member.found(bound_s) for member in self._members]
         self._note_deaths()
         return found
 
@@ -87,7 +95,7 @@ class Group:
         """Let all machines exchange at a rate, without waiting for their end."""
         window = LanWindow(time.monotonic_ns() + HEAD_START_NS, round(1e9 / rate_hz), cycles)
         for member in self._members:
-            member.order(window)
+            member.pipe.send(window)
 
     def idle(self, seconds: float) -> None:
         """Let so much time pass, in which nobody is to be lost."""
@@ -95,7 +103,7 @@ class Group:
         self._note_deaths()
 
     def _note_deaths(self) -> None:
-        self.false_deaths += sum(not notice["is_there"] for notice in self._coordinator.notices)
+        self.false_deaths += sum(not notice.is_there for notice in self._coordinator.notices)
         self._coordinator.notices.clear()
 
     def pull_cable(self, machine: int) -> tuple[float, float]:
@@ -112,7 +120,7 @@ class Group:
         start_ns = time.monotonic_ns()
         act()
         notice = self._coordinator.await_notice(
-            lambda notice: notice["machine"] == machine and notice["is_there"] == is_there, REACT_S
+            lambda notice: (notice.machine, notice.is_there) == (machine, is_there), REACT_S
         )
         if notice is None:
             what = "back" if is_there else "lost"
@@ -120,7 +128,7 @@ class Group:
                 f"{self.who}: machine {machine} of {self.racks} is not seen {what} within"
                 f" {REACT_S:g} s"
             )
-        return float(notice["ns"] - start_ns) * 1e-6
+        return (notice.seen_ns - start_ns) * 1e-6
 
 
 class _Member:
@@ -129,66 +137,50 @@ class _Member:
     def __init__(self, lab: Lab, task: LanTask) -> None:
         self._name = f"{task.who}, machine {task.place.machine}"
         self._errors = TemporaryFile()  # noqa: SIM115  # closed when the process ends
-        argv = [
-            sys.executable,
-            "-m",
-            "rack.tools.lab.benches.lan_machine",
-            json.dumps(asdict(task)),
-        ]
-        self.process = lab.popen(
-            task.place.machine, argv, stdin=PIPE, stdout=PIPE, stderr=self._errors
-        )
-        self._unread = b""
-        self.notices: list[dict[str, Any]] = []
+        self.pipe, theirs = Pipe()
+        self.notices: list[LanNotice] = []
+        with theirs:
+            argv = [sys.executable, "-c", RUN, str(theirs.fileno())]
+            self.process = lab.popen(
+                task.place.machine, argv, pass_fds=[theirs.fileno()], stderr=self._errors
+            )
+        self.pipe.send(task)
 
-    def order(self, window: LanWindow) -> None:
-        """Let it measure a window."""
-        assert self.process.stdin is not None
-        self.process.stdin.write((json.dumps(asdict(window)) + "\n").encode())
-        self.process.stdin.flush()
-
-    def found(self, bound_s: float) -> Any:
+    def found(self, bound_s: float) -> LanFound:
         """Return what it has found. Notices that come before that are kept."""
-        for document in self._documents(bound_s):
-            if "found" in document:
-                return document["found"]
-            self.notices.append(document)
+        for answer in self._answers(bound_s):
+            if isinstance(answer, LanFound):
+                return answer
+            self.notices.append(answer)
         raise Failure(f"{self._name}: no answer within {bound_s:g} s")
 
-    def await_notice(
-        self, is_it: Callable[[dict[str, Any]], bool], bound_s: float
-    ) -> dict[str, Any] | None:
+    def await_notice(self, is_it: Callable[[LanNotice], bool], bound_s: float) -> LanNotice | None:
         """Return the first notice that fits; None if there is none in time. Others are kept."""
-        for document in self._documents(bound_s):
-            if is_it(document):
-                return document
-            self.notices.append(document)
+        for answer in self._answers(bound_s):
+            if isinstance(answer, LanNotice):
+                if is_it(answer):
+                    return answer
+                self.notices.append(answer)
         return None
 
-    def _documents(self, bound_s: float) -> Iterator[dict[str, Any]]:
-        assert self.process.stdout is not None
-        out = self.process.stdout.fileno()
+    def _answers(self, bound_s: float) -> Iterator[LanFound | LanNotice]:
         deadline = time.monotonic() + bound_s
-        while True:
-            line, newline, rest = self._unread.partition(b"\n")
-            if newline:
-                self._unread = rest
-                yield json.loads(line)
-            elif not readable(out, deadline - time.monotonic()):
-                return
-            elif more := os.read(out, 65536):
-                self._unread += more
-            else:
-                self._errors.seek(0)
-                said = self._errors.read().decode(errors="replace").strip().splitlines() or [
-                    "it says nothing"
-                ]
-                raise Failure(f"{self._name}: ended: {said[-1]}")
+        try:
+            while self.pipe.poll(max(0.0, deadline - time.monotonic())):
+                yield self.pipe.recv()
+        except (EOFError, OSError):
+            # The reason comes after the end of the pipe.
+            with suppress(TimeoutExpired):
+                self.process.wait(ANSWER_S)
+            self._errors.seek(0)
+            said = self._errors.read().decode(errors="replace").strip().splitlines()
+            raise Failure(
+                f"{self._name}: ended: {said[-1] if said else 'it says nothing'}"
+            ) from None
 
     def end(self) -> None:
         """Kill it."""
         self.process.kill()
         self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout, self._errors):
-            assert pipe is not None
-            pipe.close()
+        self.pipe.close()
+        self._errors.close()

@@ -1,23 +1,24 @@
 """What runs on each machine of `rack bench lan`: one end, which exchanges messages at a rate and
 measures.
 
-It is started with one line of JSON, a `LanTask`, says when it sees those that it exchanges messages
-with, and then takes a `LanWindow` a line, until it is killed. In a window each machine has a grid
-of its own phase, as racks have.
+It is started with a pipe, through which it gets a `LanTask`. It answers with a `LanFound` when it
+sees those that it exchanges messages with, and then to every `LanWindow`, until it is killed; the
+coordinator also sends a `LanNotice` of each change. In a window each machine has a grid of its own
+phase, as racks have.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib import import_module
+from multiprocessing.connection import Connection
 from struct import Struct
-from typing import Any
+from typing import NamedTuple
 
 from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.tools.lab.benches.lan_ends import COORDINATOR, ORDER_BYTES, STATUS_BYTES, End, LanPlace
@@ -48,13 +49,6 @@ class LanTask:
     echoes: bool
     priority: int
 
-    @classmethod
-    def read(cls, text: str) -> LanTask:
-        """Return the task that `json.dumps(asdict(...))` wrote."""
-        table = json.loads(text)
-        place = table["place"] | {"addresses": tuple(table["place"]["addresses"])}
-        return cls(**table | {"place": LanPlace(**place)})
-
 
 @dataclass(frozen=True)
 class LanWindow:
@@ -75,10 +69,20 @@ class LanFound:
     processor_us: float = 0.0
 
 
-class Machine:
-    """The process of one machine."""
+class LanNotice(NamedTuple):
+    """A machine has come, or gone: when the coordinator saw it, CLOCK_MONOTONIC."""
 
-    def __init__(self, task: LanTask) -> None:
+    machine: int
+    is_there: bool
+    seen_ns: int
+
+
+class Machine:
+    """The process of one machine; `pipe` leads to who started it."""
+
+    def __init__(self, task: LanTask, pipe: Connection) -> None:
+        self._pipe = pipe
+        self._sending = threading.Lock()  # the end's threads send, too
         self._place = task.place
         self._echoes = task.echoes
         self._seen: set[int] = set()
@@ -110,9 +114,14 @@ class Machine:
         if is_there:
             self._seen.add(machine)
         if self._place.machine == COORDINATOR:
-            _say({"machine": machine, "is_there": is_there, "ns": time.monotonic_ns()})
+            self.answer(LanNotice(machine, is_there, time.monotonic_ns()))
         if len(self._seen) == len(self._place.others):
             self._all_there.set()
+
+    def answer(self, found: LanFound | LanNotice) -> None:
+        """Send what was found."""
+        with self._sending:
+            self._pipe.send(found)
 
     def measure(self, window: LanWindow) -> LanFound:
         """Run a window."""
@@ -179,26 +188,18 @@ def _grid(window: LanWindow, shift_ns: int) -> Iterator[int]:
         cycle += 1 + max(0, time.monotonic_ns() - due) // window.period_ns
 
 
-def _say(document: dict[str, Any]) -> None:
-    # One write a line: the end's threads speak, too.
-    os.write(sys.stdout.fileno(), (json.dumps(document) + "\n").encode())
-
-
 def main() -> None:
-    """Run the task of the command line."""
+    """Run the task that comes through the inherited pipe."""
     die_with_parent(os.getppid())
-    task = LanTask.read(sys.argv[1])
-    # Before the end starts its threads, which have core and priority of this one: as on a rack's
-    # adapter board.
-    cores = sorted(os.sched_getaffinity(0))
-    pin(cores[task.place.machine % len(cores)])
-    set_priority(task.priority)
-    machine = Machine(task)
-    machine.find()
-    _say({"found": None})
-    for line in sys.stdin:
-        _say({"found": asdict(machine.measure(LanWindow(**json.loads(line))))})
-
-
-if __name__ == "__main__":
-    main()
+    with Connection(int(sys.argv[1])) as pipe:
+        task: LanTask = pipe.recv()
+        # Before the end starts its threads, which have core and priority of this one: as on a
+        # rack's adapter board.
+        cores = sorted(os.sched_getaffinity(0))
+        pin(cores[task.place.machine % len(cores)])
+        set_priority(task.priority)
+        machine = Machine(task, pipe)
+        machine.find()
+        machine.answer(LanFound())
+        while True:
+            machine.answer(machine.measure(pipe.recv()))

@@ -174,14 +174,6 @@ def multiprocessing_queue(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
 
 @contextmanager
-def zenoh_within_a_session(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Put bytes on a key of a zenoh session with subscribers in it: they never leave the
-    session."""
-    with _zenoh(listen="", connect="") as session:
-        yield _zenoh_transport(_publisher(session), dtype, _subscribers([session] * readers))
-
-
-@contextmanager
 def zenoh_sessions(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Put bytes on a key of a zenoh session; every subscriber has a session of its own, as in
     processes of their own.
@@ -260,11 +252,8 @@ def _zenoh_transport(publisher: Any, dtype: np.dtype, subscribers: Sequence[Any]
     return Transport(message, lambda tick: publisher.put(bytes(message.raw)), takers)
 
 
-REFERENCES = (
-    Peer("raw copy", "mmap", raw_copy),
-    Peer("zenoh, one session", "zenoh", zenoh_within_a_session),
-)
-"""No peers: the first is the least that can be done, the second does not leave its process."""
+REFERENCES = (Peer("raw copy", "mmap", raw_copy),)
+"""No peer: the least that can be done."""
 PEERS = (
     Peer("iceoryx2 blackboard", "iceoryx2", iceoryx2_blackboard),
     Peer("iceoryx2 publish-subscribe", "iceoryx2", iceoryx2_publish_subscribe),

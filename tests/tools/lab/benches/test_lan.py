@@ -3,8 +3,6 @@ figures."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,11 +17,10 @@ from rack.tools.lab.benches.lan_ends import (
     LEASE_MS,
     ORDER_BYTES,
     STATUS_BYTES,
-    LanPlace,
 )
 from rack.tools.lab.benches.lan_figures import LanFigures, Point, Steadiness
 from rack.tools.lab.benches.lan_group import Group
-from rack.tools.lab.benches.lan_machine import ENDS, TLS, LanTask
+from rack.tools.lab.benches.lan_machine import ENDS, TLS
 from rack.tools.lab.benches.network import NAMESPACES, Lab
 from tests.machine import needs_lab
 from tests.tools.command_line import rack
@@ -75,13 +72,6 @@ def test_a_dds_answers_orders_and_what_it_does_not_answer_is_missing() -> None:
     with Lab(2) as lab, Group(lab, "cyclonedds", echoes=True, priority=0) as group:
         found = group.run(RATE_HZ, CYCLES)[COORDINATOR]
     assert 0 < len(found.us) == CYCLES - found.missing
-
-
-def test_a_task_passes_the_command_line_whole() -> None:
-    task = LanTask("UDP", LanPlace(1, ("10.0.0.1", "10.0.0.2"), ""), echoes=True, priority=60)
-    assert json.loads(json.dumps(asdict(LanTask.read(json.dumps(asdict(task)))))) == json.loads(
-        json.dumps(asdict(task))
-    )
 
 
 @pytest.mark.slow
