@@ -4,16 +4,15 @@ their costs."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rack.tools.console.tables import decimal, table
 from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
-from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond
-from rack.tools.lab.benches.harness import Absent
+from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond, misses_count
+from rack.tools.lab.benches.harness import Absent, BenchResult
 
 RATE_HZ = 400
 
@@ -48,6 +47,8 @@ class ChainFigures(MissesBeyond):
     """All runs of one chain. Costs are us a tick, of all boards; responses are counts of messages
     by cycles."""
 
+    DERIVED = ("beyond", "held", "exact")
+
     boards: int
     cycles: int
     processor_us: float
@@ -69,55 +70,47 @@ class ChainFigures(MissesBeyond):
 
 
 @dataclass(frozen=True)
-class Boards:
+class Boards(BenchResult):
     """The figures of every chain, the shortest first; `trees` are those measured in lockstep, this
     one first."""
 
-    figures: tuple[ChainFigures, ...]
+    name = "boards"
+    DERIVED = ("fit", "lockstep_fit")
+
+    chains: tuple[ChainFigures, ...]
     trees: tuple[str, ...]
     cores: int
-    absent: Absent | None
+    absent: tuple[Absent, ...]
+    rate_hz: int = RATE_HZ
+    permitted_beyond: float = BEYOND
 
     @property
     def counts(self) -> list[int]:
         """Boards of each chain."""
-        return [one.boards for one in self.figures]
+        return [one.boards for one in self.chains]
 
     @property
     def exact(self) -> bool:
         """Whether every message of every chain took as many cycles as it should."""
-        return all(one.exact for one in self.figures)
+        return all(one.exact for one in self.chains)
 
     @property
     def fit(self) -> Fit | None:
         """Processor time in real time, by number of boards."""
-        return Fit.of(self.counts, [one.processor_us for one in self.figures])
+        return Fit.of(self.counts, [one.processor_us for one in self.chains])
 
-    def lockstep_fit(self, tree: str) -> Fit | None:
-        """Return the time of a tick in lockstep, by number of boards."""
-        return Fit.of(self.counts, [one.lockstep_us[tree] for one in self.figures])
+    @property
+    def lockstep_fit(self) -> dict[str, Fit | None]:
+        """Time of a tick in lockstep, by number of boards, of each tree."""
+        return {
+            tree: Fit.of(self.counts, [one.lockstep_us[tree] for one in self.chains])
+            for tree in self.trees
+        }
 
     @property
     def title(self) -> str:
         """What was measured, in a line."""
         return f"empty boards in a chain at {RATE_HZ} Hz on {self.cores} cores"
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        own = {"bench": "boards", "rate_hz": RATE_HZ, "cores": self.cores, "trees": self.trees}
-        extra = ("beyond", "held", "exact")
-        fits = {tree: self.lockstep_fit(tree) for tree in self.trees}
-        return {
-            **own,
-            "chains": [
-                {**asdict(one), **{name: getattr(one, name) for name in extra}}
-                for one in self.figures
-            ],
-            "fit": asdict(self.fit) if self.fit else None,
-            "lockstep_fit": {tree: asdict(fit) if fit else None for tree, fit in fits.items()},
-            "permitted_beyond": BEYOND,
-            "absent": [] if self.absent is None else [asdict(self.absent)],
-        }
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as a table for people, fitted to `width`, and the fits."""
@@ -135,14 +128,13 @@ class Boards:
         head += [f"lockstep, {tree}" for tree in self.trees]
         head += ["ratio"] if len(self.trees) > 1 else []
         yield from table(
-            head, [self._row(one) for one in self.figures], width, ("a board", "beyond")
+            head, [self._row(one) for one in self.chains], width, ("a board", "beyond")
         )
-        if self.absent is not None:
-            yield f"{self.absent.line}; every miss counts against the rack"
+        yield from misses_count(self.absent)
         if fit := self.fit:
             yield f"processor time: {fit.words}"
-        for tree in self.trees:
-            if fit := self.lockstep_fit(tree):
+        for tree, fit in self.lockstep_fit.items():
+            if fit:
                 yield f"lockstep, {tree}: {fit.words}"
 
     def _row(self, one: ChainFigures) -> list[str]:
@@ -164,14 +156,14 @@ class Boards:
     def plot(self, folder: Path) -> list[Path]:
         """Write costs and misses by number of boards into `folder`; return the paths."""
         counts = self.counts
-        costs = [*_fitted("processor", counts, [one.processor_us for one in self.figures])]
+        costs = [*_fitted("processor", counts, [one.processor_us for one in self.chains])]
         for tree in self.trees:
-            found = [one.lockstep_us[tree] for one in self.figures]
+            found = [one.lockstep_us[tree] for one in self.chains]
             costs += _fitted(f"lockstep, {tree}", counts, found)
-        missed = [100 * one.missed for one in self.figures]
+        missed = [100 * one.missed for one in self.chains]
         shares = [Series("boards: missed", counts, missed, "o-")]
-        if self.absent is None:
-            late = [100 * (one.late or 0.0) for one in self.figures]
+        if not self.absent:
+            late = [100 * (one.late or 0.0) for one in self.chains]
             shares.append(Series("cyclictest: late by a cycle", counts, late, "s-", BASELINE))
         panels = (
             Diagram("", "boards", costs, "us a tick", is_linear=True),

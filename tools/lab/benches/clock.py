@@ -130,7 +130,7 @@ def _attempt(
 def _contestants(share: bool) -> tuple[Contestants, list[Absent]]:
     """Return who can be measured on this machine, and who not."""
     found: Contestants = {f"board, {wake}": partial(board, wake, share) for wake in get_args(Wake)}
-    absent = []
+    absent: list[Absent] = []
     if len(os.sched_getaffinity(0)) < 2:
         del found["board, poll"]
         absent.append(
@@ -144,10 +144,9 @@ def _contestants(share: bool) -> tuple[Contestants, list[Absent]]:
         (CYCLICTEST, absent_cyclictest(), cyclictest),
         (LINUXCNC, absent_linuxcnc(), linuxcnc),
     ):
-        if missing is None:
+        absent += missing
+        if not missing:
             found[who] = peer
-        else:
-            absent.append(missing)
     found |= {who + AWAKE: found[who] for who in BOTH_WAYS if who in found}
     return found, absent
 

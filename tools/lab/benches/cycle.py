@@ -29,7 +29,7 @@ from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.chain_figures import RATE_HZ
 from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
 from rack.tools.lab.benches.checkout import THIS, RackCommand, rack_commands
-from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
+from rack.tools.lab.benches.harness import BenchResult, Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.physics import SERVO, ReplayPace, replay
 from rack.tools.recording.recording import Recording
 
@@ -88,7 +88,7 @@ class BoardParts:
 
 
 @dataclass(frozen=True)
-class CycleCosts:
+class CycleCosts(BenchResult):
     """What the runs cost: a comparison of whole cycles, and the parts of each."""
 
     comparison: Comparison

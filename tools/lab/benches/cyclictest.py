@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import ClassVar
 
 import numpy as np
 
@@ -47,11 +48,17 @@ class WakeGrid:
         return self.wakes * self.period_ns * 1e-9 + PATIENCE_S
 
 
-def absent_cyclictest() -> Absent | None:
-    """Return what `cyclictest` lacks; None if it can run."""
-    if absent := absent_program(CYCLICTEST, CYCLICTEST, "rt-tests"):
-        return absent
-    return None if permits_fifo() else Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)")
+def absent_cyclictest() -> tuple[Absent, ...]:
+    """Return what `cyclictest` lacks; nothing if it can run."""
+    refused = Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)")
+    absent = absent_program(CYCLICTEST, CYCLICTEST, "rt-tests")
+    return absent or (() if permits_fifo() else (refused,))
+
+
+def misses_count(absent: Sequence[Absent]) -> Iterator[str]:
+    """Yield what the absence of `cyclictest` means."""
+    for each in absent:
+        yield f"{each.line}; every miss counts against the rack"
 
 
 def permits_fifo() -> bool:
@@ -119,6 +126,8 @@ BEYOND = 0.001
 class MissesBeyond:
     """Base of figures whose misses are judged by those of `cyclictest` in the same minutes; all are
     shares."""
+
+    DERIVED: ClassVar[tuple[str, ...]] = ("beyond", "held")
 
     missed: float
     late: float | None  # of cyclictest's wakes, by a cycle or more; None: it is absent

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rack.tools.console.tables import decimal, table
 from rack.tools.lab.benches.chart import Diagram, Series, draw
+from rack.tools.lab.benches.harness import BenchResult
 
 NARROW = ("overtaken", "sent", "age p50", "jitter p50", "protocol")
 """Columns of the links that a narrow terminal leaves out, in this order."""
@@ -73,23 +73,18 @@ class HandFigures:
 
 
 @dataclass(frozen=True)
-class HandBench:
+class HandBench(BenchResult):
     """Every rack in both modes."""
 
-    figures: tuple[HandFigures, ...]
+    name = "hand"
+    DERIVED = ("worked",)
+
+    racks: tuple[HandFigures, ...]
 
     @property
     def worked(self) -> bool:
         """Whether all runs did their task."""
-        return not any(one.failure for one in self.figures)
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return {
-            "bench": "hand",
-            "racks": [asdict(one) for one in self.figures],
-            "worked": self.worked,
-        }
+        return not any(one.failure for one in self.racks)
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield both tables for people, fitted to `width`."""
@@ -109,7 +104,7 @@ class HandBench:
             "task",
         ]
         yield from table(
-            head, [_rack_row(one) for one in self.figures], width, ("the rest", "handlers")
+            head, [_rack_row(one) for one in self.racks], width, ("the rest", "handlers")
         )
         yield ""
         yield "messages on every link, ms: jitter of arrival, age when they are read"
@@ -127,14 +122,14 @@ class HandBench:
         yield from table(
             [*head, "sent", "lost", "overtaken"], list(self._link_rows()), width, NARROW
         )
-        for one in self.figures:
+        for one in self.racks:
             if one.failure:
                 yield f"{one.name}: {one.failure}"
 
     def _link_rows(self) -> Iterator[list[str]]:
         """Yield a row per link; the racks in both modes under each other, message by message."""
         for message in self.messages:
-            for one in self.figures:
+            for one in self.racks:
                 for link in (link for link in one.links if link.message == message):
                     yield [
                         message,
@@ -152,7 +147,7 @@ class HandBench:
     @property
     def messages(self) -> list[str]:
         """The types of messages, in the order of the first rack's links."""
-        return list(dict.fromkeys(link.message for one in self.figures for link in one.links))
+        return list(dict.fromkeys(link.message for one in self.racks for link in one.links))
 
     def plot(self, folder: Path) -> list[Path]:
         """Write ages, jitter and losses, a row a type of messages, into `folder`; return the
@@ -169,8 +164,8 @@ class HandBench:
     def _series(self, value: Callable[[LinkFigures], float | None]) -> list[Series]:
         """Return a series of marks for each rack and mode."""
         found = []
-        for number, one in enumerate(self.figures):
-            lower = (number + 0.5) / len(self.figures) - 0.5
+        for number, one in enumerate(self.racks):
+            lower = (number + 0.5) / len(self.racks) - 0.5
             known = [
                 (figure, self.messages.index(link.message) + 0.8 * lower)
                 for link in one.links

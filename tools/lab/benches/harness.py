@@ -14,13 +14,14 @@ and the others are measured all the same.
 from __future__ import annotations
 
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -38,17 +39,33 @@ _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
 
 
-class BenchResult(Protocol):
-    """What a bench has found, as far as it is shown."""
+class BenchResult(ABC):
+    """What a bench has found; a dataclass, of which its fields are the JSON."""
+
+    name: str
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
+        return {"bench": self.name, **plain(self)}
 
+    @abstractmethod
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield it as text for people, fitted to `width`."""
 
+    @abstractmethod
     def plot(self, folder: Path) -> list[Path]:
         """Write its pictures into `folder`; return their paths."""
+
+
+def plain(found: Any) -> Any:
+    """Return a record as plain data: its fields, and the properties that its class names in
+    `DERIVED`."""
+    if is_dataclass(found):
+        names = [*(each.name for each in fields(found)), *getattr(found, "DERIVED", ())]
+        return {name: plain(getattr(found, name)) for name in names}
+    if isinstance(found, Mapping):
+        return {key: plain(value) for key, value in found.items()}
+    return list(map(plain, found)) if isinstance(found, tuple | list) else found
 
 
 Found = TypeVar("Found", bound=BenchResult)
@@ -132,26 +149,24 @@ class Absent:
         )
 
 
-def absent_package(who: str, module: str) -> Absent | None:
-    """Return what a Python package lacks; None if it can be imported."""
+def absent_package(who: str, module: str) -> tuple[Absent, ...]:
+    """Return what a Python package lacks; nothing if it can be imported."""
     try:
         import_module(module)
     except ImportError as error:
-        return Absent(who, str(error), EXTRA)
-    return None
+        return (Absent(who, str(error), EXTRA),)
+    return ()
 
 
-def absent_program(who: str, program: str, debian: str) -> Absent | None:
-    """Return what a program of a Debian package lacks; None if it is on the path."""
-    return (
-        None
-        if shutil.which(program)
-        else Absent(who, f"no program '{program}'", f"apt-get install {debian}")
-    )
+def absent_program(who: str, program: str, debian: str) -> tuple[Absent, ...]:
+    """Return what a program of a Debian package lacks; nothing if it is on the path."""
+    if shutil.which(program):
+        return ()
+    return (Absent(who, f"no program '{program}'", f"apt-get install {debian}"),)
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(BenchResult):
     """All samples of a bench. `baselines` names the contestant of each case that the others are
     compared with.
 
@@ -199,7 +214,7 @@ class Comparison:
             "title": self.title,
             "baselines": dict(self.baselines),
             "samples": [self._figures(sample) for sample in self.samples],
-            "absent": [asdict(one) for one in self.absent],
+            "absent": plain(self.absent),
             "conclusion": self.conclusion,
         }
 

@@ -60,10 +60,10 @@ class LanRuns:
 
 def measure(runs: LanRuns, progress: Progress) -> LanFigures:
     """Measure every contestant at each number of racks, by turns. Raises `Failure`."""
-    absent = [one for who, package in PACKAGES if (one := absent_package(who, package))]
+    absent = [one for each in PACKAGES for one in absent_package(*each)]
     contestants = [who for who in ENDS if who not in [one.who for one in absent]]
-    if lacks := absent_cyclictest():
-        absent.append(lacks)
+    lacks = absent_cyclictest()
+    absent += lacks
     bench = LanBench(runs)
     progress.total(
         sum(bench.cost_s(count) for count in runs.counts) * len(contestants) * runs.rounds
@@ -82,7 +82,7 @@ def measure(runs: LanRuns, progress: Progress) -> LanFigures:
                     ended = str(failure)
                     absent.append(Absent(f"{who} with {count} racks", ended))
                 progress.end(bench.cost_s(count), ended)
-            if lacks is None:
+            if not lacks:
                 bench.wake(count)
     return bench.figures(absent)
 

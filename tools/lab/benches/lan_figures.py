@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rack.tools.lab.benches.chart import PALETTE, Diagram, Series, draw
-from rack.tools.lab.benches.harness import Absent, Comparison, Sample
+from rack.tools.lab.benches.harness import Absent, BenchResult, Comparison, Sample, plain
 from rack.tools.lab.benches.lan_ends import LEASE_MS, ORDER_BYTES, STATUS_BYTES
 
 BASELINES = {"round trip": "UDP", "age": "UDP", "on the wire": "UDP", "processor": "UDP"}
@@ -63,7 +63,7 @@ class Steadiness:
 
 
 @dataclass(frozen=True)
-class LanFigures:
+class LanFigures(BenchResult):
     """All that was measured. `loss` is the share of packets that got lost at every rack."""
 
     values: Mapping[Point, tuple[float, ...]]
@@ -90,7 +90,7 @@ class LanFigures:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data, without the raw values."""
-        steady = {who: asdict(one) for who, one in self.steady.items()}
+        steady = plain(self.steady)
         return self.comparison.document() | {"loss": self.loss, "undisturbed": steady}
 
     def lines(self, width: int | None = None) -> Iterator[str]:

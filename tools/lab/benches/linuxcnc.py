@@ -48,8 +48,8 @@ LEAD = 3
 """Samples before the first interval from one run to the next."""
 
 
-def absent_linuxcnc() -> Absent | None:
-    """Return what LinuxCNC lacks; None if it is installed."""
+def absent_linuxcnc() -> tuple[Absent, ...]:
+    """Return what LinuxCNC lacks; nothing if it is installed."""
     return absent_program(LINUXCNC, PROGRAM, PACKAGE)
 
 

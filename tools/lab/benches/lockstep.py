@@ -26,7 +26,7 @@ from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.bare import BareRun, run_bare
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
-from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
+from rack.tools.lab.benches.harness import BenchResult, Comparison, Sample, interleaved, shown
 from rack.tools.recording.recording import Recording
 
 RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
@@ -38,7 +38,7 @@ BOUND_S = 600.0
 
 
 @dataclass(frozen=True)
-class LockstepSpeeds:
+class LockstepSpeeds(BenchResult):
     """The time that a simulated second takes, by rack and contestant."""
 
     comparison: Comparison

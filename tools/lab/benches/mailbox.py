@@ -77,14 +77,14 @@ def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Compariso
     """Measure every contestant that is installed in every case; the baseline of a case is its best
     peer."""
     missing = {peer.name: absent_package(peer.name, peer.module) for peer in (*REFERENCES, *PEERS)}
-    present = [peer for peer in (*REFERENCES, *PEERS) if missing[peer.name] is None]
+    present = [peer for peer in (*REFERENCES, *PEERS) if not missing[peer.name]]
     progress.total(CASE_S * len(cases))
     samples: list[Sample] = []
     for case in cases:
         progress.begin(case.name)
         samples += _measure_case(case, present, rounds)
         progress.end(CASE_S)
-    absent = tuple(one for one in missing.values() if one is not None)
+    absent = tuple(one for each in missing.values() for one in each)
     return compare(samples, absent)
 
 

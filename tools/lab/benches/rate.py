@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,10 @@ from rack.tools.lab.benches.cyclictest import (
     WakeGrid,
     absent_cyclictest,
     cyclictest,
+    misses_count,
     overdue,
 )
-from rack.tools.lab.benches.harness import Absent, turns
+from rack.tools.lab.benches.harness import Absent, BenchResult, turns
 from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
 
 RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
@@ -107,41 +108,28 @@ class RateFigures(MissesBeyond):
 
 
 @dataclass(frozen=True)
-class Rates:
+class Rates(BenchResult):
     """The figures of every rate, lowest first; `absent` is the peer that this machine lacks."""
+
+    name = "rate"
+    DERIVED = ("highest_held_hz",)
 
     config: str
     board: str
     core: int
-    figures: tuple[RateFigures, ...]
-    absent: Absent | None
+    rates: tuple[RateFigures, ...]
+    absent: tuple[Absent, ...]
+    permitted_beyond: float = BEYOND
 
     @property
     def highest_held_hz(self) -> float | None:
         """The highest rate that is held; None if none is."""
-        return max((one.rate_hz for one in self.figures if one.held), default=None)
+        return max((one.rate_hz for one in self.rates if one.held), default=None)
 
     @property
     def title(self) -> str:
         """What was measured, in a line."""
         return f"{self.config}: rate of board '{self.board}' on core {self.core}"
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        rates = [{**asdict(one), "beyond": one.beyond, "held": one.held} for one in self.figures]
-        found = {
-            "bench": "rate",
-            "config": self.config,
-            "board": self.board,
-            "core": self.core,
-            "rates": rates,
-        }
-        return {
-            **found,
-            "permitted_beyond": BEYOND,
-            "highest_held_hz": self.highest_held_hz,
-            "absent": [] if self.absent is None else [asdict(self.absent)],
-        }
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as a table for people, fitted to `width`, and the highest rate held."""
@@ -158,10 +146,9 @@ class Rates:
             "",
         ]
         yield from table(
-            head, [self._row(one) for one in self.figures], width, ("cycles", "p99", "late p50, us")
+            head, [self._row(one) for one in self.rates], width, ("cycles", "p99", "late p50, us")
         )
-        if self.absent is not None:
-            yield f"{self.absent.line}; every miss counts against the rack"
+        yield from misses_count(self.absent)
         highest = self.highest_held_hz
         bound = f"missed at most {BEYOND:.1%} beyond cyclictest"
         yield (
@@ -185,12 +172,12 @@ class Rates:
 
     def plot(self, folder: Path) -> list[Path]:
         """Write missed cycles and load by rate into `folder`; return the paths."""
-        rates = [one.rate_hz for one in self.figures]
-        shares = [Series("rack: missed", rates, [100 * one.missed for one in self.figures], "o-")]
-        if self.absent is None:
-            late = [100 * (one.late or 0.0) for one in self.figures]
+        rates = [one.rate_hz for one in self.rates]
+        shares = [Series("rack: missed", rates, [100 * one.missed for one in self.rates], "o-")]
+        if not self.absent:
+            late = [100 * (one.late or 0.0) for one in self.rates]
             shares.append(Series("cyclictest: late by a cycle", rates, late, "s-", BASELINE))
-        loads = [one.processor_us * one.rate_hz * 1e-4 for one in self.figures]
+        loads = [one.processor_us * one.rate_hz * 1e-4 for one in self.rates]
         load = [Series("", rates, loads, "o-")]
         panels = (
             Diagram("", "servo rate, Hz", shares, "% of the cycles"),

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
+from rack.tools.lab.benches.harness import BenchResult, plain
 from rack.tools.lab.benches.observed import record
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, plot, response_of
@@ -55,6 +56,8 @@ class Twin:
     """One command, and the first tick at which the torque differs in any bit without it; None: it
     never does."""
 
+    DERIVED: ClassVar = ("agrees",)
+
     serial: int
     level: str
     given: int
@@ -68,7 +71,7 @@ class Twin:
 
 
 @dataclass(frozen=True)
-class ResponseBench:
+class ResponseBench(BenchResult):
     """All runs together, and the twins."""
 
     config: str
@@ -95,7 +98,7 @@ class ResponseBench:
         return {
             **head,
             **self.response.document(),
-            "twins": [asdict(t) | {"agrees": t.agrees} for t in self.twins],
+            "twins": plain(self.twins),
         }
 
     def lines(self, width: int | None = None) -> Iterator[str]:

@@ -35,13 +35,13 @@ def test_messages_take_as_many_cycles_as_there_are_boards(
     found = measure((2, 5), Runs(0.2, 1, True), ROOT, Progress())
     assert found.exact
     assert found.trees == ("this tree", ROOT.name)
-    for one in found.figures:
+    for one in found.chains:
         assert {*one.lockstep_responses} == {one.boards}
         assert min(one.responses) == one.boards
         assert 0 < one.cycles <= 80 * one.boards
         assert one.processor_us > 0
         assert all(one.lockstep_us[tree] > 0 for tree in found.trees)
-    assert found.absent is not None
+    assert found.absent
     assert any("rt-tests" in line for line in found.lines())
     assert "ratio" in "\n".join(found.lines())
     # Two points are on a line whatever they are.
@@ -55,7 +55,7 @@ def test_a_message_late_without_a_miss_is_not_exact() -> None:
     # Earlier than that none can be, and in lockstep none is late.
     assert not replace(SHORT, responses={1: 1, 2: 399}, missed=0.01).exact
     assert not replace(SHORT, lockstep_responses={2: 399, 3: 1}).exact
-    found = Boards((SHORT, replace(SHORT, responses={3: 400})), ("this tree",), 2, None)
+    found = Boards((SHORT, replace(SHORT, responses={3: 400})), ("this tree",), 2, ())
     assert not found.exact
     assert sum("INEXACT" in line for line in found.lines()) == 1
 
@@ -82,7 +82,7 @@ def test_costs_are_drawn_with_their_line(tmp_path: Path) -> None:
         replace(SHORT, boards=n, processor_us=50.0 * n + 100.0, lockstep_us={"ours": 40.0 * n})
         for n in (1, 5, 9)
     ]
-    found = Boards(tuple(chains), ("ours",), 2, None)
+    found = Boards(tuple(chains), ("ours",), 2, ())
     assert found.document()["fit"]["board_us"] == pytest.approx(50.0)
     assert found.document()["lockstep_fit"]["ours"]["board_us"] == pytest.approx(40.0)
     assert sum("us a board" in line for line in found.lines()) == 2

@@ -11,7 +11,6 @@ import pytest
 
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
-from rack.tools.lab.benches.harness import Absent
 from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 
@@ -62,13 +61,11 @@ def test_it_is_absent_without_the_program_or_the_permission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    absent = absent_cyclictest()
-    assert isinstance(absent, Absent)
+    (absent,) = absent_cyclictest()
     assert "apt-get install rt-tests" in absent.line
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
     monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: False)
-    absent = absent_cyclictest()
-    assert isinstance(absent, Absent)
+    (absent,) = absent_cyclictest()
     assert "SCHED_FIFO is refused" in absent.line
 
 

@@ -7,6 +7,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ from rack.tools.lab.benches.harness import (
     absent_package,
     absent_program,
     interleaved,
+    plain,
     turns,
 )
 
@@ -32,6 +34,32 @@ SAMPLES = (
     Sample("large", "theirs", (0.0, 0.0), "us"),
 )
 BOTH = Comparison("pair", "Two contestants", SAMPLES, {"small": "theirs", "large": "theirs"})
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A record with a property that is shown."""
+
+    DERIVED = ("total",)
+
+    first: int
+    others: tuple[Sample, ...] = ()
+
+    @property
+    def total(self) -> int:
+        return self.first + 1
+
+
+def test_a_record_is_plain_data_with_the_properties_that_it_names() -> None:
+    assert plain({"one": Pair(1, SAMPLES[1:2])}) == {
+        "one": {
+            "first": 1,
+            "others": [
+                {"case": "small", "who": "theirs", "values": [4.0, 4.0, 10.0], "unit": "us"}
+            ],
+            "total": 2,
+        }
+    }
 
 
 class Hidden:
@@ -113,20 +141,20 @@ def test_the_picture_is_written_as_png_and_svg(tmp_path: Path) -> None:
 
 
 def test_a_package_that_cannot_be_imported_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert absent_package("JSON", "json") is None
+    assert not absent_package("JSON", "json")
     monkeypatch.setattr(sys, "meta_path", [Hidden("iceoryx2"), *sys.meta_path])
     monkeypatch.delitem(sys.modules, "iceoryx2", raising=False)
-    assert absent_package("blackboard", "iceoryx2") == Absent(
-        "blackboard", "No module named 'iceoryx2'", EXTRA
+    assert absent_package("blackboard", "iceoryx2") == (
+        Absent("blackboard", "No module named 'iceoryx2'", EXTRA),
     )
 
 
 def test_a_program_that_is_not_on_the_path_is_absent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert absent_program("shell", "sh", "dash") is None
+    assert not absent_program("shell", "sh", "dash")
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = absent_program("cyclictest", "cyclictest", "rt-tests")
+    (found,) = absent_program("cyclictest", "cyclictest", "rt-tests")
     assert found == Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
 
 

@@ -12,7 +12,6 @@ import pytest
 
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.cyclictest import WakeGrid, permits_fifo
-from rack.tools.lab.benches.harness import Absent
 from rack.tools.lab.benches.linuxcnc import absent_linuxcnc, lateness_us, linuxcnc
 from tests.tools.lab.benches import peers
 
@@ -60,6 +59,5 @@ def test_a_thread_that_never_runs_is_a_failure_in_its_own_words(
 
 def test_it_is_absent_without_its_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    absent = absent_linuxcnc()
-    assert isinstance(absent, Absent)
+    (absent,) = absent_linuxcnc()
     assert "apt-get install linuxcnc-uspace" in absent.line

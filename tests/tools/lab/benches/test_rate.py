@@ -20,7 +20,7 @@ from tests.tools.command_line import rack
 from tests.tools.lab.benches import peers
 
 HELD = RateFigures(400.0, 6000, 0.0012, 0.0005, None, 500.0, "")
-RATES = Rates("nasrem", "servo", 1, (HELD, replace(HELD, rate_hz=1000.0, missed=0.0016)), None)
+RATES = Rates("nasrem", "servo", 1, (HELD, replace(HELD, rate_hz=1000.0, missed=0.0016)), ())
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
@@ -57,7 +57,7 @@ def test_a_rate_is_held_up_to_its_bound_beyond_cyclictest() -> None:
     assert replace(HELD, failure="board lost: servo").verdict == "board lost: servo"
     assert RATES.highest_held_hz == 400.0
     assert "highest rate held: 400 Hz" in list(RATES.lines())[-1]
-    assert replace(RATES, figures=RATES.figures[1:]).highest_held_hz is None
+    assert replace(RATES, rates=RATES.rates[1:]).highest_held_hz is None
 
 
 @pytest.mark.slow
@@ -66,13 +66,13 @@ def test_a_rack_is_run_at_every_rate(tmp_path: Path, monkeypatch: pytest.MonkeyP
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure(str(path), (800, 400), Runs(0.8, 1, True), Progress())
-    assert [one.rate_hz for one in found.figures] == [400, 800]
+    assert [one.rate_hz for one in found.rates] == [400, 800]
     assert found.board == "wave"
-    for one in found.figures:
+    for one in found.rates:
         assert 0 < one.cycles <= 0.8 * one.rate_hz
         assert (one.late, one.failure) == (None, "")
         assert one.processor_us > 0
-    assert isinstance(found.absent, Absent)
+    assert isinstance(found.absent[0], Absent)
     assert any("rt-tests" in line for line in found.lines())
     assert found.document()["absent"]
     assert all(picture.stat().st_size for picture in found.plot(tmp_path))
@@ -86,7 +86,7 @@ def test_late_wakes_of_cyclictest_are_a_share_of_its_own(
     path.write_text(PLAIN)
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)))
     monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: True)
-    (one,) = measure(str(path), (400,), Runs(0.3, 2, True), Progress()).figures
+    (one,) = measure(str(path), (400,), Runs(0.3, 2, True), Progress()).rates
     # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
     assert one.late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
 

@@ -60,7 +60,7 @@ def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
     Raises `ConfigError` for a config with mistakes, before any rack runs.
     """
     absent = absent_cyclictest()
-    racks = [_System(name, runs, is_compared=absent is None) for name in names]
+    racks = [_System(name, runs, is_compared=not absent) for name in names]
     progress.total(sum(rack.lasts_s for rack in racks))
     figures = []
     with TemporaryDirectory(prefix="rack-bench-") as scratch:

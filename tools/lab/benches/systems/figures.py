@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.lab.benches.cyclictest import MissesBeyond
@@ -50,6 +51,8 @@ class RealTimeFigures(MissesBeyond):
 class SystemFigures:
     """One rack: what its config promises, and what its runs have shown. `poses` is None without a
     PUMA to move."""
+
+    DERIVED: ClassVar = ("worked",)
 
     rack: str
     predicted: SystemPrediction

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
 
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.console.tables import decimal, figure, table
-from rack.tools.lab.benches.cyclictest import BEYOND
-from rack.tools.lab.benches.harness import Absent, shown
+from rack.tools.lab.benches.cyclictest import BEYOND, misses_count
+from rack.tools.lab.benches.harness import Absent, BenchResult, shown
 from rack.tools.lab.benches.systems.figures import SystemFigures
 from rack.tools.lab.benches.systems.kills import KillDetection, KilledBoards
 from rack.tools.lab.benches.systems.motion import Stop
@@ -25,28 +24,21 @@ NO_ARM = "no PUMA"
 
 
 @dataclass(frozen=True)
-class Systems:
+class Systems(BenchResult):
     """The figures of every rack; `seconds` is the length of a run, `absent` the peer that this
     machine lacks."""
 
-    figures: tuple[SystemFigures, ...]
+    name = "systems"
+
+    systems: tuple[SystemFigures, ...]
     seconds: float
-    absent: Absent | None
+    absent: tuple[Absent, ...]
+    permitted_beyond: float = BEYOND
 
     @property
     def worked(self) -> bool:
         """Whether all of them worked."""
-        return all(one.worked for one in self.figures)
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return {
-            "bench": "systems",
-            "seconds": self.seconds,
-            "systems": [_document(one) for one in self.figures],
-            "permitted_beyond": BEYOND,
-            "absent": [] if self.absent is None else [asdict(self.absent)],
-        }
+        return all(one.worked for one in self.systems)
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the tables for people, a theme each, fitted to `width`."""
@@ -56,25 +48,19 @@ class Systems:
         """Write systems.png and systems.svg, a row a rack, into `folder`; return their paths."""
         from rack.tools.lab.benches.systems.picture import plot
 
-        return plot(self.figures, folder)
-
-
-def _document(one: SystemFigures) -> dict[str, Any]:
-    found = asdict(one) | {"worked": one.worked}
-    found["realtime"] |= {name: getattr(one.realtime, name) for name in ("beyond", "held")}
-    return found
+        return plot(self.systems, folder)
 
 
 def lines_of(found: Systems, width: int | None) -> Iterator[str]:
     """Yield every table with its title, and what is to be said of single racks."""
-    yield from _made_of(found.figures, width)
+    yield from _made_of(found.systems, width)
     yield from _answered(found, width)
     yield from _stopped(found, width)
-    yield from _planned(found.figures, width)
+    yield from _planned(found.systems, width)
     yield from _used(found, width)
     yield from _late(found, width)
-    yield from _killed(found.figures, width)
-    yield from _moved(found.figures, width)
+    yield from _killed(found.systems, width)
+    yield from _moved(found.systems, width)
     yield from _notes(found)
 
 
@@ -108,7 +94,7 @@ def _answered(found: Systems, width: int | None) -> Iterator[str]:
     head = ["rack", "R_max", "bound, eq. 3.2", "sum, eq. 3.3", "down", "measured", "up", "measured"]
     head += ["command age", "status age"]
     rows = []
-    for one in found.figures:
+    for one in found.systems:
         said = one.predicted
         ran = one.realtime
         promised = (
@@ -149,7 +135,7 @@ def _stopped(found: Systems, width: int | None) -> Iterator[str]:
         "emergency stop, rest",
     ]
     rows = []
-    for one in found.figures:
+    for one in found.systems:
         hold = one.realtime.hold
         run = one.poses
         row = [one.rack, *["-"] * 3]
@@ -223,7 +209,7 @@ def _used(found: Systems, width: int | None) -> Iterator[str]:
         "share",
     ]
     rows = []
-    for one in found.figures:
+    for one in found.systems:
         ran = one.realtime
         name, most = max(ran.bus.items(), key=lambda each: each[1].accesses)
         heavy, share = max(ran.board_loads.items(), key=lambda each: each[1], default=("-", 0.0))
@@ -251,7 +237,7 @@ def _late(found: Systems, width: int | None) -> Iterator[str]:
     )
     head = ["rack", "fastest, Hz", "missed", "cyclictest", "beyond"]
     rows = []
-    for one in found.figures:
+    for one in found.systems:
         ran = one.realtime
         rates = one.predicted.rates_hz
         late = None if ran.late is None else 100 * ran.late
@@ -329,9 +315,8 @@ def _moved(figures: Sequence[SystemFigures], width: int | None) -> Iterator[str]
 
 
 def _notes(found: Systems) -> Iterator[str]:
-    if found.absent is not None:
-        yield f"{found.absent.line}; every miss counts against the rack"
-    for one in found.figures:
+    yield from misses_count(found.absent)
+    for one in found.systems:
         commanded = one.realtime.commanded
         hold = one.realtime.hold
         if commanded not in ("", *one.predicted.levels[:1]):

@@ -40,7 +40,7 @@ def systems_of(found: Iterable[Document]) -> Systems:
     """Return what was measured of several racks, as one comparison."""
     each = [TypeAdapter(Systems).validate_python(one) for one in found]
     return Systems(
-        tuple(figures for one in each for figures in one.figures), SECONDS, each[0].absent
+        tuple(figures for one in each for figures in one.systems), SECONDS, each[0].absent
     )
 
 

@@ -82,7 +82,7 @@ def _compared(findings: Findings) -> Assessment:
         "killed: ticks until a neighbour",
         "missed, %",
     )
-    rows = [_measured_row(one) for one in found.figures]
+    rows = [_measured_row(one) for one in found.systems]
     caption = (
         "Responses in ms: longest of a run in real time. A hold is given to the highest level that"
         " takes one."
@@ -99,7 +99,7 @@ def _compared(findings: Findings) -> Assessment:
             f"All figures, as {code('rack bench systems')} prints them.",
         ),
     )
-    failed = [one for one in found.figures if not one.worked]
+    failed = [one for one in found.systems if not one.worked]
     if failed and all(one.realtime.missed > DISTURBED for one in failed):
         missed = ", ".join(
             f"{one.rack} ({100 * one.realtime.missed:.1f} % of its fastest cycles)"
@@ -115,8 +115,8 @@ def _compared(findings: Findings) -> Assessment:
     if failed:
         names = "; ".join(f"{one.rack}: {one.failure}" for one in failed)
         return Assessment(side, Ruling.FAILS, f"These did not run as they should: {text(names)}.")
-    late = [one.rack for one in found.figures if _is_beyond(one)]
-    count = len(found.figures)
+    late = [one.rack for one in found.systems if _is_beyond(one)]
+    count = len(found.systems)
     if late:
         why = (
             f"All {count} systems run on one set of mechanisms. Beyond its bound after missed"
@@ -216,7 +216,7 @@ def _rccl(workshop: Workshop) -> Side:
 
 
 def _rccl_tested(findings: Findings) -> Assessment:
-    found = systems_of([findings[RCCL_RUN.name]]).figures[0]
+    found = systems_of([findings[RCCL_RUN.name]]).systems[0]
     rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
     layout = wire(load(RCCL))
     fastest = [

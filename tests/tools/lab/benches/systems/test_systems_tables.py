@@ -55,7 +55,7 @@ def _rows(found: Systems, rack: str) -> list[list[str]]:
 
 def test_a_rack_has_a_row_in_the_table_of_each_theme() -> None:
     made, answered, stopped, first_plan, host, used, late, killed, moved = _rows(
-        Systems((FOUND,), 1.0, None), "one"
+        Systems((FOUND,), 1.0, ()), "one"
     )
     assert made == ["one", "2", "2", "0", "3", "1", "50", "400", "0.50", "yes"]
     spans = ["22.5/25"] * 2
@@ -82,7 +82,7 @@ def test_what_a_rack_lacks_is_shown_as_such() -> None:
     )
     lines = list(
         Systems(
-            (FOUND, none), 1.0, Absent("cyclictest", "no program", "apt-get install rt-tests")
+            (FOUND, none), 1.0, (Absent("cyclictest", "no program", "apt-get install rt-tests"),)
         ).lines()
     )
     assert "one: top > low" in lines
@@ -98,7 +98,7 @@ def test_no_line_is_wider_than_a_page() -> None:
     long = replace(
         FOUND, rack="nist-state-table", predicted=replace(PROMISED, rates_hz=(50.0, 50.0, 400.0))
     )
-    assert max(map(len, Systems((FOUND, long), 10.0, None).lines(120))) <= 120
+    assert max(map(len, Systems((FOUND, long), 10.0, ()).lines(120))) <= 120
 
 
 def test_a_rack_fails_by_its_run_and_a_late_hold_is_named() -> None:
@@ -107,16 +107,16 @@ def test_a_rack_fails_by_its_run_and_a_late_hold_is_named() -> None:
     overtaken = replace(
         FOUND, realtime=replace(RAN, hold=replace(HOLD, fate="overtaken", measured_ms=None))
     )
-    assert Systems((FOUND, late, overtaken), 1.0, None).worked
-    assert not Systems((FOUND, failed), 1.0, None).worked
-    assert list(Systems((FOUND, failed), 1.0, None).lines())[-1] == "one: board lost: servo"
-    *_, last = Systems((FOUND, late), 1.0, None).lines()
+    assert Systems((FOUND, late, overtaken), 1.0, ()).worked
+    assert not Systems((FOUND, failed), 1.0, ()).worked
+    assert list(Systems((FOUND, failed), 1.0, ()).lines())[-1] == "one: board lost: servo"
+    *_, last = Systems((FOUND, late), 1.0, ()).lines()
     assert last == "late: the response to the hold took longer than the longest on the grid"
     queued = replace(FOUND, realtime=replace(RAN, commanded="low"))
     below = (
         "one: down is measured from low: the wait in the queue above it does not count as response"
     )
-    assert below in Systems((queued,), 1.0, None).lines()
-    assert any("overtaken" in line for line in Systems((overtaken,), 1.0, None).lines())
+    assert below in Systems((queued,), 1.0, ()).lines()
+    assert any("overtaken" in line for line in Systems((overtaken,), 1.0, ()).lines())
     assert RAN.held
     assert replace(RAN, missed=0.02).verdict == "1.85 % missed beyond cyclictest"
