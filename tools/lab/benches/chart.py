@@ -107,7 +107,9 @@ def _draw(axes: Axes, panel: Diagram, has_rows: bool) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     if any(one.label and len(one.x) for one in panel.series):
         # Above rows, which it would hide.
-        place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)} if has_rows else {}
+        place: dict[str, Any] = {}
+        if has_rows:
+            place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
         axes.legend(frameon=False, fontsize=6.5, ncols=1 + has_rows, **place)
 
 

@@ -299,7 +299,7 @@ def interleaved(
     found: dict[_Name, list[_Result]] = {name: [] for name in contestants}
     for turn, name in turns(list(contestants), rounds):
         if progress is not None:
-            label = name if isinstance(name, str) else ", ".join(map(str, name))
+            label = ", ".join(map(str, name if isinstance(name, tuple) else (name,)))
             progress.begin(f"{label}: round {turn + 1} of {rounds}")
         found[name].append(contestants[name]())
         if progress is not None:

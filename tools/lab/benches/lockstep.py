@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from rack.boards.config import load, resolve
+from rack.boards import OneProcess
+from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.bare import BareRun, run_bare
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
 from rack.tools.lab.benches.harness import BenchResult, Comparison, Sample, interleaved, shown
 from rack.tools.recording.recording import Recording
@@ -35,6 +36,20 @@ BARE = "no rack"
 EXPECTED_S = 10.0
 """About how long a run takes."""
 BOUND_S = 600.0
+
+
+@dataclass(frozen=True)
+class BareRun:
+    """A finished run of levels alone. `processor_s` is the time of its ticks.
+
+    `last` is the newest message of each mailbox that was visible before the end, `serials` its
+    number; without one, a mailbox is left out.
+    """
+
+    ticks: int
+    processor_s: float
+    serials: Mapping[str, int]
+    last: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -147,8 +162,17 @@ def _ms_a_second(rack: str, ticks: int, took_s: float) -> float:
 
 
 def _bare(rack: str, ticks: int) -> BareRun:
-    resolved = resolve(load(rack, ["clock.mode=lockstep"]))
-    return apart(run_bare, resolved.layout, resolved.tasks, ticks)
+    return apart(run_bare, load(rack, ["clock.mode=lockstep"]), ticks)
+
+
+def run_bare(config: RackConfig, ticks: int) -> BareRun:
+    """Run a rack's levels in this process for so many ticks."""
+    with OneProcess(config) as rack:
+        start_ns = time.process_time_ns()
+        rack.run_ticks(ticks)
+        processor_s = (time.process_time_ns() - start_ns) * 1e-9
+        last = {name: rack.newest(name).record[()].copy() for name in rack.serials}
+        return BareRun(ticks, processor_s, rack.serials, last)
 
 
 def _check(rack: str, seconds: float | None, folder: Path) -> int:

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rack.boards.config import load, resolve
+from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.bare import run_bare
-from rack.tools.lab.benches.lockstep import BARE, differences, measure, speeds
+from rack.tools.lab.benches.lockstep import BARE, differences, measure, run_bare, speeds
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
@@ -25,8 +24,8 @@ def test_levels_without_a_rack_write_what_they_write_in_one(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     recording = Recording(nasrem_run(tmp_path_factory))
-    resolved = resolve(load("nasrem", ["clock.mode=lockstep"]))
-    bare = apart(run_bare, resolved.layout, resolved.tasks, recording.ended["outcome"]["ticks"])
+    config = load("nasrem", ["clock.mode=lockstep"])
+    bare = apart(run_bare, config, recording.ended["outcome"]["ticks"])
     assert list(differences(recording, bare)) == []
     assert bare.processor_s > 0.0
     # Other work is noticed: one message less, or one value that differs in its last bit.
@@ -84,11 +83,3 @@ def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
         apart(fails)
     with pytest.raises(Failure, match="ended with status 4"):
         apart(exits)
-
-
-def test_a_rack_whose_boards_interrupt_each_other_does_not_run_bare(small: Path) -> None:
-    resolved = resolve(load(small, ["protocol.default=interrupt"]))
-    with pytest.raises(
-        Failure, match="interrupts its readers; only racks without any run without boards"
-    ):
-        run_bare(resolved.layout, resolved.tasks, 1)
