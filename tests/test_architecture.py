@@ -69,6 +69,7 @@ def test_imports_point_downward_only(floor: str) -> None:
     assert not upward
 
 
+@pytest.mark.slow
 def test_folders_form_no_circle() -> None:
     # A folder's __init__ shows what the folder has to offer: it is no part of what the folder's
     # files need.
@@ -183,6 +184,7 @@ def test_every_folder_is_installed() -> None:
     assert set(listed) == folders
 
 
+@pytest.mark.slow
 def test_every_room_has_quick_tests() -> None:
     quick: defaultdict[Path, list[str]] = defaultdict(list)
     for path in sorted((ROOT / "tests").rglob("test_*.py")):

@@ -71,6 +71,7 @@ def test_the_law_is_replaced_on_two_boards_in_motion_without_a_step(run: Ran) ->
     ).max() == pytest.approx(0.0)
 
 
+@pytest.mark.slow
 def test_a_silent_general_machine_is_bridged_then_the_arm_holds_and_goes_on(run: Ran) -> None:
     due = run.values("supervisor.command", "due", 1400, 1999)
     assert (due == 0).any()

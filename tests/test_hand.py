@@ -74,6 +74,7 @@ def test_two_runs_have_one_digest(runs: list[Recording]) -> None:
     assert None not in digests
 
 
+@pytest.mark.slow
 def test_restarted_board_goes_on_with_the_hand_as_it_was(runs: list[Recording]) -> None:
     tick, position, stopped = (
         runs[0].signal("hand.status", name) for name in ("tick", "position", "stopped")
@@ -88,6 +89,7 @@ def test_restarted_board_goes_on_with_the_hand_as_it_was(runs: list[Recording]) 
     assert np.abs(position[-1] - position[-50]).max() > 0.01
 
 
+@pytest.mark.slow
 def test_report_says_what_the_tendons_did(runs: list[Recording]) -> None:
     hand = report_of(runs[0])["hand"]
     assert hand["violations"] == hand["touches"] == 0
@@ -109,6 +111,7 @@ def test_recording_shows_tensions_and_joints_by_finger(runs: list[Recording]) ->
     )
 
 
+@pytest.mark.slow
 def test_recording_shows_a_push_as_an_arrow(runs: list[Recording]) -> None:
     file = runs[0].folder / "run.rrd"
     vectors = read(file, "/cell/pushes", "Arrows3D:vectors")

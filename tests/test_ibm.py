@@ -52,6 +52,7 @@ def test_the_arm_was_braked_while_each_block_was_lowered(run: tuple[Path, dict[s
         assert len(set(braked) & set(range(lowering[0] + 1000, lowering[-1] - 500)))
 
 
+@pytest.mark.slow
 def test_no_braking_counts_as_touch_and_each_block_is_put_down(
     run: tuple[Path, dict[str, Any]],
 ) -> None:

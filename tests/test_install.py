@@ -146,6 +146,7 @@ def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_p
     assert json.loads(run(tmp_path, installed / "rack", *words))["worked"]
 
 
+@pytest.mark.slow
 def test_nothing_but_rack_is_installed(installed: Path) -> None:
     with ZipFile(next(installed.parents[1].glob("*.whl"))) as wheel:
         tops = {name.partition("/")[0] for name in wheel.namelist()}

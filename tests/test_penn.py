@@ -84,6 +84,7 @@ def test_the_force_is_kept_on_the_flat_and_after_an_edge_that_nobody_knows(run: 
     assert EDGE - 0.005 < off.min() < off.max() < EDGE + 0.05
 
 
+@pytest.mark.slow
 def test_a_lost_client_leaves_its_segment_ended_and_the_force_held_and_then_released(
     run: Path,
 ) -> None:
@@ -100,6 +101,7 @@ def test_a_lost_client_leaves_its_segment_ended_and_the_force_held_and_then_rele
     assert b"forces released, the position is held" in reason[-1].encode()
 
 
+@pytest.mark.slow
 def test_no_limit_is_exceeded_and_no_torque_steps(run: Path) -> None:
     _, violations, touches, target = table(run, "arm.status", "violations", "touches", "target")
     assert violations[-1] == touches[-1] == 0

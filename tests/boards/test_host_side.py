@@ -212,6 +212,7 @@ def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(
     assert not runs(daemon)
 
 
+@pytest.mark.slow
 def test_output_without_end_is_cut_and_counted_and_hides_no_other_board(config: MakeConfig) -> None:
     text = others(loud="Printing", long="Printing", failed="Failing")
     settings = [

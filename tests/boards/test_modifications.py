@@ -157,6 +157,7 @@ def test_a_run_with_switches_repeats_and_equals_that_without_modifications_up_to
     assert differs[0] == 301
 
 
+@pytest.mark.slow
 def test_one_that_fails_is_taken_out_with_its_reason_in_status_and_events_and_the_arm_goes_on(
     switched: Ran,
 ) -> None:
@@ -200,6 +201,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("setting", "place", "why"), MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_in_a_modification_is_one_line(
     rack_of: Callable[..., RackConfig], setting: str, place: str, why: str
@@ -220,6 +222,7 @@ def test_a_name_given_twice_is_one_line(tmp_path: Path) -> None:
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_command_names_a_modification_of_its_board(rack_of: Callable[..., RackConfig]) -> None:
     with pytest.raises(ConfigError, match="modify of 'shoulder' knows: pd, lean, breaks"):
         wire(rack_of(commands(switch("leans", True, 1))))

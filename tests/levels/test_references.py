@@ -81,6 +81,7 @@ ENDING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("name", ENDING)
 def test_a_module_neither_ends_nor_holds_the_process_that_checks_a_config(

@@ -80,6 +80,7 @@ def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
     return [*((name, "--help") for name, _, _ in ALL), *answers, (*run, "--json")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_output_that_cannot_be_printed_is_one_line(
     small: Path, rack_name: str, unbuffered: str
@@ -102,6 +103,7 @@ def test_output_that_cannot_be_printed_is_one_line(
         assert not before or arguments[0] == "status"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_reader_that_has_seen_enough_hears_of_no_error(
     small: Path, rack_name: str, unbuffered: str
@@ -125,6 +127,7 @@ def test_a_reader_that_has_seen_enough_hears_of_no_error(
         assert not done.stderr or done.stderr.startswith(f"rack '{rack_name}' does not exist")
 
 
+@pytest.mark.slow
 def test_with_stdout_closed_commands_do_what_they_do(small: Path, rack_name: str) -> None:
     for arguments in outputs(small, rack_name)[-7:]:
         # Python itself closes what the shell has closed before it starts.

@@ -114,6 +114,7 @@ def test_a_slower_joint_has_a_response_of_its_own(
     assert subjects == {"system, path > joint2 > arm", "system, path > joint1, joint3 > arm"}
 
 
+@pytest.mark.slow
 def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> None:
     response = response_of(Recording(folder))
     assert response is not None
@@ -136,6 +137,7 @@ def test_the_levels_alone_write_what_they_write_in_the_rack(
     assert list(differences(recording, bare)) == []
 
 
+@pytest.mark.slow
 def test_the_graph_of_boards_has_a_row_for_every_level(folder: Path) -> None:
     names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
     places = (

@@ -55,6 +55,7 @@ def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None:
     states = read(folder / "run.rrd", "/levels/counter/row", "StateChange:state")
     lines = read(folder / "run.rrd", "/log/rows", "TextLog:text")
@@ -71,5 +72,6 @@ def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None
     }
 
 
+@pytest.mark.slow
 def test_the_recorded_config_names_the_same_files(folder: Path) -> None:
     assert str(folder.parent / "slow.toml") in Recording(folder).config

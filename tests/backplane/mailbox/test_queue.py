@@ -262,6 +262,7 @@ def bookkeeping(segment: Segment) -> Iterator[int]:
             yield from range(message - SLOT_HEAD_SIZE, message - SLOT_HEAD_SIZE + size)
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(make_bus: MakeBus) -> None:
     segment = make_bus(*queue(8))
     writer = open_writer(segment, NAME)

@@ -13,6 +13,7 @@ from rack.tools.recording.recording import Recording
 from tests.shared_runs import small_run
 
 
+@pytest.mark.slow
 def test_levels_do_what_they_do_in_a_rack_in_lockstep(
     small: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -274,6 +274,7 @@ def run_limited(
     )
 
 
+@pytest.mark.slow
 @as_root
 @pytest.mark.parametrize(
     ("limits", "why"),
@@ -335,6 +336,7 @@ def test_a_limit_of_the_system_is_one_line_with_its_value(
     assert not done.stdout
 
 
+@pytest.mark.slow
 @as_root
 def test_memory_that_could_not_be_locked_is_said_with_its_limit(
     config: MakeConfig, tmp_path: Path
@@ -350,6 +352,7 @@ def test_memory_that_could_not_be_locked_is_said_with_its_limit(
     assert "memory not locked" not in run_limited(real_time, tmp_path).stdout
 
 
+@pytest.mark.slow
 @as_root
 @needs_fifo
 def test_lockstep_has_no_deadlines_to_warn_of(config: MakeConfig, tmp_path: Path) -> None:
@@ -359,6 +362,7 @@ def test_lockstep_has_no_deadlines_to_warn_of(config: MakeConfig, tmp_path: Path
     assert not re.search("SCHED_FIFO|missed deadlines|NO REAL-TIME|not locked", done.stdout)
 
 
+@pytest.mark.slow
 @as_root
 @pytest.mark.filterwarnings(FORKS)
 def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(

@@ -161,6 +161,7 @@ def orders_and_bodies(
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("action", ACTIONS)
 def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
     action: Mapping[str, Any], rack_name: str, tmp_path: Path
@@ -175,6 +176,7 @@ def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
     check(found, {"orders": senders[0].refused, "shared": 0})
 
 
+@pytest.mark.slow
 def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_path: Path) -> None:
     body = {
         "name": b"part",
@@ -196,6 +198,7 @@ def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_
     check(ended, {"orders": 0, "shared": senders[1].refused})
 
 
+@pytest.mark.slow
 def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Path) -> None:
     listen = free_port()
     cell = real("cell", rack_name, tmp_path, listen)

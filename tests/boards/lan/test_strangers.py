@@ -229,20 +229,24 @@ def test_a_friend_is_heard_answered_and_shown_who_is_there(found: Found) -> None
     assert "friend came" in found.home["tokens"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bare", "plain", "forged"])
 def test_who_shows_no_certificate_of_ours_is_not_connected(found: Found, name: str) -> None:
     assert found.of[name] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
 
 
+@pytest.mark.slow
 def test_a_rack_goes_out_only_to_whom_the_address_belongs(found: Found) -> None:
     assert found.of["impostor"] == {"heard": {}, "tokens": {}, "answers": {}, "connected": False}
 
 
+@pytest.mark.slow
 def test_a_certificate_of_ours_without_a_right_gets_nothing(found: Found) -> None:
     assert found.of["nobody"] == {"heard": {}, "tokens": {}, "answers": {}, "connected": True}
     assert STRANGER not in found.home["asked"]
 
 
+@pytest.mark.slow
 def test_whoever_may_watch_may_do_nothing_else(found: Found) -> None:
     viewer = found.of["viewer"]
     assert set(viewer["answers"]) == {READ}
@@ -252,12 +256,14 @@ def test_whoever_may_watch_may_do_nothing_else(found: Found) -> None:
     assert set(found.home["asked"]) == {READ, "rack/home/ask/stop/friend"}
 
 
+@pytest.mark.slow
 def test_nobody_sends_under_another_name(found: Found) -> None:
     # Friend sends 100 bytes, all others 99 under its key: those would be good.
     assert set(found.home["came"]) == {out_key(*source.split("/")) for source in IMPORTED}
     assert found.home["sizes"][pulse("friend")] == [100]
 
 
+@pytest.mark.slow
 def test_what_is_sealed_wrongly_is_counted_by_cause_and_not_taken(found: Found) -> None:
     home, second = found.home, out_key("liar", "second.status")
     assert min(home["flaws"].values()) > ROUNDS / 2
@@ -266,10 +272,12 @@ def test_what_is_sealed_wrongly_is_counted_by_cause_and_not_taken(found: Found) 
     assert 0 < home["good"][pulse("liar")] < home["came"][pulse("liar")]
 
 
+@pytest.mark.slow
 def test_a_seal_with_another_secret_does_not_fit(found: Found) -> None:
     assert found.home["good"][pulse("mole")] == 0 < found.home["came"][pulse("mole")]
 
 
+@pytest.mark.slow
 def test_a_huge_message_is_not_put_together(found: Found) -> None:
     assert found.home["good"][pulse("heavy")] == found.home["came"][pulse("heavy")] > 0
     assert found.home["sizes"][pulse("heavy")] == [100]

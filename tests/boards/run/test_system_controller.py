@@ -25,6 +25,7 @@ RESTART_TICKS = 200
 """Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tick", [0, 1])
 def test_a_board_that_dies_at_the_first_ticks_comes_back(config: MakeConfig, tick: int) -> None:
     fault = FaultConfig.model_validate({"kind": "kill", "board": "wave", "tick": tick})

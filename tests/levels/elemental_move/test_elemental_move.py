@@ -49,6 +49,7 @@ def test_block_is_put_where_it_should_be_and_nothing_is_touched(transferred: tup
     assert rack.move.replans == 0
 
 
+@pytest.mark.slow
 def test_arm_hardly_waits_for_a_path_once_it_has_begun(transferred: tuple) -> None:
     # Between two segments the primitive level may be without work for some of its cycles, not for
     # one of this level's.

@@ -197,6 +197,7 @@ def test_ctrl_c_ends_a_campaign_with_a_report_of_what_was_done(small: Path, tmp_
     assert (report["interrupted"], report["summary"]["left_behind"]) == (True, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "numbers", [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT,) * 2]
 )

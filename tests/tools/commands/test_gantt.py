@@ -55,6 +55,7 @@ def test_a_figure_is_printed_as_in_the_paper_and_drawn(
     assert str(tmp_path / "out" / "gantt.png") in shown.stdout
 
 
+@pytest.mark.slow
 def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_ms(
     tmp_path: Path,
 ) -> None:

@@ -64,6 +64,7 @@ def test_a_fault_begins_at_the_next_tick_and_says_which(running: str) -> None:
     wait_until(lambda: entry[Entry.COUNT] and UtilityLines(segment).bad_inputs == [])
 
 
+@pytest.mark.slow
 def test_waiting_is_for_the_end_of_a_fault(running: str) -> None:
     done = rack(
         "inject", running, "watch", "mute", "--cycles", "5", "--mailbox", "watch.status", "--wait"
@@ -77,6 +78,7 @@ def test_waiting_is_for_the_end_of_a_fault(running: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_fault_can_wait_for_a_tick_and_for_a_condition(running: str) -> None:
     tick = Segment.attach(running).words[System.TICK] + 2000
     drop = json.loads(
@@ -95,6 +97,7 @@ def test_a_fault_can_wait_for_a_tick_and_for_a_condition(running: str) -> None:
 NEVER = ("watch", "mute", "--when", "watch.status.state == error")
 
 
+@pytest.mark.slow
 def test_a_fault_with_a_condition_is_armed_and_can_be_withdrawn(running: str) -> None:
     done = rack("inject", running, *NEVER, "--json")
     answer = json.loads(done.stdout)
@@ -114,6 +117,7 @@ def test_a_fault_with_a_condition_is_armed_and_can_be_withdrawn(running: str) ->
     assert again.stderr.startswith(f"fault {number} is not waiting; waiting: ")
 
 
+@pytest.mark.slow
 def test_waiting_ends_at_its_time_out_and_says_for_what_it_was(running: str) -> None:
     done = rack("inject", running, *NEVER, "--wait", "--timeout", "0.2")
     assert (done.returncode, done.stdout) == (1, "")
@@ -125,6 +129,7 @@ def test_waiting_ends_at_its_time_out_and_says_for_what_it_was(running: str) -> 
     rack("inject", running, "--withdraw", at_once.split()[-1])
 
 
+@pytest.mark.slow
 def test_the_faults_of_a_rack_are_listed(running: str) -> None:
     rack("inject", running, "wave", "babble", "--for", "20ms", "writes=5")
     listed = json.loads(rack("inject", running, "--list", "--json").stdout)
@@ -133,6 +138,7 @@ def test_the_faults_of_a_rack_are_listed(running: str) -> None:
     assert "babble of wave (writes 5)" in rack("inject", running, "--list").stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -166,6 +172,7 @@ def test_what_cannot_be_is_one_line_that_says_what_can(
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "keys", "line"),
     [
@@ -207,6 +214,7 @@ def test_a_fault_that_a_running_rack_cannot_have_is_not_added(
     assert Segment.attach(running).words[System.INJECTED] == injected
 
 
+@pytest.mark.slow
 def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
     words = Segment.attach(running).words
     done = rack("estop", running)

@@ -117,6 +117,7 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
     assert len(read(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(

@@ -157,6 +157,7 @@ def test_a_terminal_that_is_gone_ends_a_run_in_order(
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]
 
 
+@pytest.mark.slow
 def test_under_nohup_a_run_outlives_its_terminal_and_ends_by_other_signals(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:

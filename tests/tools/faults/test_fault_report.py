@@ -56,20 +56,24 @@ def test_a_fault_is_reported_with_its_detection_reaction_and_recovery(report: Re
     assert report["restarts"] == {"upper": 1}
 
 
+@pytest.mark.slow
 def test_a_fault_that_never_struck_is_not_called_missed(report: Report) -> None:
     never = report["faults"][1]
     assert (never["seen"], never["found_by"], never["delay_cycles"]) == ("not struck", "", None)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_unexplained(report: Report) -> None:
     assert report["unexplained"] == []
 
 
+@pytest.mark.slow
 def test_the_report_says_the_same_whenever_it_is_made(folder: Path, report: Report) -> None:
     assert write_report(folder)[0] == report
     assert json.loads((folder / "report.json").read_text()) == report
 
 
+@pytest.mark.slow
 def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
     lines = markdown(report).splitlines()
     head = lines.index("## Faults: 2")
@@ -92,6 +96,7 @@ def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
     assert "Restarts: upper 1." in lines
 
 
+@pytest.mark.slow
 def test_a_detection_without_a_fault_is_shown_as_one(report: Report) -> None:
     found = {"tick": 7, "board": "upper", "code": "gap", "text": "a message is missing"}
     lines = markdown({**report, "unexplained": [found]}).splitlines()
@@ -122,12 +127,14 @@ def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
     assert row.strip("| ").endswith(recovered)
 
 
+@pytest.mark.slow
 def test_a_run_without_faults_has_no_such_section(report: Report) -> None:
     plain = markdown({**report, "faults": [], "restarts": {}})
     assert "Faults" not in plain
     assert "Restarts" not in plain
 
 
+@pytest.mark.slow
 def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder: Path) -> None:
     lane = read(folder / "run.rrd", "/events/upper", "StateChange:state").values.ravel().tolist()
     # The fault ends with its board's process; who hears of which first is open, and the reaction
@@ -144,6 +151,7 @@ def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder:
     )
 
 
+@pytest.mark.slow
 def test_the_graph_of_boards_shows_who_is_lost_until_it_is_back(
     folder: Path, report: Report
 ) -> None:

@@ -75,6 +75,7 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
     answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
     assert answer["fate"] == "done"
@@ -83,6 +84,7 @@ def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
+@pytest.mark.slow
 def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     running: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,18 +100,21 @@ def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
+@pytest.mark.slow
 def test_a_command_that_stays_in_force_says_how_to_end_it(running: str) -> None:
     held = rack("command", running, "upper", "hold").stdout.splitlines()
     assert held[1:] == [f"in force until: rack command {running} upper resume"]
     assert len(rack("command", running, "upper", "resume").stdout.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
     done = rack("command", running, "upper", "goto", "home")
     assert done.returncode == 1
     assert done.stdout.rstrip().endswith(": the way home is closed")
 
 
+@pytest.mark.slow
 def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
     rows = {
         row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)
@@ -150,6 +155,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "reason"), REFUSED.values(), ids=REFUSED)
 def test_bad_usage_is_one_line_and_status_2(
     running: str, words: tuple[str, ...], reason: str

@@ -52,6 +52,7 @@ def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
     assert first["notes"] == again["notes"] == []
 
 
+@pytest.mark.slow
 def test_entries_of_another_rack_are_refused_in_one_line(
     rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
 ) -> None:

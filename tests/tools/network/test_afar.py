@@ -218,6 +218,7 @@ def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far)
     )
 
 
+@pytest.mark.slow
 @REALTIME
 def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> None:
     segment = Segment.attach(far.name)

@@ -176,6 +176,7 @@ def test_a_level_that_computes_for_known_times_is_measured_to_have_taken_them(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("figure", ["realtime"], indirect=True)
 def test_a_preempted_planners_processor_time_is_without_its_executors(figure: Recording) -> None:
     plans = cycles_of(figure)["level.planner"].rows

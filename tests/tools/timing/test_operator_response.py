@@ -60,6 +60,7 @@ def test_every_command_of_a_run_comes_at_its_predicted_tick(
     assert all(picture.stat().st_size > 1000 for picture in pictures)
 
 
+@pytest.mark.slow
 def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Path) -> None:
     given = [
         CommandConfig(level="upper", what="goto", home=True, tick=50),
@@ -82,6 +83,7 @@ def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Pat
     )
 
 
+@pytest.mark.slow
 def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorResponse) -> None:
     late = replace(response.commands[0], acts=113)
     assert not replace(response, commands=(late,)).held
@@ -91,6 +93,7 @@ def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorRes
     assert replace(response, commands=(lost,), lockstep=False).beyond == [lost]
 
 
+@pytest.mark.slow
 def test_a_run_without_commands_has_no_response(config: MakeConfig, tmp_path: Path) -> None:
     recording = run_commands(config(), (), tmp_path / "run", 0.5)
     assert response_of(recording) is None

@@ -23,6 +23,7 @@ TICKS = 600
 BLOCK, PART = 40, 200
 
 
+@pytest.mark.slow
 def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
     small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

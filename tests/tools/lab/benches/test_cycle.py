@@ -122,6 +122,7 @@ def test_replayed_physics_end_in_the_recorded_state(
     assert min(times_us) > 0.0
 
 
+@pytest.mark.slow
 def test_physics_of_another_run_are_refused(tmp_path_factory: pytest.TempPathFactory) -> None:
     own = Replay.of(Recording(nasrem_run(tmp_path_factory)))
     short = replace(own, controls=own.controls[:20])

@@ -92,6 +92,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return slow_run(tmp_path_factory)
 
 
+@pytest.mark.slow
 def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
     report, text = write_report(folder)
     response = report["system_response"]
@@ -123,12 +124,14 @@ class Silent(Cut):
     lost: ClassVar[dict[str, int]] = {}
 
 
+@pytest.mark.slow
 def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(folder: Path) -> None:
     way = report_of(Cut(folder))["system_response"]["command"]
     assert (way["holds"], way["beyond"], way["unseen"]) == (True, [], 1)
     assert way["measured_ms"]["max"] == way["bound_ms"]
 
 
+@pytest.mark.slow
 def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
     recording = Silent(folder)
     recording.ended["faults"] = [
@@ -148,6 +151,7 @@ def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path
     assert "- 1112.5 ms from tick 760: fault: mute of upper" in text.splitlines()
 
 
+@pytest.mark.slow
 def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -> None:
     report, text = write_report(folder)
     for task in report["tasks"].values():
@@ -160,6 +164,7 @@ def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -
     assert "| residual min |" in realtime
 
 
+@pytest.mark.slow
 def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folder: Path) -> None:
     late = {
         "task": "lower",
@@ -181,6 +186,7 @@ def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folde
     assert "- the recorder lost rows: lower 4" in lossy.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 120])
 def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: int) -> None:
     report = {**write_report(folder)[0], "mode": "realtime"}
@@ -260,6 +266,7 @@ HELD = "nothing has moved for 30 s: elemental_move holds"
 TOUCHED = "level 'servo': unintended contact: 'post' touches 'link4' at 3.125 s"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("outcome", "headline"),
     [
@@ -274,6 +281,7 @@ def test_what_ended_a_run_or_is_latched_is_its_headline(
     assert text.splitlines()[0].endswith(f": {headline}")
 
 
+@pytest.mark.slow
 def test_limits_that_a_push_broke_stand_beside_those_that_the_arm_broke(folder: Path) -> None:
     motion = {
         "tracking_rms_mrad": 0.1,
@@ -285,6 +293,7 @@ def test_limits_that_a_push_broke_stand_beside_those_that_the_arm_broke(folder: 
     assert "limits exceeded in 0 substeps, by a push from outside in 7." in text
 
 
+@pytest.mark.slow
 def test_contacts_stand_with_the_arms_limits_and_the_forces_wanted(folder: Path) -> None:
     force = {
         "largest_force_n": 23.14,

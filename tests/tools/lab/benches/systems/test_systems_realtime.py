@@ -21,6 +21,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return Recording(nasrem_run(tmp_path_factory))
 
 
+@pytest.mark.slow
 def test_a_plan_is_visible_after_as_many_cycles_as_its_planner_has(recording: Recording) -> None:
     found = {plan.maker: plan for plan in plan_latencies(recording, cycles_of(recording))}
     # Without a miss: cycles times `within_cycles`.
@@ -33,6 +34,7 @@ def test_a_plan_is_visible_after_as_many_cycles_as_its_planner_has(recording: Re
         assert plan.computed_ms["min"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_board_counts_with_its_planner(recording: Recording) -> None:
     layout, ended = recording.layout, recording.ended
     ticks, tasks = ended["outcome"]["ticks"], ended["tasks"]
@@ -51,6 +53,7 @@ def test_a_board_counts_with_its_planner(recording: Recording) -> None:
     assert max(loads, key=lambda board: loads[board]) == "servo"
 
 
+@pytest.mark.slow
 def test_commands_age_until_the_lowest_level_reads_them(recording: Recording) -> None:
     timing = rack_timing(recording.rack_config, recording.layout)
     down, up = (ages_ms(recording, timing, down=down) for down in (True, False))
