@@ -74,9 +74,7 @@ class _ChainRuns:
     ) -> None:
         self.chain = chain
         self._settings = runs
-        self._grid = WakeGrid(
-            peers, round(1e9 / RATE_HZ), max(1, round(runs.seconds * RATE_HZ)), PRIORITY
-        )
+        self._grid = WakeGrid.at(peers, RATE_HZ, runs.seconds, PRIORITY)
         path = chain._replace(mode="lockstep").write(folder)
         self._runs: list[Observed] = []
         self._late: list[np.ndarray] = []

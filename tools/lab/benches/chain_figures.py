@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rack.tools.console.tables import decimal, table
-from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
-from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond, misses_count
+from rack.tools.lab.benches.chart import Diagram, Series, draw
+from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond, missed_by, misses_count
 from rack.tools.lab.benches.harness import Absent, BenchResult
 
 RATE_HZ = 400
@@ -138,15 +138,13 @@ class Boards(BenchResult):
                 yield f"lockstep, {tree}: {fit.words}"
 
     def _row(self, one: ChainFigures) -> list[str]:
-        late = None if one.late is None else 100 * one.late
-        shares = [decimal(100 * one.missed), decimal(late), decimal(100 * one.beyond)]
         cycles = ", ".join(map(str, sorted({*one.responses, *one.lockstep_responses})))
         costs = [one.lockstep_us[tree] for tree in self.trees]
         return [
             str(one.boards),
             decimal(one.processor_us, 1),
             decimal(one.processor_us / one.boards, 1),
-            *shares,
+            *one.cells(),
             "held" if one.held else "not held",
             f"{cycles}{'' if one.exact else ' INEXACT'}",
             *(decimal(cost, 1) for cost in costs),
@@ -160,14 +158,9 @@ class Boards(BenchResult):
         for tree in self.trees:
             found = [one.lockstep_us[tree] for one in self.chains]
             costs += _fitted(f"lockstep, {tree}", counts, found)
-        missed = [100 * one.missed for one in self.chains]
-        shares = [Series("boards: missed", counts, missed, "o-")]
-        if not self.absent:
-            late = [100 * (one.late or 0.0) for one in self.chains]
-            shares.append(Series("cyclictest: late by a cycle", counts, late, "s-", BASELINE))
         panels = (
             Diagram("", "boards", costs, "us a tick", is_linear=True),
-            Diagram("", "boards", shares, "% of the cycles"),
+            Diagram("", "boards", missed_by(counts, self.chains), "% of the cycles"),
         )
         return draw(folder / "boards", self.title, panels)
 

@@ -56,8 +56,7 @@ def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Compar
     samples = []
     for rate_hz in rates_hz:
         progress.begin(f"{rate_hz:g} Hz")
-        wakes = max(1, round(runs.seconds * rate_hz))
-        grid = WakeGrid((core,), round(1e9 / rate_hz), wakes, PRIORITY if is_fifo else 0)
+        grid = WakeGrid.at((core,), rate_hz, runs.seconds, PRIORITY if is_fifo else 0)
         turns = {who: partial(_attempt, who, one, grid) for who, one in contestants.items()}
         for who, found in interleaved(turns, runs.rounds).items():
             reasons = [late for late in found if isinstance(late, str)]

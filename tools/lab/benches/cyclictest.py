@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +20,8 @@ import numpy as np
 
 from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
+from rack.tools.console.tables import decimal
+from rack.tools.lab.benches.chart import BASELINE, Series
 from rack.tools.lab.benches.harness import Absent, absent_program
 
 CYCLICTEST = "cyclictest"
@@ -41,6 +43,12 @@ class WakeGrid:
     period_ns: int
     wakes: int
     priority: int
+
+    @classmethod
+    def at(cls, cores: Iterable[int], rate_hz: float, seconds: float, priority: int) -> WakeGrid:
+        """Return the points of a rate for a time."""
+        wakes = max(1, round(seconds * rate_hz))
+        return cls(tuple(sorted(cores)), round(1e9 / rate_hz), wakes, priority)
 
     @property
     def patience_s(self) -> float:
@@ -141,6 +149,21 @@ class MissesBeyond:
     def held(self) -> bool:
         """Whether the rate is held."""
         return self.beyond <= BEYOND
+
+    def cells(self, digits: int = 3) -> list[str]:
+        """Return cells of a table: shares missed, late, and missed beyond, %."""
+        late = None if self.late is None else 100 * self.late
+        return [decimal(part, digits) for part in (100 * self.missed, late, 100 * self.beyond)]
+
+
+def missed_by(places: Sequence[float], figures: Sequence[MissesBeyond]) -> list[Series]:
+    """Return the series of what was missed, and late of `cyclictest`, by rate or number."""
+    missed = [100 * one.missed for one in figures]
+    late = [100 * one.late for one in figures if one.late is not None]
+    series = [Series("rack: missed", places, missed, "o-")]
+    if late:
+        series.append(Series("cyclictest: late by a cycle", places, late, "s-", BASELINE))
+    return series
 
 
 def overdue(late_us: np.ndarray, period_ns: int) -> float:

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from rack.levels.timing.trace_times import counts
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.exchange_times import ExchangeTimes, exchange_times
 from rack.tools.lab.benches.hand_figures import HandBench, HandFigures, LinkFigures
+from rack.tools.lab.benches.harness import interleaved
 from rack.tools.lab.benches.observed import Recorded, record
 from rack.tools.live.interrupts import interrupts
 from rack.tools.recording.cycles import cycles_of
@@ -35,27 +37,22 @@ SETTLED_S = 0.3
 def measure(
     rounds: int, share: bool, progress: Progress, racks: Sequence[str] = RACKS
 ) -> HandBench:
-    """Run both racks by turns, in real time, then in lockstep; return their figures."""
-    progress.total(2 * len(racks) * rounds * (ABOUT_S + LAUNCH_S))
-    found: dict[tuple[str, str], list[Recorded]] = {
-        (rack, mode): [] for rack in racks for mode in MODES
-    }
+    """Run both racks in both modes by turns; return their figures."""
+    each_s = ABOUT_S + LAUNCH_S
+    progress.total(2 * len(racks) * rounds * each_s)
     with TemporaryDirectory(prefix="rack-bench-") as scratch:
-        for turn in range(rounds):
-            for rack in racks if turn % 2 == 0 else reversed(racks):
-                for mode in MODES:
-                    progress.begin(f"{rack}: {mode}, run {turn + 1} of {rounds}")
-                    ran = _run(rack, mode, Path(scratch) / f"{rack}-{turn}.{mode}", share)
-                    found[rack, mode].append(ran)
-                    progress.end(
-                        ABOUT_S + LAUNCH_S, "done" if ran.result.worked else ran.result.failure()
-                    )
-        return HandBench(tuple(_figures(rack, mode, ran) for (rack, mode), ran in found.items()))
+        runs = {
+            (rack, mode): partial(_run, rack, mode, scratch, share)
+            for mode in MODES
+            for rack in racks
+        }
+        found = interleaved(runs, rounds, progress, each_s)
+        return HandBench(tuple(_figures(*name, ran) for name, ran in found.items()))
 
 
-def _run(rack: str, mode: str, folder: Path, share: bool) -> Recorded:
+def _run(rack: str, mode: str, scratch: str, share: bool) -> Recorded:
     config = load(rack, [f"name=hand-{os.getpid()}", f"clock.mode={mode}", "clock.speed=1.0"])
-    return record(config, None, folder, share)
+    return record(config, None, Path(mkdtemp(dir=scratch)), share)
 
 
 def _figures(rack: str, mode: str, runs: Sequence[Recorded]) -> HandFigures:

@@ -162,12 +162,7 @@ class LanBench:
     def wake(self, count: int) -> None:
         """Measure how late this machine wakes `cyclictest` at the highest rate, on all cores."""
         rate_hz = max(self._runs.rates_hz)
-        grid = WakeGrid(
-            tuple(sorted(os.sched_getaffinity(0))),
-            round(1e9 / rate_hz),
-            self._cycles(rate_hz),
-            PRIORITY,
-        )
+        grid = WakeGrid.at(os.sched_getaffinity(0), rate_hz, self._runs.seconds, PRIORITY)
         self._note(Point("wake", count, rate_hz, CYCLICTEST, "us"), cyclictest(grid).tolist())
 
     def _note(self, point: Point, values: Sequence[float]) -> None:

@@ -4,10 +4,11 @@ interleaved."""
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from rack.levels.timing.trace_times import (
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import figure, table
+from rack.tools.lab.benches.harness import interleaved
 from rack.tools.lab.benches.observed import record
 from rack.tools.recording.recording import Recording
 
@@ -125,17 +127,21 @@ def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[
     figures."""
     config = load(name, [f"name=bench-{os.getpid()}"])
     racks = {partition: partition.of(config) for partition in PARTITIONS}
-    progress.total(len(racks) * rounds * (seconds + LAUNCH_S))
-    with tempfile.TemporaryDirectory() as folder:
-        runs: dict[Partition, list[Recording]] = {partition: [] for partition in racks}
-        for turn in range(rounds):
-            for number, (partition, rack) in enumerate(racks.items()):
-                progress.begin(f"{partition.name}, run {turn + 1} of {rounds}")
-                runs[partition].append(
-                    record(rack, seconds, Path(folder) / f"{number}-{turn}").recording
-                )
-                progress.end(seconds + LAUNCH_S)
-        return [_figures(partition, racks[partition], found) for partition, found in runs.items()]
+    each_s = seconds + LAUNCH_S
+    progress.total(len(racks) * rounds * each_s)
+    with TemporaryDirectory(prefix="rack-bench-") as scratch:
+        runs = {
+            partition.name: partial(_run, rack, seconds, scratch)
+            for partition, rack in racks.items()
+        }
+        found = interleaved(runs, rounds, progress, each_s)
+        return [
+            _figures(partition, rack, found[partition.name]) for partition, rack in racks.items()
+        ]
+
+
+def _run(rack: RackConfig, seconds: float, scratch: str) -> Recording:
+    return record(rack, seconds, Path(mkdtemp(dir=scratch))).recording
 
 
 def _figures(

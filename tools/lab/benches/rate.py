@@ -24,7 +24,7 @@ from rack.levels.timing.trace_times import Distribution, distribution, lateness_
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import decimal, figure, table
-from rack.tools.lab.benches.chart import BASELINE, Diagram, Series, draw
+from rack.tools.lab.benches.chart import Diagram, Series, draw
 from rack.tools.lab.benches.cyclictest import (
     BEYOND,
     CYCLICTEST,
@@ -32,6 +32,7 @@ from rack.tools.lab.benches.cyclictest import (
     WakeGrid,
     absent_cyclictest,
     cyclictest,
+    missed_by,
     misses_count,
     overdue,
 )
@@ -158,13 +159,11 @@ class Rates(BenchResult):
 
     @staticmethod
     def _row(one: RateFigures) -> list[str]:
-        late = None if one.late is None else 100 * one.late
-        shares = [decimal(100 * one.missed), decimal(late), decimal(100 * one.beyond)]
         late_us = [figure(one.lateness_us, name, 0) for name in ("p50", "p99")]
         return [
             f"{one.rate_hz:g}",
             str(one.cycles),
-            *shares,
+            *one.cells(),
             *late_us,
             decimal(one.processor_us, 0),
             one.verdict,
@@ -173,14 +172,10 @@ class Rates(BenchResult):
     def plot(self, folder: Path) -> list[Path]:
         """Write missed cycles and load by rate into `folder`; return the paths."""
         rates = [one.rate_hz for one in self.rates]
-        shares = [Series("rack: missed", rates, [100 * one.missed for one in self.rates], "o-")]
-        if not self.absent:
-            late = [100 * (one.late or 0.0) for one in self.rates]
-            shares.append(Series("cyclictest: late by a cycle", rates, late, "s-", BASELINE))
         loads = [one.processor_us * one.rate_hz * 1e-4 for one in self.rates]
         load = [Series("", rates, loads, "o-")]
         panels = (
-            Diagram("", "servo rate, Hz", shares, "% of the cycles"),
+            Diagram("", "servo rate, Hz", missed_by(rates, self.rates), "% of the cycles"),
             Diagram("", "servo rate, Hz", load, "processor time of a cycle, % of its period"),
         )
         return draw(folder / "rate", self.title, panels)
@@ -199,9 +194,7 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     for rate_hz, rack in racks.items():
         progress.begin(f"{rate_hz:g} Hz")
         priority = config.board[board].priority or 1
-        grid = WakeGrid(
-            (core,), round(1e9 / rate_hz), max(1, round(runs.seconds * rate_hz)), priority
-        )
+        grid = WakeGrid.at((core,), rate_hz, runs.seconds, priority)
         ran: list[Observed] = []
         late: list[np.ndarray] = []
         for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), runs.rounds):

@@ -240,9 +240,7 @@ def _late(found: Systems, width: int | None) -> Iterator[str]:
     for one in found.systems:
         ran = one.realtime
         rates = one.predicted.rates_hz
-        late = None if ran.late is None else 100 * ran.late
-        shares = (decimal(part, 2) for part in (100 * ran.missed, late, 100 * ran.beyond))
-        rows.append([one.rack, f"{max(rates):.4g}" if rates else "-", *shares])
+        rows.append([one.rack, f"{max(rates):.4g}" if rates else "-", *ran.cells(2)])
     yield from table(head, rows, width)
 
 
