@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +10,7 @@ import typer
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, config_names
-from rack.tools.lab.benches.harness import print_found, show
+from rack.tools.lab.benches.harness import show
 from rack.tools.lab.benches.options import (
     Against,
     Config,
@@ -120,8 +119,7 @@ def switch(as_json: Json = False) -> None:
     """
     from rack.tools.lab.benches.switch import measure
 
-    cost = measure()
-    print_found(asdict(cost), cost.lines(), as_json)
+    show(lambda progress: measure(), None, as_json)
 
 
 @bench.command()
@@ -141,19 +139,9 @@ def partition(
     after another. The output shows misses, residuals and plan ages, and next to them the timing
     model's predictions from the budgets of the config.
     """
-    from rack.tools.console.progress import progress_for
-    from rack.tools.console.tables import terminal_width
-    from rack.tools.lab.benches.partition import compare, lines_of
+    from rack.tools.lab.benches.partition import measure
 
-    with progress_for(as_json) as progress:
-        found = compare(config, seconds, rounds, progress)
-    document = {
-        "config": config,
-        "seconds": seconds,
-        "rounds": rounds,
-        "partitions": [asdict(p) for p in found],
-    }
-    print_found(document, lines_of(found, terminal_width()), as_json)
+    show(lambda progress: measure(config, seconds, rounds, progress), None, as_json)
 
 
 @bench.command()

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from importlib import import_module
@@ -78,18 +78,16 @@ def show(measure: Callable[[Progress], Found], plot: Path | None, as_json: bool)
 
     with progress_for(as_json) as progress:
         found = measure(progress)
-    print_found(found.document(), found.lines(terminal_width()), as_json)
+    if as_json:
+        print_json(found.document())
+    else:
+        print_wrapped("\n".join(found.lines(terminal_width())))
     if plot is not None:
         plot.mkdir(parents=True, exist_ok=True)
         paths = found.plot(plot)
         if not as_json:
             print(f"pictures: {', '.join(map(str, paths))}")
     return found
-
-
-def print_found(document: dict[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    """Print what was found: for people, or as one JSON document."""
-    print_json(document) if as_json else print_wrapped("\n".join(lines))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from rack.levels.timing.trace_times import (
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import figure, table
-from rack.tools.lab.benches.harness import interleaved
+from rack.tools.lab.benches.harness import BenchResult, interleaved
 from rack.tools.lab.benches.observed import record
 from rack.tools.recording.recording import Recording
 
@@ -122,7 +122,53 @@ class PartitionFigures:
     levels: tuple[LevelFigures, ...]
 
 
-def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[PartitionFigures]:
+@dataclass(frozen=True)
+class Partitions(BenchResult):
+    """The measurements of all partitions of a rack."""
+
+    name = "partition"
+
+    config: str
+    seconds: float
+    rounds: int
+    partitions: tuple[PartitionFigures, ...]
+
+    def lines(self, width: int | None = None) -> Iterator[str]:
+        """Yield two tables for people, fitted to `width`: executors, and planners with their plan
+        ages; times in ms."""
+        levels = [(one.partition, level) for one in self.partitions for level in one.levels]
+        planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
+        yield "executors: predicted worst-case response, and residual, ms"
+        head = [
+            "partition",
+            "level",
+            "cycle",
+            "predicted",
+            "cycles",
+            "missed",
+            "skipped",
+            "residual p50",
+            "residual min",
+        ]
+        yield from table(
+            head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50")
+        )
+        yield ""
+        yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
+        head = [
+            "partition",
+            "level",
+            "slice",
+            "predicted",
+            "plans",
+            "late",
+            "residual p50",
+            "residual min",
+        ]
+        yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
+
+
+def measure(name: str, seconds: float, rounds: int, progress: Progress) -> Partitions:
     """Run every partition of a rack `rounds` times for `seconds`, interleaved, and return the
     figures."""
     config = load(name, [f"name=bench-{os.getpid()}"])
@@ -135,9 +181,8 @@ def compare(name: str, seconds: float, rounds: int, progress: Progress) -> list[
             for partition, rack in racks.items()
         }
         found = interleaved(runs, rounds, progress, each_s)
-        return [
-            _figures(partition, rack, found[partition.name]) for partition, rack in racks.items()
-        ]
+        figures = (_figures(each, rack, found[each.name]) for each, rack in racks.items())
+        return Partitions(name, seconds, rounds, tuple(figures))
 
 
 def _run(rack: RackConfig, seconds: float, scratch: str) -> Recording:
@@ -198,41 +243,6 @@ def _task(
         if task.name in responses
         else None,
     )
-
-
-def lines_of(found: Sequence[PartitionFigures], width: int | None = None) -> Iterator[str]:
-    """Yield two tables for people, fitted to `width`: executors, and planners with their plan ages;
-    times in ms."""
-    levels = [(one.partition, level) for one in found for level in one.levels]
-    planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
-    yield "executors: predicted worst-case response, and residual, ms"
-    head = [
-        "partition",
-        "level",
-        "cycle",
-        "predicted",
-        "cycles",
-        "missed",
-        "skipped",
-        "residual p50",
-        "residual min",
-    ]
-    yield from table(
-        head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50")
-    )
-    yield ""
-    yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
-    head = [
-        "partition",
-        "level",
-        "slice",
-        "predicted",
-        "plans",
-        "late",
-        "residual p50",
-        "residual min",
-    ]
-    yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
 
 
 def _executor_row(partition: str, level: LevelFigures) -> list[str]:

@@ -26,6 +26,7 @@ import posix_ipc
 from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.levels.timing.trace_times import Distribution, distribution
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.harness import BenchResult
 
 PAPER_US = 100.0
 """Task switch on NIST's boards (NISTIR 90-4251, section 4)."""
@@ -40,11 +41,13 @@ READY_S = 20.0
 
 
 @dataclass(frozen=True)
-class SwitchCost:
+class SwitchCost(BenchResult):
     """Times in us over `wakes` wake-ups on `core`.
 
     `in_us` is from planner to executor, `out_us` back; `switch_us`, t_cs, is half of both together.
     """
+
+    name = "switch"
 
     core: int
     wakes: int
@@ -53,7 +56,7 @@ class SwitchCost:
     switch_us: Distribution
     paper_us: float = PAPER_US
 
-    def lines(self) -> Iterator[str]:
+    def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as text for people."""
         yield (
             f"context switch on core {self.core}, us; an executor preempted its planner"

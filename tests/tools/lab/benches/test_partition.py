@@ -10,7 +10,7 @@ from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.partition import PARTITIONS, Partition, compare, lines_of
+from rack.tools.lab.benches.partition import PARTITIONS, Partition, measure
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
 
@@ -58,9 +58,11 @@ def test_a_board_that_polls_cannot_share_the_only_core() -> None:
 def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> None:
     path = tmp_path / "waves.toml"
     path.write_text(PLANNED)
-    found = compare(str(path), 0.3, 1, Progress())
-    assert [one.partition for one in found] == [partition.name for partition in PARTITIONS]
-    for one in found:
+    found = measure(str(path), 0.3, 1, Progress())
+    assert [one.partition for one in found.partitions] == [
+        partition.name for partition in PARTITIONS
+    ]
+    for one in found.partitions:
         wave, watch = one.levels
         assert (wave.level, watch.level) == ("wave", "watch")
         assert 0 < wave.executor.cycles <= 120
@@ -71,10 +73,10 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
         assert wave.plan_age_ms["min"] >= 10.0
         assert watch.planner is None
         assert wave.executor.fits is None
-    lines = list(lines_of(found))
+    lines = list(found.lines())
     assert sum("watch" in line for line in lines) == len(PARTITIONS)
     assert sum("wave" in line for line in lines) == 2 * len(PARTITIONS)
-    assert max(map(len, lines_of(found, 80))) <= 80
+    assert max(map(len, found.lines(80))) <= 80
 
 
 @pytest.mark.slow
@@ -82,8 +84,8 @@ def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> No
 @needs_two_cores
 @pytest.mark.alone
 def test_predictions_from_budgets_agree_with_measurements() -> None:
-    measured = compare("fig3", 0.6, 1, Progress())
-    found = {one.partition: one.levels[0] for one in measured}
+    measured = measure("fig3", 0.6, 1, Progress())
+    found = {one.partition: one.levels[0] for one in measured.partitions}
     tight, loose = found["tight, 2 cores"].planner, found["loose, 2 cores"].planner
     assert tight is not None
     assert loose is not None
@@ -93,4 +95,4 @@ def test_predictions_from_budgets_agree_with_measurements() -> None:
     assert tight.cycles > 5
     assert tight.missed >= tight.cycles - 1
     assert loose.missed < loose.cycles / 2
-    assert any("FAILS" in line for line in lines_of(measured))
+    assert any("FAILS" in line for line in measured.lines())

@@ -4,17 +4,15 @@ partitions."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 
 from rack.boards.config import load, loads
 from rack.levels.timing.equations import response_ticks
 from rack.tools.console.progress import Progress
+from rack.tools.lab.benches import partition, switch
 from rack.tools.lab.benches.boards import responses_of
 from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.observed import observe
-from rack.tools.lab.benches.partition import PARTITIONS, compare
 from rack.tools.lab.benches.response import ResponseRuns
-from rack.tools.lab.benches.switch import PERIOD_S, WAKES, measure
 from rack.tools.lab.reproduction.experiments.experiment import (
     PICTURES,
     Document,
@@ -37,11 +35,15 @@ NAME = "nasrem"
 
 def _switch(workshop: Workshop) -> Document:
     need_real_time(cores=2)
-    return asdict(measure())
+    return switch.measure().document()
 
 
 SWITCH = Experiment(
-    "switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, lambda: {"wakes": WAKES}, _switch
+    "switch",
+    "the context switch",
+    switch.WAKES * switch.PERIOD_S + LAUNCH_S,
+    lambda: {"wakes": switch.WAKES},
+    _switch,
 )
 
 
@@ -87,16 +89,13 @@ RESPONSE = Experiment(
 
 def _partition(workshop: Workshop) -> Document:
     need_real_time(cores=2)
-    return {
-        "seconds": PARTITION_S,
-        "partitions": [asdict(one) for one in compare(NAME, PARTITION_S, 1, Progress())],
-    }
+    return partition.measure(NAME, PARTITION_S, 1, Progress()).document()
 
 
 PARTITION = Experiment(
     "partition",
     "nasrem with its planners on one core and on two",
-    len(PARTITIONS) * (PARTITION_S + LAUNCH_S),
+    len(partition.PARTITIONS) * (PARTITION_S + LAUNCH_S),
     lambda: {"config": load(NAME).text(), "seconds": PARTITION_S},
     _partition,
 )
