@@ -3,12 +3,20 @@ has its reason."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.partition import (
+    LevelFigures,
+    PartitionFigures,
+    Partitions,
+    TaskFigures,
+)
+from rack.tools.lab.benches.switch import SwitchCost
 from rack.tools.lab.reproduction.experiments.experiment import KEPT, Workshop
 from rack.tools.lab.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
 from rack.tools.lab.reproduction.sections import application, model, opening, time
@@ -131,6 +139,38 @@ def test_state_tables_must_answer_the_disturbance() -> None:
     ignored = {"nist-state-table": {"disturbed": task("pick"), "undisturbed": task("pick")}}
     assert judged(application.CHAPTER, "state-tables", answered).ruling is Ruling.HOLDS
     assert judged(application.CHAPTER, "state-tables", ignored).ruling is Ruling.FAILS
+
+
+TIMES = {"min": 4.0, "p50": 5.0, "p99": 9.0, "p99_9": 9.0, "max": 12.0}
+
+
+def test_the_context_switch_is_compared_with_the_papers() -> None:
+    found = {"switch": SwitchCost(1, 1000, TIMES, TIMES, TIMES).document()}
+    tested = judged(application.CHAPTER, "context-switch", json.loads(json.dumps(found)))
+    assert tested.ruling is Ruling.BOUNDED
+    assert "takes 5 us, 20.0 times less" in tested.why
+
+
+@pytest.mark.parametrize(
+    ("slow", "fast", "ruling"),
+    [(0, 0, Ruling.BOUNDED), (0, 50, Ruling.HOLDS), (50, 50, Ruling.FAILS)],
+    ids=["nobody needs more", "fast levels need more", "slow levels need more"],
+)
+def test_partitions_are_judged_by_what_slow_and_fast_levels_miss(
+    slow: int, fast: int, ruling: Ruling
+) -> None:
+    def figures(partition: str, missed: dict[str, int]) -> PartitionFigures:
+        levels = (
+            LevelFigures(level, TaskFigures(1.0, 100, bad, 0, None, None, None), None, None)
+            for level, bad in missed.items()
+        )
+        return PartitionFigures(partition, tuple(levels))
+
+    tight = figures("tight, 1 core", {"task": slow, "servo": fast})
+    loose = figures("loose, 2 cores", {"task": slow, "servo": 0})
+    found = {"partition": Partitions("nasrem", 4.0, 1, (tight, loose)).document()}
+    plain = json.loads(json.dumps(found))
+    assert judged(application.CHAPTER, "figure-5", plain).ruling is ruling
 
 
 def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     Workshop,
     kept,
     made,
+    program_files,
 )
 
 
@@ -95,3 +96,9 @@ def test_what_a_result_depends_on_stands_next_to_it(workshop: Workshop) -> None:
     assert document["depends"] == json.loads(json.dumps(one.depends()))
     assert {"inputs", "program", "machine"} <= set(document["depends"])
     assert isinstance(found, Kept)
+
+
+def test_results_depend_on_the_program_but_not_on_what_writes_the_page() -> None:
+    folders = {path.parent.name for path in program_files()}
+    assert {"mailbox", "servo", "benches", "experiments", "configs"} <= folders
+    assert not {"reproduction", "sections"} & folders

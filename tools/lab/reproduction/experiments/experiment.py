@@ -13,7 +13,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -205,16 +205,19 @@ def need_real_time(cores: int = 1) -> None:
 
 @cache
 def program() -> str:
-    """Return a checksum of the program and its configs, without what only writes the page."""
-    page = PROGRAM / "tools" / "reproduction"
+    """Return a checksum of the program and its configs."""
     digest = xxhash.xxh3_64()
-    for floor in FLOORS:
-        for path in sorted((PROGRAM / floor).rglob("*")):
-            if (
-                path.suffix in (".py", ".toml", ".xml")
-                and path.parent not in (page, page / "sections")
-                and path.is_file()
-            ):
-                digest.update(str(path.relative_to(PROGRAM)).encode())
-                digest.update(path.read_bytes())
+    for path in program_files():
+        digest.update(str(path.relative_to(PROGRAM)).encode())
+        digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def program_files() -> Iterator[Path]:
+    """Yield the files that results depend on: without those that only write the page."""
+    page = Path(__file__).resolve().parents[1]
+    for floor in FLOORS:
+        for path in sorted((PROGRAM / floor).rglob("*.*")):
+            is_source = path.suffix in (".py", ".toml", ".xml") and path.is_file()
+            if is_source and path.parent not in (page, page / "sections"):
+                yield path

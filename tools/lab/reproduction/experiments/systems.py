@@ -31,9 +31,7 @@ def system_experiment(name: str) -> Experiment:
 
 
 def _run(name: str, workshop: Workshop) -> Document:
-    found = measure([name], Runs(SECONDS, 1, workshop.share), Progress())
-    plain: Document = TypeAdapter(Systems).dump_python(found, mode="json")
-    return plain
+    return measure([name], Runs(SECONDS, 1, workshop.share), Progress()).document()
 
 
 def systems_of(found: Iterable[Document]) -> Systems:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from rack.boards.config import RackConfig, load
-from rack.tools.lab.benches.switch import PAPER_US
+from rack.tools.lab.benches.partition import LevelFigures, Partitions
+from rack.tools.lab.benches.switch import PAPER_US, SwitchCost
 from rack.tools.lab.reproduction.experiments import tables
-from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.measured import PARTITION, SWITCH
 from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
 from rack.tools.lab.reproduction.experiments.tables import TABLES
@@ -195,29 +196,29 @@ def _switch(workshop: Workshop) -> Side:
 
 
 def _switch_tested(findings: Findings) -> Assessment:
-    found = findings[SWITCH.name]
+    found = findings.record(SWITCH.name, SwitchCost)
     names = {
-        "in_us": "planner to executor",
-        "out_us": "executor to planner",
-        "switch_us": "t<sub>cs</sub>, half of both",
+        "planner to executor": found.in_us,
+        "executor to planner": found.out_us,
+        "t<sub>cs</sub>, half of both": found.switch_us,
     }
     rows = [
-        (name, *(f"{found[key][part]:.1f}" for part in ("min", "p50", "p99", "max")))
-        for key, name in names.items()
+        (name, *(f"{times[part]:.1f}" for part in ("min", "p50", "p99", "max")))
+        for name, times in names.items()
     ]
     side = Side.of(
         Columns(
             ("us", "least", "median", "99th percentile", "longest"),
             rows,
-            f"Of {found['wakes']} switches.",
+            f"Of {found.wakes} switches.",
         )
     )
-    median = found["switch_us"]["p50"]
+    median = found.switch_us["p50"]
     assumed = 1e3 * load(NAME).timing.context_switch_ms
     why = (
         "NIST's 68020 boards cannot be measured any more. On this machine a switch takes"
         f" {median:.0f} us, {PAPER_US / median:.1f} times less than theirs; the 99th percentile,"
-        f" {found['switch_us']['p99']:.0f} us, compares with the {assumed:g} us of the config."
+        f" {found.switch_us['p99']:.0f} us, compares with the {assumed:g} us of the config."
     )
     return Assessment(side, Ruling.BOUNDED, why)
 
@@ -238,7 +239,7 @@ def _figure5(workshop: Workshop) -> Side:
 
 def _figure5_tested(findings: Findings) -> Assessment:
     """Compare partitions: do slow levels do with multitasking, and do fast ones need more?"""
-    found = findings[PARTITION.name]["partitions"]
+    found = findings.record(PARTITION.name, Partitions)
     slow = {
         one.level
         for one in figure5.placed(load(NAME))
@@ -246,15 +247,14 @@ def _figure5_tested(findings: Findings) -> Assessment:
     }
     rows = []
     missed = {kind: [0, 0] for kind in ("slow", "fast", "apart")}
-    for partition in found:
-        is_tight = partition["partition"].startswith("tight")
-        for level in partition["levels"]:
-            rows.append(_partition_row(partition["partition"], level))
-            fast = "fast" if is_tight else "apart"
-            counts = missed["slow" if level["level"] in slow else fast]
-            for task in filter(None, (level["executor"], level["planner"])):
-                counts[0] += task["missed"] + task["skipped"]
-                counts[1] += task["cycles"]
+    for one in found.partitions:
+        fast = "fast" if one.partition.startswith("tight") else "apart"
+        for level in one.levels:
+            rows.append(_partition_row(one.partition, level))
+            counts = missed["slow" if level.level in slow else fast]
+            for task in filter(None, (level.executor, level.planner)):
+                counts[0] += task.missed + task.skipped
+                counts[1] += task.cycles
     head = (
         "partition",
         "level",
@@ -265,10 +265,7 @@ def _figure5_tested(findings: Findings) -> Assessment:
         "late",
         "plan's age, ms, longest",
     )
-    words = (
-        f"Each partition ran {code(NAME)} for {findings[PARTITION.name]['seconds']:g} s in real"
-        " time."
-    )
+    words = f"Each partition ran {code(NAME)} for {found.seconds:g} s in real time."
     side = Side.of(Columns(head, rows, words))
     shares = {region: bad / all_ if all_ else 0.0 for region, (bad, all_) in missed.items()}
     said = (
@@ -290,23 +287,20 @@ def _figure5_tested(findings: Findings) -> Assessment:
     )
 
 
-def _partition_row(partition: str, level: Document) -> tuple[str, ...]:
-    executor = level["executor"]
-    planner = level["planner"]
-    age = level["plan_age_ms"]
-    fits = [
-        task["fits"]
-        for task in (executor, planner)
-        if task is not None and task["fits"] is not None
-    ]
+def _partition_row(partition: str, level: LevelFigures) -> tuple[str, ...]:
+    executor = level.executor
+    planner = level.planner
+    age = level.plan_age_ms
+    fits = [task.fits for task in filter(None, (executor, planner)) if task.fits is not None]
+    verdict = "yes" if all(fits) else "NO"
     return (
         partition,
-        level["level"],
-        "-" if not fits else "yes" if all(fits) else "NO",
-        str(executor["cycles"]),
-        str(executor["missed"] + executor["skipped"]),
-        "-" if planner is None else str(planner["cycles"]),
-        "-" if planner is None else str(planner["missed"]),
+        level.level,
+        verdict if fits else "-",
+        str(executor.cycles),
+        str(executor.missed + executor.skipped),
+        "-" if planner is None else str(planner.cycles),
+        "-" if planner is None else str(planner.missed),
         "-" if age is None else f"{age['max']:g}",
     )
 

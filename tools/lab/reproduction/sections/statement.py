@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
+
+from pydantic import TypeAdapter
 
 from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Kept, Workshop
 from rack.tools.lab.reproduction.sections.page import (
@@ -15,6 +18,8 @@ from rack.tools.lab.reproduction.sections.page import (
     text,
 )
 
+_Record = TypeVar("_Record")
+
 
 @dataclass(frozen=True)
 class Findings:
@@ -25,6 +30,10 @@ class Findings:
 
     def __getitem__(self, name: str) -> Document:
         return self.found[name]
+
+    def record(self, name: str, kind: type[_Record]) -> _Record:
+        """Return what an experiment has found as the record that it was written from."""
+        return TypeAdapter(kind).validate_python(self.found[name])
 
 
 @dataclass(frozen=True)
