@@ -21,6 +21,7 @@ from rack.tools.faults.campaigns.trial import Killer
 from rack.tools.faults.ending import Strike, strikes
 from rack.tools.faults.evidence import BRAKES
 from rack.tools.lab.benches.harness import Sample
+from rack.tools.lab.benches.observed import endless
 
 DETECTED = "detected"
 SAFE = "brakes engaged"
@@ -58,10 +59,7 @@ def run_killing(
 ) -> KilledRun:
     """Run a rack that no board ends, killed by the faults of its config and by `kills` from
     outside."""
-    boards = {
-        name: table.model_copy(update={"ends_run": False}) for name, table in config.board.items()
-    }
-    with Rack(config.model_copy(update={"board": boards}), share=share) as rack:
+    with Rack(endless(config), share=share) as rack:
         killer = Killer(rack.segment, kills)
         rack.start(seconds)
         began_ns = time.monotonic_ns()

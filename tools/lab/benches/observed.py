@@ -57,6 +57,14 @@ def record(
     return Recorded(result, Recording(folder))
 
 
+def endless(config: RackConfig) -> RackConfig:
+    """Return a rack that no board ends."""
+    boards = {
+        name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
+    }
+    return config.model_copy(update={"board": boards})
+
+
 class Deed(NamedTuple):
     """Something that the host side does to a rack in lockstep, exactly before `tick`."""
 

@@ -37,7 +37,7 @@ from rack.tools.lab.benches.cyclictest import (
     overdue,
 )
 from rack.tools.lab.benches.harness import Absent, BenchResult, turns
-from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
+from rack.tools.lab.benches.observed import Observed, Runs, endless, missed_share, observe
 
 RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
 STEP_MS = 0.5
@@ -62,18 +62,11 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
     period_ms = 1e3 / rate_hz
     scale = config.clock.period_ms / period_ms
     boards = {}
-    for name, board in config.board.items():
-        changes: dict[str, Any] = {
-            "rate_hz": None,
-            "every": max(1, round(config.every(name) * scale)),
-        }
+    for name, board in endless(config).board.items():
+        changes: dict[str, Any] = {"every": max(1, round(config.every(name) * scale))}
         if name in fastest:
-            changes = {
-                "rate_hz": None,
-                "every": 1,
-                "within_cycles": max(1, round(board.within_cycles * scale)),
-            }
-        boards[name] = board.model_copy(update={**changes, "ends_run": False})
+            changes = {"every": 1, "within_cycles": max(1, round(board.within_cycles * scale))}
+        boards[name] = board.model_copy(update={**changes, "rate_hz": None})
     robot = config.robot
     if robot is not None:
         # Rounded: 2.5 ms / 0.5 ms must be 5, whatever the last bit says.

@@ -23,6 +23,7 @@ from rack.levels.timing.trace_times import counts, lateness_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
+from rack.tools.lab.benches.observed import endless
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
@@ -47,13 +48,9 @@ def measure(name: str, progress: Progress) -> Comparison:
     Raises `Failure` if the rack ends early or a recorder cannot attach.
     """
     config = load(name, [f"name=bench-{os.getpid()}", "clock.mode=realtime"])
-    boards = {
-        name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
-    }
     each_s = READINGS + SETTLE_S
     progress.total(ROUNDS * len(PHASES) * each_s)
-    endless = config.model_copy(update={"board": boards})
-    with TemporaryDirectory(prefix="rack-bench-") as folder, Rack(endless) as rack:
+    with TemporaryDirectory(prefix="rack-bench-") as folder, Rack(endless(config)) as rack:
         rack.start()
         # The fastest task first: its lateness is shown.
         tasks = sorted(rack.segment.layout.tasks, key=lambda task: task.every)

@@ -2,48 +2,34 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import time
-from typing import Any
 
 import numpy as np
 
 from rack.backplane.memory import lock_memory
-from rack.backplane.process import die_with_parent, pin, set_priority
-from rack.tools.console.answer import Failure
+from rack.backplane.process import pin, set_priority
+from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.cyclictest import WakeGrid
 
 HEAD_START_NS = 50_000_000
 
 
 def sleep_loop(grid: WakeGrid) -> np.ndarray:
-    """Return the lateness of every wake, us, shape (n,). Raises `Failure` if the process does not
-    finish.
+    """Return the lateness of every wake, us, shape (n,). Raises `Failure`.
 
     `time.sleep` is `clock_nanosleep` until a point of CLOCK_MONOTONIC. Like a board that is late,
     it skips the points that have passed.
     """
-    spawn = multiprocessing.get_context("spawn")
-    late_ns = spawn.RawArray("q", [-1] * grid.wakes)
-    process = spawn.Process(target=_sleep, args=(os.getpid(), grid, late_ns), daemon=True)
-    process.start()
-    try:
-        process.join(grid.patience_s)
-        if process.exitcode:
-            raise Failure(f"the loop of clock_nanosleep ended: exit status {process.exitcode}")
-    finally:
-        process.kill()
-        process.join()
-    found = np.array(late_ns)
+    found = np.array(apart(measure, grid))
     return found[found >= 0] * 1e-3
 
 
-def _sleep(parent: int, grid: WakeGrid, late_ns: Any) -> None:
-    die_with_parent(parent)
+def measure(grid: WakeGrid) -> list[int]:
+    """Sleep to every point, in a process of its own; return how late, ns; -1: skipped."""
     pin(grid.cores[0])
     set_priority(grid.priority)
     lock_memory()
+    late_ns = [-1] * grid.wakes
     period = grid.period_ns
     monotonic_ns = time.monotonic_ns
     sleep = time.sleep
@@ -56,3 +42,4 @@ def _sleep(parent: int, grid: WakeGrid, late_ns: Any) -> None:
         late = monotonic_ns() - due
         late_ns[at] = late
         at += 1 + max(late, 0) // period
+    return late_ns
