@@ -249,7 +249,9 @@ def costs(found: Found, baseline: str | None) -> CycleCosts:
         _sample(*one, (trace.rows["processor_ns"] * 1e-3 for trace in found.traces[one]))
         for one in order
     ]
-    parts = [BoardParts(*one, _medians(found.traces[one])) for one in order]
+    # A single cycle has no parts: the record of the next one has its bookkeeping.
+    long = [one for one in order if any(len(trace.rows) > 1 for trace in found.traces[one])]
+    parts = [BoardParts(*one, _medians(found.traces[one])) for one in long]
     shares = [
         _sample(SHARE, who, found.shares_us[who]) for who in sorted(found.shares_us, key=_is_other)
     ]

@@ -80,6 +80,15 @@ def test_without_another_checkout_only_physics_give_a_ratio() -> None:
     }
 
 
+def test_a_single_cycle_has_no_parts_and_is_not_drawn(tmp_path: Path) -> None:
+    found = given()
+    found.traces["task, real time", "this tree"] = [trace(50, cycles=1)]
+    bench = costs(found, None)
+    assert [one.case for one in bench.parts] == ["servo, real time"]
+    assert bench.comparison.sample("task, real time", "this tree") is not None
+    assert all(path.stat().st_size for path in bench.plot(tmp_path))
+
+
 @pytest.mark.slow
 def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> None:
     found = measure(None, 0.6, 1, Progress(), share=True)
