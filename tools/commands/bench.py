@@ -39,7 +39,7 @@ def mailbox(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure a message, written and read, next to other ways of inter-process communication.
+    """What does a message cost, next to pipes, iceoryx2, zenoh?
 
     Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2, pipes
     and queues of multiprocessing, and zenoh. The ratio is to the best of these peers. A raw copy is
@@ -61,7 +61,7 @@ def cycle(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the processor time of a board's cycle, by part.
+    """What does a board's cycle cost, part by part?
 
     Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns
     with another checkout. The servo board is also compared with bare mj_step calls: the physics of
@@ -84,7 +84,7 @@ def lockstep(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how fast nasrem, k1607 and fig4 run in lockstep.
+    """How fast do nasrem, k1607 and fig4 run in lockstep?
 
     Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one
     process without a rack. Its messages must be those of the rack, bit for bit. TREE runs in its
@@ -98,7 +98,7 @@ def lockstep(
 
 @bench.command()
 def recording(config: Config = "nasrem", plot: Plot = None, as_json: Json = False) -> None:
-    """Measure the cost of recording: lateness, misses, processor time.
+    """What does recording cost: lateness, misses, processor time?
 
     One rack runs without a recorder, with one, and with a live viewer, by turns; ratios are to
     without.
@@ -110,7 +110,7 @@ def recording(config: Config = "nasrem", plot: Plot = None, as_json: Json = Fals
 
 @bench.command()
 def switch(as_json: Json = False) -> None:
-    """Measure the context switch t_cs of eqs 3.8 and 3.9.
+    """What does a context switch cost, t_cs of eqs 3.8 and 3.9?
 
     On the paper's 68020 boards it took 100 us. An executor of real-time priority wakes up on the
     core of a busy planner, as on a board with both. The times are those from the planner's last
@@ -133,11 +133,10 @@ def partition(
     ] = 2,
     as_json: Json = False,
 ) -> None:
-    """Compare four partitions of a rack.
+    """Which layout: planners tight or loose, on one core or two?
 
-    Its planners are coupled tightly or loosely, on one core or two. The runs are in real time, one
-    after another. The output shows misses, residuals and plan ages, and next to them the timing
-    model's predictions from the budgets of the config.
+    Each of the four partitions runs in real time, by turns. The output shows misses, residuals and
+    plan ages, and next to them the timing model's predictions from the budgets of the config.
     """
     from rack.tools.lab.benches.partition import measure
 
@@ -167,7 +166,7 @@ def response(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the response to an operator, from command to torque.
+    """How soon does an operator's command act on the torque?
 
     Racks run one after another, with holds and resumes at random ticks, at every level in turn; the
     response is compared with its bounds R_s. In lockstep each command must act at the predicted
@@ -194,7 +193,7 @@ def clock(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how late a board starts its cycle.
+    """How late does a board start its cycle on this machine?
 
     Lateness is the time from grid point to start. An empty board waits in each of the ways that a
     config permits. By turns with it, on the same core at the same rate and priority: `cyclictest`,
@@ -224,7 +223,7 @@ def rate(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Find the highest servo rate that a rack holds.
+    """What servo rate does a rack hold on this machine?
 
     The board that cycles at every tick runs at each rate in turn; the other levels keep their
     rates. A rate is held if at most 0.1 % of its cycles are missed beyond those that `cyclictest`
@@ -255,12 +254,12 @@ def boards(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure what empty boards cost by their number.
+    """What does each additional board cost?
 
-    They pass a message down a chain at 400 Hz on all cores. The output shows processor time a tick,
-    missed cycles next to those of `cyclictest`, and the cycles that a message takes: as many as
-    there are boards. In lockstep it shows the time of a tick, with --against also that of another
-    checkout. Exit status 1 if a message took another time.
+    Empty boards pass a message down a chain at 400 Hz on all cores. The output shows processor time
+    a tick, missed cycles next to those of `cyclictest`, and the cycles that a message takes: as
+    many as there are boards. In lockstep it shows the time of a tick, with --against also that of
+    another checkout. Exit status 1 if a message took another time.
     """
     from rack.tools.lab.benches.boards import COUNTS, measure
     from rack.tools.lab.benches.chain import LONGEST
@@ -286,7 +285,7 @@ def launch(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure what a user waits for: launches, short commands, and the reaction to a killed board.
+    """How long do launches, commands and reactions take?
 
     A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to
     the checkout given by --against. The ratio of a short command is to a Python that imports numpy
@@ -320,7 +319,7 @@ def systems(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Compare racks with each other: what their configs promise, and what their runs show.
+    """What do racks promise, and what do their runs show?
 
     Without CONFIG these are nasrem and the bundled racks that model other systems: about four
     minutes on two quiet cores, 25 seconds a rack.
@@ -368,7 +367,7 @@ def hand(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Compare table-driven buffers with interrupt-driven messages, on the same hand.
+    """Buffers by tables, or messages by interrupts, for a hand?
 
     The racks hic and condor grasp a can, keep it while it is pulled, and release it, by turns. In
     real time, then in lockstep, where everything is exact: what the workstation of condor sent in
@@ -399,7 +398,7 @@ def lan(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure racks that exchange messages over a network.
+    """What does exchange over a network cost?
 
     A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: a
     network namespace (root only). By turns with a rack's network link, with TLS and without: bare
