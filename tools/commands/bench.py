@@ -11,16 +11,42 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, config_names
 from rack.tools.lab.benches.harness import show
-from rack.tools.lab.benches.options import (
-    Against,
-    Config,
-    Plot,
-    RackRounds,
-    Rates,
-    Rounds,
-    Seconds,
-    Share,
-)
+
+Config = Annotated[
+    str,
+    typer.Option(
+        "--config",
+        metavar="CONFIG",
+        help="config by name, or path to a .toml file",
+        autocompletion=config_names,
+    ),
+]
+
+Plot = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="write the figures as PNG and SVG into this folder"),
+]
+Against = Annotated[
+    Path | None,
+    typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one"),
+]
+Share = Annotated[
+    bool,
+    typer.Option(
+        "--share", help="run even on cores held by another rack's real-time boards: figures suffer"
+    ),
+]
+Rates = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--rate", metavar="HZ", min=1, max=10_000, help="rate; may be given several times"
+    ),
+]
+Rounds = Annotated[
+    int, typer.Option(metavar="N", min=1, help="rounds; every contestant is measured once in each")
+]
+RackRounds = Annotated[int, typer.Option(metavar="N", min=1, help="runs of each rack, by turns")]
+Seconds = Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one measurement")]
 
 bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 
