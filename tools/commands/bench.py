@@ -91,8 +91,7 @@ def cycle(
 
     Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns
     with another checkout. The servo board is also compared with bare mj_step calls: the physics of
-    its recorded run, replayed alone. TREE runs in its own
-    environment, TREE/.venv.
+    its recorded run, replayed alone. TREE runs in its own environment, TREE/.venv.
     """
     from rack.tools.lab.benches.cycle import measure
 
