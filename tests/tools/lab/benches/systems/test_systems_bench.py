@@ -94,9 +94,9 @@ def test_a_rack_is_compared_by_its_runs(
     assert ran["hold"]["fate"] == "acted on"
     assert ran["hold"]["measured_ms"] >= 25.0
     assert set(ran["bus"]) == set(ran["board_loads"]) == {"path", *NAMES, "arm"}
-    # A board of a joint reads one command and one status in each of 400 cycles a second, and writes
-    # at least as much.
-    assert all(ran["bus"][name]["accesses"] > 2 * 380 for name in NAMES)
+    # A board of a joint reads a command and a status in each of at most 400 cycles a second, and
+    # writes at least as much.
+    assert all(ran["bus"][name]["accesses"] > 400 for name in NAMES)
     assert sum(ran["board_loads"].values()) == pytest.approx(sum(ran["loads"].values()))
     assert ran["plans"] == []
     assert [peer["who"] for peer in found["absent"]] == ["cyclictest"]
