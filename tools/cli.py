@@ -99,6 +99,16 @@ COMMANDS = (
     ),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
+GROUPS = {
+    "Run": ("run", "stop", "step", "list", "clean"),
+    "Watch": ("status", "top", "record", "replay", "report"),
+    "Command and disturb": ("command", "prompt", "estop", "inject", "campaign"),
+    "Predict": ("check", "analyze", "gantt"),
+    "Compare": ("bench", "reproduce"),
+    "Reach others": ("lan",),
+    "Look up": ("schema",),
+}
+"""What one would do, and the commands for it."""
 MAX_ARGUMENT = 4096
 """Characters, as in the longest path; longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"
@@ -179,6 +189,8 @@ def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
     """Return what answers a command that is given with a name and --json at most; None for any
     other."""
     command, *rest = arguments or [""]
+    if command == "--version":
+        return _show_version
     names = [argument for argument in rest if argument != "--json"]
     if COMPLETION in os.environ or any(not name or name.startswith("-") for name in names):
         return None
@@ -197,6 +209,12 @@ def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
 
             return partial(show_report, folder, as_json)
     return None
+
+
+def _show_version() -> None:
+    from importlib.metadata import version
+
+    print(f"rack {version('nasrem-rack')}")
 
 
 def _print(answer: Callable[[], None]) -> None:
@@ -242,6 +260,16 @@ def commands() -> TyperGroup:
     import typer
     from typer.core import TyperCommand, TyperGroup
 
+    class Grouped(TyperGroup):
+        """The command line, with its commands in `GROUPS`."""
+
+        def format_commands(self, ctx: Any, formatter: Any) -> None:
+            """Write a table of the commands for each group."""
+            lines = {name: line for name, _, line in COMMANDS}
+            for group, names in GROUPS.items():
+                with formatter.section(group):
+                    formatter.write_dl([(f"{name:9}", lines[name]) for name in names])
+
     class LazyCommand(TyperCommand):
         """A command of which only the name and one line of help are known."""
 
@@ -257,7 +285,14 @@ def commands() -> TyperGroup:
                 info_name, args, parent, **extra
             )
 
+    def rack(
+        version: bool = typer.Option(False, "--version", help="Show the version and exit."),
+    ) -> None:
+        # It is answered before.
+        assert not version
+
     app = _app(
+        cls=Grouped,
         add_completion=True,
         no_args_is_help=True,
         help=(
@@ -268,7 +303,7 @@ def commands() -> TyperGroup:
             "Exit status: 0 success, 1 failure, 2 usage or config error, 128 + N ended by signal N."
         ),
     )
-    app.callback()(lambda: None)
+    app.callback()(rack)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup), "it has a callback"
     for name, source, line in COMMANDS:

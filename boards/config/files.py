@@ -4,6 +4,7 @@ paths."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -168,8 +169,11 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     ]
     found = next((file for file in files if file is not None), None)
     if found is None:
-        by_name = ", ".join(names(folders[-1]))
-        raise ConfigError([Mistake(place, text, f"no such file; by name: {by_name}; or a path")])
+        known_names = names(folders[-1])
+        near = get_close_matches(text, known_names, 1)
+        by_name = f"by name: {', '.join(known_names)}; or a path"
+        why = f"did you mean '{near[0]}'?" if near else by_name
+        raise ConfigError([Mistake(place, text, f"no such file; {why}")])
     return found
 
 

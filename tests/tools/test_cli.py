@@ -6,11 +6,13 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from rack.tools.cli import COMMANDS as ALL
+from rack.tools.cli import GROUPS
 from tests.processes import RACK
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
@@ -154,6 +156,22 @@ def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
     done = rack("campaign", "fig2", option)
     assert (done.returncode, done.stdout) == (2, "")
     assert f"Invalid value for '{option.partition('=')[0]}'" in done.stderr
+
+
+def test_every_command_stands_in_one_group_of_the_help_with_its_line() -> None:
+    grouped = [name for names in GROUPS.values() for name in names]
+    assert sorted(grouped) == sorted(name for name, _, _ in ALL)
+    shown = " ".join(rack("--help").stdout.split())
+    for name, _, line in ALL:
+        assert f" {name} {line}" in shown
+    assert [shown.index(f" {group}: ") for group in GROUPS] == sorted(
+        shown.index(f" {group}: ") for group in GROUPS
+    )
+
+
+def test_the_version_is_that_of_the_project() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert rack("--version").stdout == f"rack {project['version']}\n"
 
 
 def test_bytes_that_are_no_text_are_refused() -> None:
