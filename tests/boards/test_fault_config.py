@@ -78,10 +78,10 @@ def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
 
 def test_an_unknown_script_lists_the_known_scripts(small: Path) -> None:
     with pytest.raises(ConfigError) as error:
-        load(small, faults="noisy")
+        load(small, faults="unheard")
     assert (
         str(error.value)
-        == f'--faults = "noisy": no such file; by name: {", ".join(names(FAULTS))}; or a path'
+        == f'--faults = "unheard": no such file; by name: {", ".join(names(FAULTS))}; or a path'
     )
 
 
