@@ -20,8 +20,8 @@ class ByteLock:
 
     def __init__(self, fd: int, address: int) -> None:
         self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
-        self._take = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
-        self._unlock = _FLOCK.pack(fcntl.F_UNLCK, os.SEEK_SET, address, 1, 0)
+        self._take = _one_byte(fcntl.F_WRLCK, address)
+        self._unlock = _one_byte(fcntl.F_UNLCK, address)
 
     def take(self) -> bool:
         """Take the lock; False when it is held already."""
@@ -45,6 +45,10 @@ class ByteLock:
 def is_locked(fd: int, address: int) -> bool:
     """Say whether the byte at a bus address of an open segment is locked, without taking the
     lock."""
-    asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, address, 1, 0)
+    asked = _one_byte(fcntl.F_WRLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK
+
+
+def _one_byte(kind: int, address: int) -> bytes:
+    return _FLOCK.pack(kind, os.SEEK_SET, address, 1, 0)

@@ -134,7 +134,7 @@ class Occupation:
         first = np.ones(len(starts), bool)
         first[1:] = starts[1:] > ends[:-1]
         self.starts = starts[first]
-        self.ends = ends[np.roll(first, -1)] if len(ends) else ends
+        self.ends = ends[np.roll(first, -1)]
         self._before = np.concatenate(([0], np.cumsum(self.ends - self.starts)))
 
     @classmethod
