@@ -135,7 +135,7 @@ class Occupation:
         first[1:] = starts[1:] > ends[:-1]
         self.starts = starts[first]
         self.ends = ends[np.roll(first, -1)]
-        self._before = np.concatenate(([0], np.cumsum(self.ends - self.starts)))
+        self._sums = np.cumsum(self.ends - self.starts)
 
     @classmethod
     def of(cls, rows: np.ndarray) -> Occupation:
@@ -163,7 +163,7 @@ class Occupation:
             return np.zeros(np.shape(times), np.int64)
         newest = np.maximum(begun - 1, 0)
         beyond = np.clip(self.ends[newest] - times, 0, None)
-        return np.asarray(np.where(begun > 0, self._before[begun] - beyond, 0))
+        return np.asarray(np.where(begun > 0, self._sums[newest] - beyond, 0))
 
 
 def waking_ns(rows: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from rack.backplane.byte_lock import ByteLock
+from rack.backplane.byte_lock import ByteLock, is_locked
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, descriptors, forked, wait_until
 
@@ -52,3 +52,23 @@ def test_a_lock_ends_with_its_process(make_bus: MakeBus) -> None:
         wait_until(lambda: segment.words[ADDRESS])
         assert not mine.take()
     assert mine.take()
+
+
+def test_asking_for_a_lock_names_one_byte_and_takes_nothing(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    lock = ByteLock(segment.fd, ADDRESS)
+    lock.take()
+    around = range(ADDRESS - 1, ADDRESS + 2)
+    assert [is_locked(segment.fd, address) for address in around] == [False, True, False]
+    lock.release()
+    assert not is_locked(segment.fd, ADDRESS)
+    assert lock.take()
+
+
+def test_a_lock_closed_twice_closes_no_other_file(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    lock = ByteLock(segment.fd, ADDRESS)
+    lock.close()
+    before = descriptors()
+    lock.close()
+    assert descriptors() == before

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 import pytest
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
+from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import OperatorTableError
 from rack.backplane.operator_table import (
     OperatorTable,
@@ -19,9 +20,10 @@ from rack.backplane.operator_table import (
     RequestWord,
 )
 from rack.backplane.segment import Segment
+from rack.backplane.words import System
 from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, exit_status, fork
+from tests.processes import FORKS, descriptors, exit_status, fork
 
 BOX = "reader.operator"
 
@@ -139,3 +141,57 @@ def test_two_operators_at_once_fill_entries_of_their_own(segment: Segment) -> No
     waiting = OperatorTable(segment).waiting()
     assert len(waiting) == 2 * half
     assert len({entry[RequestWord.TICKET] for entry in waiting}) == 2 * half
+
+
+def test_a_request_leaves_no_file_open(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    before = descriptors()
+    table.add(Request(0, b"", 9))
+    with table.claim(Request(0, b"", 9)):
+        pass
+    assert (claim := table.try_claim(Request(0, b"", 9))) is not None
+    claim.leave()
+    assert descriptors() == before
+
+
+def test_a_request_counts_as_its_clients_while_the_client_holds_it(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    claim = table.try_claim(Request(0, b"", 9))
+    assert claim is not None
+    assert [entry.index for entry in table.waiting()] == [claim.entry.index]
+    claim.leave()
+    assert table.waiting() == []
+
+
+def test_a_request_without_a_client_waits_in_an_entry_that_a_client_had(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    with table.claim(Request(0, b"", 9)) as first:
+        pass
+    assert table.add(Request(0, b"", 9)).index == first.index
+    assert [entry.index for entry in table.waiting()] == [first.index]
+
+
+def test_while_another_fills_an_entry_a_request_is_not_added(segment: Segment) -> None:
+    table = OperatorTable(segment)
+    lock = ByteLock(segment.fd, segment.map.operator)
+    assert lock.take()
+    assert table.try_claim(Request(0, b"", 9)) is None
+    lock.close()
+    assert table.try_claim(Request(0, b"", 9)) is not None
+
+
+@pytest.mark.parametrize(("tick", "was_withdrawn"), [(-1, True), (0, False), (1, False)])
+def test_a_request_that_the_clock_is_just_giving_is_not_withdrawn(
+    segment: Segment, tick: int, was_withdrawn: bool
+) -> None:
+    table = OperatorTable(segment)
+    entry = table.add(Request(0, b""))
+    assert entry[RequestWord.TICK] == -1
+    entry.words[RequestWord.GIVEN_TICK] = tick
+    assert table.withdraw(entry, entry[RequestWord.TICKET]) is was_withdrawn
+
+
+def test_tickets_count_the_requests(segment: Segment) -> None:
+    tickets = [OperatorTable(segment).add(Request(0, b"", 9))[RequestWord.TICKET] for _ in range(3)]
+    assert tickets == [1, 2, 3]
+    assert segment.words[System.REQUESTED] == 3

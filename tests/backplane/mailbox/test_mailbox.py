@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
 from rack.backplane.mailbox.protocols import open_reader, open_writer
-from rack.backplane.mailbox.slots import Slots, epoch_of
+from rack.backplane.mailbox.slots import Slots, claim, epoch_of
 from rack.backplane.segment import Segment
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
@@ -265,3 +265,68 @@ def test_an_unknown_mailbox_is_no_mailbox(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     with pytest.raises(KeyError, match="nobody"):
         open_reader(segment, "nobody.status")
+
+
+@pytest.mark.parametrize(
+    ("every", "delay", "phase", "visible"),
+    [
+        # Ticks 8 to 15 of a message released at 8, and the end of its slice or the next boundary.
+        (4, 4, 0, [12, 12, 12, 12, 16, 16, 16, 16]),
+        (4, 4, 1, [12, 12, 12, 12, 13, 17, 17, 17]),
+        (2, 6, 0, [14, 14, 14, 14, 14, 14, 16, 16]),
+        (8, 3, 0, [11, 11, 11, 12, 15, 15, 15, 18]),
+    ],
+)
+def test_a_message_is_in_time_before_the_end_of_its_slice(
+    make_bus: MakeBus, every: int, delay: int, phase: int, visible: list[int]
+) -> None:
+    spec = replace(mailbox(every=every, delay=delay), phase=phase)
+    writer = open_writer(make_bus(spec), NAME)
+    assert [writer.visible_at(8, now) for now in range(8, 16)] == visible
+    assert [writer.is_in_time(8, now) for now in range(8, 16)] == [
+        now < 8 + delay for now in range(8, 16)
+    ]
+    # Without a clock, as in a test, a writer is never late.
+    assert writer.is_in_time(8, None)
+    assert writer.visible_at(8, None) == 8 + delay
+
+
+def test_a_reader_counts_its_reads_and_the_messages_that_it_copied(make_bus: MakeBus) -> None:
+    writer, reader = ends(make_bus(mailbox()))
+    write(writer, 0)
+    writer.write(1, basis=0)
+    for tick in (0, 1, 1, 2):
+        reader.read(tick)
+    assert (reader.accesses, reader.transfers, reader.serial, reader.found) == (4, 2, 2, 2)
+    assert (reader.newest, reader.visible, reader.basis) == (1, 2, 0)
+
+
+def test_a_forged_message_is_counted_with_the_process_that_it_names(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox())
+    writer, reader = ends(segment)
+    write(writer, 0)
+    assert seen(reader, 1) == (1, NEW)
+    forger = Slots(segment, writer.spec)
+    forger.resume(claim(epoch_of(writer._slots.signature), 4321))
+    forger.publish(1, 2, 1)
+    assert seen(reader, 2) == (1, OLD)
+    statistics = reader.statistics
+    assert (statistics.forged, statistics.forger) == (1, 4321)
+    assert (statistics.bad_reads, statistics.corrupt, statistics.bus_errors) == (1, 0, 0)
+
+
+@pytest.mark.parametrize(("bad", "expected"), [(1, (7, NEW)), (4, (4, NEW)), (5, (1, OLD))])
+def test_a_read_steps_back_over_a_bounded_number_of_bad_messages(
+    make_bus: MakeBus, bad: int, expected: tuple[int, Verdict]
+) -> None:
+    segment = make_bus(mailbox(depth=16))
+    writer, reader = ends(segment)
+    write(writer, 0)
+    assert seen(reader, 1) == (1, NEW)
+    for tick in range(1, 8):
+        write(writer, tick)
+    # The newest are bad; after so many tries the last good one stays.
+    for serial in range(8, 8 - bad, -1):
+        segment.bytes[message_address(segment, serial)] ^= 1
+    assert seen(reader, 8) == expected
+    assert (reader.statistics.corrupt, reader.statistics.bad_reads) == (bad, 1)

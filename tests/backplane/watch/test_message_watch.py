@@ -179,3 +179,37 @@ def test_a_slot_whose_head_is_damaged_is_damaged_and_not_lost(link: MakeLink) ->
         rack.segment.bytes[message_address(rack.segment, 19) + at] ^= 0x80
     rack.run(20, 40)
     assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED]
+
+
+@pytest.mark.parametrize(("messages", "alarms"), [(2, []), (3, [Alarm.BABBLE])])
+def test_one_message_more_than_releases_is_no_babble(
+    link: MakeLink, messages: int, alarms: list[Alarm]
+) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.reader.cycle(20)
+    for _ in range(messages):
+        publish(rack, 20, 21)
+    rack.reader.cycle(21)
+    assert [code for _, code in rack.alarms()] == alarms
+
+
+def test_of_a_babble_the_single_messages_are_not_judged(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.reader.cycle(20)
+    for _ in range(5):
+        publish(rack, 20, 21)
+    # Serials begin at 1: 21 to 25 are the babble.
+    rack.segment.bytes[message_address(rack.segment, 23)] ^= 4
+    rack.reader.cycle(21)
+    assert [code for _, code in rack.alarms()] == [Alarm.BABBLE]
+
+
+def test_a_later_message_of_an_earlier_release_is_out_of_order(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.reader.cycle(20)
+    publish(rack, 18, 21)
+    rack.reader.cycle(21)
+    assert rack.alarms() == [(21, Alarm.DISORDER)]
