@@ -175,7 +175,8 @@ def overhead_ns(rows: np.ndarray) -> int:
     """Return the median processor time of waking up for a cycle and closing it; 0 where every cycle
     was disturbed."""
     beyond = _beyond_stamps(rows)
-    return int(np.median(beyond[beyond >= 0])) if (beyond >= 0).any() else 0
+    undisturbed = beyond[beyond >= 0]
+    return int(np.median(undisturbed)) if len(undisturbed) else 0
 
 
 def _beyond_stamps(rows: np.ndarray) -> np.ndarray:

@@ -149,7 +149,8 @@ def test_a_request_leaves_no_file_open(segment: Segment) -> None:
     table.add(Request(0, b"", 9))
     with table.claim(Request(0, b"", 9)):
         pass
-    assert (claim := table.try_claim(Request(0, b"", 9))) is not None
+    claim = table.try_claim(Request(0, b"", 9))
+    assert claim is not None
     claim.leave()
     assert descriptors() == before
 

@@ -1,0 +1,324 @@
+"""A level that is a state table, cycle by cycle: which row fires, what the status says of it, and
+what a restarted board remembers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message, State
+from rack.levels.level import LevelContext, Ports
+from rack.levels.messages import Error
+from rack.levels.operator import OPERATOR_COMMAND, Answer, Operation
+from rack.levels.systems.state_table.level import (
+    TABLE_STATUS,
+    WORD_COMMAND,
+    StateTableExecutor,
+    answer_of,
+)
+from rack.levels.systems.state_table.vocabulary import Lexicon
+from rack.levels.tables import SceneConfig
+from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON
+
+TICK_NS = 10_000_000
+PATIENCE_TICKS = 5
+
+
+class Door(StateTableExecutor):
+    """The door of `tables`: its lock and its place are as the test sets them."""
+
+    vocabulary = DOORS
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self.lock = "free"
+        self.place = "shut"
+        self.drives: list[str] = []
+
+    @classmethod
+    def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
+        """Return the colours."""
+        return LEXICON
+
+    def look(self, read: Ports, tick: int) -> dict[str, str]:
+        """Return what the test has set."""
+        return {"lock": self.lock, "place": self.place}
+
+    def do_drive(self, speed: str) -> None:
+        """Note the speed."""
+        self.drives.append(speed)
+
+
+class Bench:
+    """A door and its mailboxes, without a bus."""
+
+    def __init__(self, folder: Path) -> None:
+        paths = {}
+        for name, text in {
+            "normal": f"patience = {PATIENCE_TICKS * TICK_NS / 1e9}\n{DOOR}",
+            "careful": DOOR.replace('"shut"', '"closed"').replace(
+                'place = ["open", "closed"]', 'place = ["open", "shut"]'
+            ),
+        }.items():
+            paths[name] = folder / f"{name}.toml"
+            paths[name].write_text(text)
+        context = SimpleNamespace(
+            board="door",
+            scene=None,
+            clock_ns=TICK_NS,
+            tick_s=TICK_NS * 1e-9,
+            params={"tables": {name: str(path) for name, path in paths.items()}},
+        )
+        self.context = cast(LevelContext, context)
+        self.status = Message(TABLE_STATUS.dtype({}))
+        self.last = Reading(Message(TABLE_STATUS.dtype({})), Verdict.NONE)
+        self.above: Reading | None = None
+        self.operator = Reading(Message(OPERATOR_COMMAND.dtype({})), Verdict.NONE)
+        self.door = Door(self.context)
+        self.tick = 100
+
+    def command(self, serial: int, words: str, hold: bool = False, operator: int = 0) -> None:
+        """Let the level above command this from now on."""
+        message = Message(WORD_COMMAND.dtype({}))
+        message.id = serial
+        message.words = words
+        message.hold = hold
+        message.operator = operator
+        self.above = Reading(message, Verdict.NEW)
+
+    def order(self, serial: int, what: Operation, name: str = "") -> Message:
+        """Let the operator command this; return the status after the cycle that reads it."""
+        message = Message(OPERATOR_COMMAND.dtype({}))
+        message.id = serial
+        message.what = what
+        message.name = name
+        self.operator = Reading(message, Verdict.NEW)
+        status = self.cycle()
+        self.operator = Reading(message, Verdict.OLD)
+        return status
+
+    def cycle(self) -> Message:
+        """Do one cycle; return the status."""
+        read = Ports(
+            command={} if self.above is None else {"task": self.above},
+            last_status=self.last,
+            operator=self.operator,
+        )
+        self.door.process(read, Ports(status=self.status), self.tick)
+        self.tick += 1
+        return self.status
+
+    def restart(self) -> None:
+        """Start the board again: it finds the last status, and every command of the operator."""
+        last = Message(TABLE_STATUS.dtype({}))
+        last.copy_from(self.status)
+        self.last = Reading(last, Verdict.NEW)
+        self.operator = Reading(
+            self.operator.value, Verdict.NEW if self.operator.is_there else Verdict.NONE
+        )
+        self.status = Message(TABLE_STATUS.dtype({}))
+        self.door = Door(self.context)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+def brief(status: Message) -> tuple[str, int, str, str, int]:
+    """Return state of the table, number and name of the row, command in force and level state."""
+    return status.in_state, status.row, status.fired, status.words, State(status.state)
+
+
+def test_a_command_from_above_is_taken_done_and_answered(bench: Bench) -> None:
+    assert brief(bench.cycle()) == ("shut", 3, "stay shut", "", State.IDLE)
+    bench.command(4, "open")
+    status = bench.cycle()
+    assert brief(status) == ("moving", 1, "open it", "open", State.EXECUTING)
+    assert (status.echo, status.done, status.ordered) == (4, 0, 0)
+    assert bench.door.words == ["open"]
+    bench.door.place = "open"
+    status = bench.cycle()
+    assert brief(status) == ("shut", 5, "arrived", "open", State.DONE)
+    assert (status.echo, status.done) == (4, 4)
+    assert bench.door.drives == ["slowly", "stop"]
+    # It is done: the same serial is no new command, the next one is.
+    assert bench.cycle().fired == "stay shut"
+    bench.command(5, "open")
+    status = bench.cycle()
+    assert (status.fired, status.echo, status.done) == ("open it", 5, 4)
+
+
+def test_a_command_that_no_row_takes_is_not_in_force(bench: Bench) -> None:
+    bench.door.lock = "locked"
+    bench.command(1, "open")
+    status = bench.cycle()
+    assert brief(status) == ("shut", 2, "locked", "", State.HOLDING)
+    assert (status.reason, status.echo) == ("locked", 0)
+    bench.door.lock = "free"
+    bench.command(2, "paint blue")
+    # The table has no row for words that the level does not know.
+    assert brief(bench.cycle()) == ("shut", 3, "stay shut", "", State.IDLE)
+
+
+@pytest.mark.parametrize("place", ["between", "open"])
+def test_a_state_is_late_after_more_than_its_patience(bench: Bench, place: str) -> None:
+    bench.command(1, "open")
+    bench.cycle()
+    bench.door.place = "between"
+    assert [bench.cycle().fired for _ in range(PATIENCE_TICKS)] == ["moves"] * PATIENCE_TICKS
+    bench.door.place = place
+    status = bench.cycle()
+    if place == "open":
+        assert (status.fired, status.error, status.reason) == ("arrived", Error.NONE, "")
+    else:
+        assert (status.fired, status.error, status.reason) == ("jams", Error.TABLE, "the door jams")
+        assert status.done == 0
+
+
+def test_a_reason_from_below_is_added_to_that_of_the_row(bench: Bench) -> None:
+    bench.door.lock = "locked"
+    bench.door.detail = "no key"
+    bench.command(1, "open")
+    assert bench.cycle().reason == "locked: no key"
+    bench.door.lock = "free"
+    # A row without a reason has none from below either.
+    assert bench.cycle().reason == ""
+
+
+def test_a_case_that_no_row_takes_is_an_error_with_the_case(bench: Bench) -> None:
+    bench.command(1, "open")
+    bench.cycle()
+    bench.door.place = "nowhere"
+    status = bench.cycle()
+    assert (status.row, status.fired, status.error) == (0, "", Error.TABLE)
+    assert status.reason.startswith("no row of 'moving' takes lock = free, place = nowhere")
+
+
+def test_the_level_above_holds_this_one_while_it_executes(bench: Bench) -> None:
+    bench.command(1, "open", hold=True, operator=9)
+    status = bench.cycle()
+    assert (status.state, bench.door.holds, status.operator) == (State.HOLDING, True, 9)
+    assert "above" in status.reason
+    bench.command(1, "open", operator=9)
+    bench.door.place = "between"
+    assert (bench.cycle().state, bench.door.holds) == (State.EXECUTING, False)
+    assert bench.above is not None
+    bench.above = bench.above._replace(is_lost=True)
+    assert (bench.cycle().state, bench.door.holds) == (State.HOLDING, True)
+
+
+def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
+    bench.command(1, "open")
+    bench.cycle()
+    bench.door.place = "between"
+    bench.door.resting = False
+    status = bench.order(1, Operation.HOLD)
+    assert (status.state, status.answer, status.order) == (State.HOLDING, Answer.TAKEN, 1)
+    bench.door.resting = True
+    assert bench.cycle().answer == Answer.DONE
+    bench.order(2, Operation.RESUME)
+    assert (bench.cycle().state, bench.door.holds) == (State.EXECUTING, False)
+
+
+def test_an_operators_command_goes_before_that_of_the_level_above(bench: Bench) -> None:
+    bench.command(7, "paint red")
+    status = bench.order(3, Operation.DO, "open")
+    assert brief(status) == ("moving", 1, "open it", "open", State.EXECUTING)
+    assert (status.ordered, status.echo, status.answer) == (3, 0, Answer.TAKEN)
+    bench.door.place = "open"
+    status = bench.cycle()
+    assert (status.state, status.answer, status.done) == (State.DONE, Answer.DONE, 0)
+    # Released, the level goes on with the command from above.
+    bench.order(4, Operation.RESUME)
+    assert bench.cycle().echo == 0
+    assert not bench.door.holds
+
+
+def test_an_operators_command_that_ends_in_an_error_is_refused_and_the_level_holds(
+    bench: Bench,
+) -> None:
+    bench.order(3, Operation.DO, "open")
+    bench.door.place = "between"
+    for _ in range(PATIENCE_TICKS):
+        bench.cycle()
+    status = bench.cycle()
+    assert (status.fired, status.answer, status.standing) == (
+        "jams",
+        Answer.REFUSED,
+        Operation.HOLD,
+    )
+    assert status.objection == "the door jams"
+
+
+def test_an_operator_hears_which_words_and_tables_there_are(bench: Bench) -> None:
+    status = bench.order(1, Operation.DO, "paint blue")
+    assert (status.answer, status.standing, status.words) == (Answer.REFUSED, Operation.NONE, "")
+    assert "blue" in status.objection
+    status = bench.order(2, Operation.TABLE, "other")
+    assert status.answer == Answer.REFUSED
+    assert status.objection == "no table 'other'; tables: normal, careful"
+    assert status.table == "normal"
+
+
+def test_a_table_in_force_goes_on_in_the_state_of_the_same_name_or_starts(bench: Bench) -> None:
+    checksum = bench.cycle().checksum
+    status = bench.order(1, Operation.TABLE, "careful")
+    assert (status.table, status.in_state, status.answer) == ("careful", "closed", Answer.DONE)
+    assert status.checksum != checksum
+    bench.command(1, "open")
+    assert bench.cycle().in_state == "moving"
+    bench.door.place = "between"
+    assert bench.order(2, Operation.TABLE, "normal").in_state == "moving"
+
+
+def test_a_restarted_board_goes_on_where_its_last_status_was(bench: Bench) -> None:
+    bench.order(1, Operation.TABLE, "careful")
+    bench.order(2, Operation.TABLE, "normal")
+    bench.command(6, "open")
+    bench.cycle()
+    bench.restart()
+    bench.door.place = "between"
+    status = bench.cycle()
+    assert brief(status) == ("moving", 4, "moves", "open", State.EXECUTING)
+    assert (status.table, status.echo, bench.door.drives) == ("normal", 6, [])
+    bench.door.place = "open"
+    assert bench.cycle().done == 6
+    bench.restart()
+    assert (bench.cycle().fired, bench.status.done) == ("stay shut", 6)
+
+
+def test_a_restarted_board_goes_on_with_an_operators_command(bench: Bench) -> None:
+    bench.order(3, Operation.DO, "open")
+    bench.restart()
+    bench.door.place = "between"
+    status = bench.cycle()
+    assert (status.fired, status.ordered, status.echo) == ("moves", 3, 0)
+    assert status.words == "open"
+
+
+@pytest.mark.parametrize(
+    ("state", "echo", "serial", "expected"),
+    [
+        (State.DONE, 3, 3, "done"),
+        (State.ERROR, 3, 3, "error"),
+        (State.EXECUTING, 3, 3, "executing"),
+        (State.HOLDING, 3, 3, "executing"),
+        (State.DONE, 2, 3, "waiting"),
+        (State.DONE, 4, 3, "waiting"),
+        (State.DONE, 0, 0, "waiting"),
+    ],
+)
+def test_the_level_below_has_answered_when_it_echoes_the_newest_command(
+    state: State, echo: int, serial: int, expected: str
+) -> None:
+    status = Message(TABLE_STATUS.dtype({}))
+    status.state = state
+    status.echo = echo
+    assert answer_of(Reading(status, Verdict.OLD), serial) == expected
+    assert answer_of(Reading(status, Verdict.NONE), serial) == "waiting"
+    assert answer_of(Reading(status, Verdict.OLD, is_lost=True), serial) == "lost"
