@@ -1,0 +1,331 @@
+"""The primitive level as a state table: what it senses, begins, halts and grips, and its set
+points, without a rack."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message, MessageType
+from rack.boards.config import load
+from rack.boards.config.resolved import resolve
+from rack.levels.errors import RobotError
+from rack.levels.level import LevelContext, Ports
+from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.state_table.primitive import (
+    GRIP_CYCLES,
+    JOINT_MOVE,
+    JOINT_MOVE_STATUS,
+    PrimitiveTable,
+)
+
+BOARDS = ("first", "second")
+
+
+@pytest.fixture(scope="module")
+def context() -> LevelContext:
+    PrimitiveTable.preload()
+    plan = resolve(load("nist-state-table"))
+    return next(wiring.context for wiring in plan.tasks if wiring.task == "primitive")
+
+
+class Bench:
+    """The level with messages that the test fills; its arm is where it is commanded, at first."""
+
+    def __init__(self, context: LevelContext) -> None:
+        self.context = context
+        self.level = PrimitiveTable(context)
+        self.home = self.level._point[0].copy()
+        self.arm = self.message(ARM_STATUS)
+        self.arm.opening = self.level._gripper.open
+        self.below = [self.message(JOINT_STATUS) for _ in BOARDS]
+        self.readings = [Reading(below, Verdict.NEW) for below in self.below]
+        for below in self.below:
+            below.position = self.home
+        self.above: dict[str, Reading] = {}
+        self.write = Ports(
+            command=self.message(JOINT_REFERENCE), status=self.message(JOINT_MOVE_STATUS)
+        )
+        self.tick = 10 * context.every
+
+    def message(self, kind: MessageType) -> Message:
+        """Return an empty message."""
+        return Message(kind.dtype(dict(self.context.sizes)))
+
+    def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
+        """Let the level above command this from now on."""
+        command = self.message(JOINT_MOVE)
+        command.joints = joints
+        command.speed = speed
+        command.object = row
+        self.above = {"move": Reading(command, Verdict.NEW)}
+
+    def look(self) -> dict[str, str]:
+        """Return the conditions of this cycle."""
+        read = Ports(
+            command=self.above,
+            statuses=dict(zip(BOARDS, self.readings, strict=True)),
+            arm=Reading(self.arm, Verdict.NEW),
+        )
+        return self.level.look(read, self.tick)
+
+    def give(self) -> Message:
+        """Write, and let the arm be there; return the set point."""
+        self.level.give(self.write, self.tick)
+        command = self.write.command
+        for below in self.below:
+            below.position = command.position
+        self.tick += self.context.every
+        assert isinstance(command, Message)
+        return command
+
+    def follow(self) -> None:
+        """Do a cycle in which the boards below follow."""
+        self.look()
+        self.give()
+
+
+@pytest.fixture
+def bench(context: LevelContext) -> Bench:
+    return Bench(context)
+
+
+def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
+    bench.follow()
+    goal = bench.home + 0.1
+    bench.command(goal, speed=0.5)
+    assert bench.look()["arm"] == "arrived"
+    bench.level.do_begin()
+    first = bench.give()
+    # The first set point is a cycle into the motion.
+    step = first.position - bench.home
+    assert (step > 0).all()
+    assert (step < 0.1).all()
+    arms = []
+    positions = [first.position.copy()]
+    while not arms or arms[-1] == "moving":
+        arms.append(bench.look()["arm"])
+        assert len(arms) < 10_000
+        positions.append(bench.give().position.copy())
+        assert bench.write.status.moving == (arms[-1] == "moving")
+    assert arms[-1] == "arrived"
+    np.testing.assert_allclose(positions[-1], goal, atol=1e-9)
+    assert (bench.write.command.velocity == 0).all()
+    moved = np.array(positions) - bench.home
+    np.testing.assert_allclose(moved, moved[:, :1] * np.ones(len(goal)), atol=1e-9)
+    assert (np.diff(moved[:, 0]) >= -1e-12).all()
+    np.testing.assert_array_equal(bench.write.status.end, goal)
+
+
+def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Bench) -> None:
+    bench.follow()
+    ends = {}
+    for speed in (0.0, 0.01, 0.5, 1.0, 3.0):
+        bench.level._curve = None
+        bench.command(bench.home + 0.5, speed)
+        bench.look()
+        bench.level.do_begin()
+        assert bench.level._curve is not None
+        ends[speed] = bench.level._curve.ends_s
+    assert ends[0.0] == ends[0.01] > ends[0.5] > ends[1.0] == ends[3.0]
+
+
+def test_a_goal_beyond_a_joints_limits_is_cut(bench: Bench) -> None:
+    bench.follow()
+    bench.command(np.full(len(bench.home), 100.0))
+    bench.look()
+    bench.level.do_begin()
+    np.testing.assert_array_equal(bench.level._end, bench.level._limits.position[:, 1])
+
+
+def test_a_motion_to_where_the_arm_is_never_begins(bench: Bench) -> None:
+    bench.follow()
+    bench.command(bench.home)
+    bench.look()
+    bench.level.do_begin()
+    assert bench.level._curve is None
+    assert bench.look()["arm"] == "arrived"
+
+
+@pytest.mark.parametrize("action", ["do_halt", "do_begin"])
+def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: str) -> None:
+    bench.follow()
+    bench.command(bench.home + 0.5)
+    bench.look()
+    bench.level.do_begin()
+    for _ in range(10):
+        bench.give()
+        bench.look()
+    before = bench.write.command.position.copy()
+    getattr(bench.level, action)()
+    cycles = 0
+    while (arm := bench.look()["arm"]) == "moving":
+        bench.give()
+        cycles += 1
+        assert cycles < 10_000
+    assert arm == "resting"
+    last = bench.give().position
+    assert (last > before).all()
+    assert (last < bench.home + 0.4).all()
+    # At rest there is nothing to halt.
+    bench.level.do_halt()
+    assert bench.level._curve is None
+
+
+def test_set_points_are_due_two_cycles_ahead_and_numbered_by_cycle(bench: Bench) -> None:
+    every = bench.context.every
+    released = bench.tick
+    bench.look()
+    command = bench.give()
+    assert (command.id, command.due) == (released // every + 1, released + 2 * every)
+    bench.below[1].stopped = 1
+    bench.look()
+    assert bench.give().due == 0
+
+
+@pytest.mark.parametrize(
+    ("off", "arm"), [(0.009, "arrived"), (-0.009, "arrived"), (0.011, "moving")]
+)
+def test_a_joint_that_is_not_where_it_is_commanded_moves(
+    bench: Bench, off: float, arm: str
+) -> None:
+    bench.follow()
+    position = bench.home.copy()
+    position[2] += off
+    bench.below[0].position = position
+    assert bench.look()["arm"] == arm
+
+
+def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) -> None:
+    bench.follow()
+    bench.below[1].stopped = 1
+    bench.below[1].reason = "brakes"
+    assert bench.look()["arm"] == "away"
+    assert bench.level.detail == "brakes"
+    bench.below[1].stopped = 0
+    bench.below[1].reason = ""
+    # It goes on from where the arm is.
+    bench.below[0].position = bench.home + 0.2
+    assert bench.look()["arm"] == "resting"
+    np.testing.assert_allclose(bench.give().position, bench.home + 0.2)
+    assert bench.level.detail == ""
+    for bad in ({"is_lost": True}, {"verdict": Verdict.NONE}):
+        good = bench.readings[0]
+        bench.readings[0] = good._replace(**bad)
+        assert bench.look()["arm"] == "away"
+        assert bench.level.detail == "its board is lost"
+        bench.readings[0] = good
+        assert bench.look()["arm"] != "away"
+
+
+def test_boards_that_hold_have_four_cycles_to_take_over(bench: Bench) -> None:
+    bench.below[0].holding = 1
+    arms = []
+    for _ in range(6):
+        arms.append(bench.look()["arm"])
+        bench.give()
+    assert arms == ["arrived"] * 6
+    # In the sixth the set points began anew.
+    assert bench.level._follows == 1
+
+
+def test_a_gripper_counts_as_moving_until_its_motion_must_show(bench: Bench) -> None:
+    gripper = bench.level._gripper
+    assert bench.look()["gripper"] == "open"
+    bench.command(bench.home, row=1)
+    bench.look()
+    bench.level.do_close()
+    bench.arm.opening = gripper.closed
+    assert [bench.look()["gripper"] for _ in range(GRIP_CYCLES)] == ["moving"] * 5 + ["empty"]
+    bench.level.do_open()
+    bench.arm.opening = gripper.open
+    assert [bench.look()["gripper"] for _ in range(GRIP_CYCLES)] == ["moving"] * 5 + ["open"]
+
+
+@pytest.mark.parametrize(
+    ("is_closed", "off", "speed", "expected"),
+    [
+        (False, -0.0009, 0.0, "open"),
+        (False, -0.0011, 0.0, "moving"),
+        (True, 0.0009, 0.0, "empty"),
+        (True, 0.0011, 0.0, "holds"),
+        (True, 0.0011, -0.0021, "moving"),
+        (True, 0.0, 0.0019, "empty"),
+        (False, 0.0, 0.0021, "moving"),
+    ],
+)
+def test_a_gripper_holds_what_keeps_it_from_closing(
+    bench: Bench, is_closed: bool, off: float, speed: float, expected: str
+) -> None:
+    gripper = bench.level._gripper
+    bench.level._closed = is_closed
+    bench.arm.opening = (gripper.closed if is_closed else gripper.open) + off
+    bench.arm.opening_velocity = speed
+    assert bench.look()["gripper"] == expected
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_what_the_gripper_holds_is_carried_and_reported(bench: Bench, row: int) -> None:
+    level = bench.level
+    bench.command(bench.home, row=row)
+    bench.follow()
+    free = bench.write.command.load.copy()
+    assert (bench.write.command.opening, bench.write.command.payload_mass) == (
+        level._gripper.open,
+        0.0,
+    )
+    level.do_close()
+    bench.arm.opening = level._gripper.closed + 0.02
+    for _ in range(GRIP_CYCLES):
+        bench.follow()
+    command, status = bench.write.command, bench.write.status
+    assert (status.closed, status.held, status.object) == (1, 1, row)
+    assert command.payload_mass == level._masses[row] > 0
+    assert (command.opening, command.force) == (level._gripper.closed, level._gripper.force)
+    assert not np.allclose(command.load, free)
+    level.do_open()
+    bench.arm.opening = level._gripper.open
+    for _ in range(GRIP_CYCLES):
+        bench.follow()
+    assert (status.closed, status.held, status.object) == (0, 0, -1)
+    assert command.payload_mass == 0
+    np.testing.assert_allclose(command.load, free)
+
+
+def test_it_holds_something_that_it_does_not_know(bench: Bench) -> None:
+    bench.level.do_close()
+    bench.arm.opening = bench.level._gripper.closed + 0.02
+    for _ in range(GRIP_CYCLES):
+        bench.follow()
+    assert (bench.write.status.held, bench.write.status.object) == (1, -1)
+    assert bench.write.command.payload_mass == 0
+
+
+def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -> None:
+    last = bench.message(JOINT_MOVE_STATUS)
+    last.closed = 1
+    last.held = 1
+    last.object = 1
+    last.table = bench.level.table_name
+    last.in_state = bench.level.state
+    last.position = bench.home + 0.1
+    last.end = bench.home + 0.2
+    command = bench.message(JOINT_REFERENCE)
+    command.id = 77
+    fresh = Ports(command=bench.message(JOINT_REFERENCE), status=bench.message(JOINT_MOVE_STATUS))
+    read = Ports(last_status=Reading(last, Verdict.NEW), last_command=Reading(command, Verdict.NEW))
+    level = bench.level
+    level.recall(read, fresh)
+    assert (level._closed, level._held, level._object) == (True, True, 1)
+    np.testing.assert_allclose(level._point[0], bench.home + 0.1)
+    np.testing.assert_allclose(level._end, bench.home + 0.2)
+    assert fresh.command.id == 77
+
+
+def test_an_arm_without_a_gripper_is_refused(context: LevelContext) -> None:
+    robot = context.robot.model_copy(update={"gripper": None})
+    with pytest.raises(RobotError, match="has none"):
+        PrimitiveTable(replace(context, robot=robot))
