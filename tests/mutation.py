@@ -2,7 +2,7 @@
 takes an hour.
 
 Each mutant is a copy of the tree with one random change in one file: a comparison flipped, a
-statement dropped, a number by one, `and` for `or`, a condition negated, a sign. The tests that
+statement dropped, a number greater, `and` for `or`, a condition negated, a sign. The tests that
 mirror the file must fail on it. What no test is to notice is not changed: annotations, messages,
 numbers of enumeration members, lengths of time-outs.
 
@@ -124,7 +124,8 @@ class Mutations:
             case ast.Constant(value=bool() as value):
                 yield self._mutation(*self.span(node), str(not value))
             case ast.Constant(value=int() | float() as value):
-                yield self._mutation(*self.span(node), repr(value + 1))
+                # One more of a thousand million is no other number of ns.
+                yield self._mutation(*self.span(node), repr(value + max(1, value // 2)))
             case (
                 ast.Expr()
                 | ast.AugAssign()

@@ -1,0 +1,81 @@
+"""What host boards print: lines of bounded length, so many of each board, and the others
+counted."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from rack.boards.crate import output
+from rack.boards.crate.output import LONGEST_LINE, HostOutput, lines_of
+
+MOST = 4
+
+
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch) -> Iterator[HostOutput]:
+    """The output of a board, of which a run keeps few lines."""
+    monkeypatch.setattr(output, "MOST_LINES", MOST)
+    pipe = HostOutput("general")
+    yield pipe
+    os.close(pipe.reader)
+    os.close(pipe.writer)
+
+
+def dropped(lines: int) -> str:
+    return f"host board 'general': {lines} lines dropped so far; a run keeps the first {MOST}\n"
+
+
+def test_lines_are_whole_or_cut_and_what_has_not_ended_waits() -> None:
+    long = b"x" * LONGEST_LINE
+    assert lines_of(b"one\n\ntwo\nthr") == [b"one\n", b"\n", b"two\n"]
+    assert lines_of(long[:-1]) == []
+    assert lines_of(long) == [long]
+    assert lines_of(long + b"\nrest\n") == [long + b"\n", b"rest\n"]
+    assert lines_of(long + b"rest\n") == [long, b"rest\n"]
+
+
+def test_a_line_that_comes_in_pieces_is_passed_on_once_it_is_whole(
+    printed: HostOutput, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for piece, whole in ((b"on", ""), (b"e\ntw", "one\n"), (b"o\n", "two\n")):
+        os.write(printed.writer, piece)
+        printed.pass_on()
+        assert capfd.readouterr().out == whole
+    # Nothing has come since.
+    printed.pass_on()
+    assert capfd.readouterr().out == ""
+
+
+def test_the_last_line_needs_no_end_when_its_board_is_over(
+    printed: HostOutput, capfd: pytest.CaptureFixture[str]
+) -> None:
+    os.write(printed.writer, b"one\ntwo")
+    printed.pass_on(is_over=True)
+    assert capfd.readouterr().out == "one\ntwo\n"
+    printed.pass_on(is_over=True)
+    assert capfd.readouterr().out == ""
+
+
+def test_a_run_keeps_the_first_lines_and_says_each_time_that_the_dropped_ones_have_doubled(
+    printed: HostOutput, capfd: pytest.CaptureFixture[str]
+) -> None:
+    said = []
+    for _ in range(12):
+        os.write(printed.writer, b"line\n")
+        printed.pass_on()
+        said.append(capfd.readouterr().out)
+    kept = ["line\n"] * MOST
+    assert said == [*kept, dropped(1), "", "", "", "", dropped(6), "", ""]
+    printed.pass_on(is_over=True)
+    assert capfd.readouterr().out == dropped(8)
+
+
+def test_of_a_board_that_printed_as_much_as_is_kept_nothing_is_dropped(
+    printed: HostOutput, capfd: pytest.CaptureFixture[str]
+) -> None:
+    os.write(printed.writer, b"line\n" * MOST)
+    printed.pass_on(is_over=True)
+    assert capfd.readouterr().out == "line\n" * MOST
