@@ -15,6 +15,8 @@ from rack.boards.config.resolved import resolve
 from rack.levels.errors import RobotError
 from rack.levels.level import LevelContext, Ports
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS
+from rack.levels.systems.state_table.level import TABLE_STATUS, WORD_COMMAND
 from rack.levels.systems.state_table.primitive import (
     GRIP_CYCLES,
     JOINT_MOVE,
@@ -329,3 +331,26 @@ def test_an_arm_without_a_gripper_is_refused(context: LevelContext) -> None:
     robot = context.robot.model_copy(update={"gripper": None})
     with pytest.raises(RobotError, match="has none"):
         PrimitiveTable(replace(context, robot=robot))
+
+
+def test_inertia_and_load_are_those_at_the_set_point(bench: Bench) -> None:
+    bench.follow()
+    command = bench.write.command
+    at_home = command.inertia.copy(), command.load.copy()
+    bench.level._point[0] = bench.home + 0.4
+    bench.give()
+    assert not np.allclose(command.inertia, at_home[0])
+    assert not np.allclose(command.load, at_home[1])
+
+
+def test_whoever_changes_the_bytes_of_a_message_changes_its_version(context: LevelContext) -> None:
+    kinds = (WORD_COMMAND, TABLE_STATUS, JOINT_MOVE, JOINT_MOVE_STATUS, MOVE_TABLE_STATUS)
+    sizes = dict(context.sizes)
+    bytes_of = {kind.name: (kind.version, kind.dtype(sizes).itemsize) for kind in kinds}
+    assert bytes_of == {
+        "word_command": (1, 76),
+        "table_status": (1, 436),
+        "joint_move": (1, 176),
+        "joint_move_status": (1, 544),
+        "move_table_status": (1, 448),
+    }
