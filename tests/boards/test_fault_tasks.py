@@ -23,6 +23,7 @@ LEAST_S = 0.5
 """Time for which the hog waits: its processor time is known to 10 ms."""
 
 
+@pytest.mark.slow
 @needs_fifo
 @pytest.mark.filterwarnings(FORKS)
 def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(

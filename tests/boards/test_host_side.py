@@ -194,6 +194,7 @@ def daemons(rack: Rack) -> list[int]:
     return [int(event.text.split()[1]) for event in rack.events if event.text.startswith("daemon ")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends_first", [False, True])
 def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(
     config: MakeConfig, ends_first: bool

@@ -96,6 +96,7 @@ def test_a_lockstep_tick_begins_when_every_task_due_has_finished(
             assert log.index(("end", name, tick)) < log.index(("tick", "clock", tick + period))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wake", get_args(Wake))
 def test_one_at_a_time_means_one_after_the_other(make_bus: MakeBus, wake: Wake) -> None:
     planner = task("planner", slot=4, role="planner", wake=wake)

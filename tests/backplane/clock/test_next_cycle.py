@@ -162,6 +162,7 @@ def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment) -> None:
     assert cycle.wait() is None
 
 
+@pytest.mark.slow
 @WAKES
 def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
     bus.words[Head.LAUNCHER_START] += 1

@@ -132,6 +132,7 @@ def test_boards_are_ready_before_the_clock_runs(config: MakeConfig) -> None:
     assert set(states.values()) == {TaskState.ENDED}
 
 
+@pytest.mark.slow
 def test_after_the_launch_only_the_segment_has_a_name(config: MakeConfig) -> None:
     with Rack(config("protocol.default=lock")) as rack:
         folder = shm_path(rack.config.name).parent
@@ -141,6 +142,7 @@ def test_after_the_launch_only_the_segment_has_a_name(config: MakeConfig) -> Non
     assert rack.config.name not in racks()
 
 
+@pytest.mark.slow
 def test_a_stop_ends_the_run_at_the_next_tick(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
         rack.start()
@@ -220,6 +222,7 @@ def test_racks_one_after_the_other_leave_no_file_open(config: MakeConfig) -> Non
     assert descriptors() == before
 
 
+@pytest.mark.slow
 def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     rack = Rack(config())
     run(rack, 0.0025)

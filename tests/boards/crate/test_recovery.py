@@ -110,6 +110,7 @@ def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
     assert outcome.ticks == demand.tick + RESTART_TICKS
 
 
+@pytest.mark.slow
 def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
     faults = [{"kind": "kill", "board": "wave", "tick": 50 + 400 * k} for k in range(4)]
     settings = ("supervision.restarts=1", "supervision.within_s=0.9")

@@ -221,6 +221,7 @@ def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:
     assert rig.status.position == pytest.approx(GOAL, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
 def test_with_known_velocities_the_arm_may_ramp_to_rest_instead(reaction: str, braked: int) -> None:
     rig = rig_under_way(on_sensor_fault=reaction)

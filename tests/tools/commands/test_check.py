@@ -59,6 +59,7 @@ def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
     assert "not counted (set one in the config, or use --from RUN): upper" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in names() if name not in FAILING])
 def test_a_shipped_rack_passes_its_own_check(name: str) -> None:
     done = check(name)

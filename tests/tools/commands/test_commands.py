@@ -102,6 +102,7 @@ def test_a_look_at_a_rack_needs_numpy_and_nothing_else(small: Path, rack_name: s
         assert rack_name in rack("list").stdout
 
 
+@pytest.mark.slow
 def test_a_report_that_is_there_is_shown_without_any(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:

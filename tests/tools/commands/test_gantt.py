@@ -138,6 +138,7 @@ def test_any_rack_has_a_schedule_where_it_has_budgets(tmp_path: Path) -> None:
     assert {"servo": 1, "primitive": 0, "world": 0}.items() <= lanes.items()
 
 
+@pytest.mark.slow
 def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
     shown = rack("gantt", "cyclic", "--out", tmp_path, "--json")
     (panel,) = json.loads(shown.stdout)["panels"]

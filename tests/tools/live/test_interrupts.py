@@ -38,6 +38,7 @@ def times(recording: Recording) -> dict[str, ExchangeTimes]:
     return {one.writer: one for one in exchange_times(recording) if one.reader == "hub"}
 
 
+@pytest.mark.slow
 def test_status_shows_every_inbox(tmp_path: Path, rack_name: str) -> None:
     path = tmp_path / "hub.toml"
     path.write_text(RACK)

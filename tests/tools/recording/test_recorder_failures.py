@@ -550,6 +550,7 @@ def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(
     ]
 
 
+@pytest.mark.slow
 def test_a_recorder_that_comes_after_the_start_says_of_how_many_cycles_its_figures_are(
     config: RackConfig, tmp_path: Path
 ) -> None:

@@ -108,6 +108,7 @@ def test_the_one_file_of_an_earlier_version_is_read(damaged: Path) -> None:
     assert messages(Recording(damaged)) == parts
 
 
+@pytest.mark.slow
 def test_a_long_run_has_many_parts_which_are_one_table(
     damaged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,6 +30,7 @@ def cell(run: Recording) -> Cell:
     return build_cell(config.robot, config.scene, config.clock_ns)
 
 
+@pytest.mark.slow
 def test_the_file_is_whole(run: Recording) -> None:
     verified = subprocess.run(
         [executable(), "rrd", "verify", run.folder / "run.rrd"], capture_output=True, text=True
@@ -37,6 +38,7 @@ def test_the_file_is_whole(run: Recording) -> None:
     assert verified.returncode == 0, verified.stderr
 
 
+@pytest.mark.slow
 def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
     ticks = run.signal("servo.status", "tick")
     for at, joint in enumerate(load("nasrem").robot.joints):
@@ -49,6 +51,7 @@ def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
             assert np.array_equal(rows.values, expected)
 
 
+@pytest.mark.slow
 def test_limits_are_the_arms(run: Recording, cell: Cell) -> None:
     rows = read(run.folder / "run.rrd", "/joints/j2/position/limits")
     assert np.array_equal(rows.values, np.tile(cell.bounds.position[1], (len(rows.values), 1)))
@@ -56,6 +59,7 @@ def test_limits_are_the_arms(run: Recording, cell: Cell) -> None:
     assert rows.ticks[-1] == run.signal("servo.status", "tick")[-1]
 
 
+@pytest.mark.slow
 def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
     states = dict(
         zip(
@@ -78,6 +82,7 @@ def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
     assert {"body/link6", "body/finger_left", "body/block1", "body/peg"} <= set(frames.values[:, 0])
 
 
+@pytest.mark.slow
 def test_the_planned_path_begins_where_the_tool_is(run: Recording) -> None:
     file = run.folder / "run.rrd"
     line = read(file, "/cell/planned_path", "LineStrips3D:strips").values[0][0]
@@ -87,6 +92,7 @@ def test_the_planned_path_begins_where_the_tool_is(run: Recording) -> None:
     assert line[-1] == pytest.approx(points.values[0][-1], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
     for task in run.layout.tasks:
         rows = read(
@@ -100,6 +106,7 @@ def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
         assert rows.values.ravel().tolist() == ["read", work, "write", "wait"] * len(cycles)
 
 
+@pytest.mark.slow
 def test_spans_of_a_lane_follow_one_another_and_stay_in_their_slices(run: Recording) -> None:
     for task in run.layout.tasks:
         times = sim_times(run, f"/boards/{task.slot}-{task.board}/{task.role}")
@@ -110,6 +117,7 @@ def test_spans_of_a_lane_follow_one_another_and_stay_in_their_slices(run: Record
         ).all()
 
 
+@pytest.mark.slow
 def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
     made, visible = (
         run.signal("elemental_move.status", "tick"),
@@ -125,6 +133,7 @@ def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
     assert rows.values.min() == pytest.approx(250.0)
 
 
+@pytest.mark.slow
 def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> None:
     end_ns = round(NASREM_S * 1e9)
     for chunk in (
@@ -139,6 +148,7 @@ def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> No
         assert times.max() <= end_ns + 2 * 10**9, chunk.entity_path
 
 
+@pytest.mark.slow
 def test_config_and_events_are_in_it(run: Recording) -> None:
     file = run.folder / "run.rrd"
     document = (
@@ -151,6 +161,7 @@ def test_config_and_events_are_in_it(run: Recording) -> None:
     assert [line.partition(":")[0] for line in lines] == [e["kind"] for e in shown]
 
 
+@pytest.mark.slow
 def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
     reader = RrdReader(str(run.folder / "run.rrd"))
     recorded = {path.replace("\\", "") for path in reader.store().schema().entity_paths()}
@@ -196,6 +207,7 @@ def sim_times(run: Recording, entity: str) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_lockstep_shows_no_time_that_is_held_against_the_clock(run: Recording) -> None:
     lateness, execution, deadline = read(run.folder / "run.rrd", "/times/servo").values.T
     assert np.isnan([lateness, deadline]).all()

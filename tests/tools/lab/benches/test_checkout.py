@@ -45,6 +45,7 @@ def test_a_checkout_runs_in_its_own_environment(
         other.run("fail", "now", bound_s=BOUND_S)
 
 
+@pytest.mark.slow
 def test_a_command_that_hangs_is_ended() -> None:
     waits = "import threading; threading.Event().wait()"
     command = RackCommand("other", (sys.executable, "-c", waits))
