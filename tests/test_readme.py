@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from rack.boards.faults import KINDS
 from rack.tools.cli import GROUPS
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
@@ -77,6 +78,12 @@ def test_the_pages_show_the_commands() -> None:
     rows = re.findall(r"^\| ([a-z ]+) \| (`.*`) \|$", table, re.MULTILINE)
     listed = {goal.capitalize(): tuple(re.findall(r"`(\w+)`", names)) for goal, names in rows}
     assert listed == GROUPS
+
+
+def test_the_pages_count_the_kinds_of_faults() -> None:
+    counts = re.findall(r"(\d+) kinds", TEXT)
+    assert len(counts) >= 2
+    assert {int(count) for count in counts if int(count) > 20} == {len([*KINDS])}
 
 
 def test_the_readme_is_a_front_door_and_pages_have_an_end() -> None:
