@@ -189,12 +189,14 @@ def _watch(
     rack.start(seconds)
     monitor = RackMonitor(rack.segment)
     standstill = Standstill(rack.segment)
-    while rack.watch(display.period_s):
+    is_running = True
+    while is_running:
+        # The last look is at the rack's end: a run in lockstep may be over between two.
+        is_running = rack.watch(display.period_s)
         display.show(monitor.look())
         _log_news(news, rack.segment, log)
         for event in standstill.look():
             log.add(event)
-    display.show(monitor.look())
     if rack.outcome is None:
         raise Failure("the run ended without an outcome")
     return rack.outcome

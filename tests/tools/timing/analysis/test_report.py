@@ -219,7 +219,7 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(
     )
     run_rack(
         load(tmp_path / "commanded.toml", [f"name={rack_name}", given]),
-        12.0,
+        48.0,
         tmp_path / "run",
         Watchful(),
     )
@@ -239,7 +239,7 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(
             "why": "hold",
             "since_s": 0.755,
             "until_s": None,
-            "lasted_s": 11.2425,
+            "lasted_s": 47.2425,
         },
     ]
     assert "## Holds: 2" in text.splitlines()
