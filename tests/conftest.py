@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from rack.boards.crate import line
+from rack.tools.recording import recorder_process
+from tests import warm
 from tests.machine import turn
 
 SMALL = f"""
@@ -75,6 +78,17 @@ def _turn(request: pytest.FixtureRequest) -> None:
     """Fail a test that has waited in vain: an error of the hook would end the whole session."""
     if _NO_TURN in request.node.stash:
         pytest.fail(request.node.stash[_NO_TURN])
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _in_stock() -> Iterator[None]:
+    """Start the crates and recorders of racks in this process from stock."""
+    warm.fill()
+    with pytest.MonkeyPatch.context() as patch:
+        for starter in (line, recorder_process):
+            patch.setattr(starter, "subprocess", warm.subprocess_in_stock)
+        yield
+    warm.clear()
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import children_of, descriptors, runs, wait_until
+from tests.warm import programs
 
 
 def refusal(rack: Rack) -> str:
@@ -70,10 +71,7 @@ def test_a_board_that_is_never_ready_is_named(
 def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> None:
     def kill_crate(event: Event) -> None:
         if event.kind == "launch":
-            crates = [
-                pid for pid in children_of(os.getpid()) if b"rack.boards.crate" in command_of(pid)
-            ]
-            for pid in crates:
+            for pid in programs("rack.boards.crate"):
                 os.kill(pid, signal.SIGKILL)
 
     rack = Rack(config(), kill_crate)
@@ -146,10 +144,6 @@ def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(
             ]
             assert set(boards) <= set(children_of(crate.pid))
         assert not runs(crate.pid)
-
-
-def command_of(pid: int) -> bytes:
-    return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 @pytest.mark.slow

@@ -4,9 +4,23 @@ from __future__ import annotations
 
 import os
 
+import pytest
+
 from rack.backplane.address_map import ALARM_DEPTH
-from rack.backplane.watch.alarms import MISSES, Alarm, AlarmWriter, alarm_ring
+from rack.backplane.ring import Ring
+from rack.backplane.watch.alarms import (
+    CLEAN_READS,
+    MISSES,
+    Alarm,
+    AlarmWriter,
+    Episodes,
+    alarm_ring,
+)
+from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
+
+EVERY = 4
+"""Ticks of a cycle of the mailbox's writer."""
 
 
 def test_alarms_are_read_as_they_were_rung(make_bus: MakeBus) -> None:
@@ -59,3 +73,65 @@ def test_an_alarm_wakes_the_rack_and_a_miss_does_not(make_bus: MakeBus) -> None:
         assert os.eventfd_read(attention) == len(Alarm) - len(MISSES)
     finally:
         os.close(attention)
+
+
+@pytest.fixture
+def episodes(make_bus: MakeBus) -> tuple[Episodes, Ring]:
+    """Episodes about the second of two mailboxes, and the ring of the task that finds them."""
+    other, box = mailbox(name="writer.other"), mailbox(every=EVERY, delay=EVERY)
+    segment = make_bus(other, box)
+    return Episodes(segment, box.name, AlarmWriter(segment, "reader")), alarm_ring(
+        segment, "reader"
+    )
+
+
+def rung(ring: Ring) -> list[tuple[int, int, float, int]]:
+    """Return code, tick, value and since of the alarms since the last call, all about mailbox 1."""
+    rows = ring.drain().rows
+    assert set(rows["subject"].tolist()) <= {1}
+    return [
+        (row["code"], row["tick"], row["value"], row["since"])
+        for row in (dict(zip(rows.dtype.names, row, strict=True)) for row in rows.tolist())
+    ]
+
+
+def test_a_finding_that_lasts_raises_one_alarm_with_what_was_found(
+    episodes: tuple[Episodes, Ring],
+) -> None:
+    found, ring = episodes
+    found.find(Alarm.STALE, 1, 10)
+    found.find(Alarm.STALE, 2, 11, 5.0, since=3)
+    found.find(Alarm.GAP, 2, 11, 5.0, since=3)
+    assert rung(ring) == [(Alarm.STALE, 10, 0.0, 10), (Alarm.GAP, 11, 5.0, 3)]
+
+
+@pytest.mark.parametrize(
+    ("accesses", "ticks", "is_open"),
+    [
+        (CLEAN_READS, 1000, True),
+        (CLEAN_READS + 1, CLEAN_READS * EVERY, True),
+        (CLEAN_READS + 1, CLEAN_READS * EVERY + 1, False),
+    ],
+)
+def test_an_episode_ends_after_both_enough_clean_accesses_and_cycles_of_the_writer(
+    episodes: tuple[Episodes, Ring], accesses: int, ticks: int, is_open: bool
+) -> None:
+    found, ring = episodes
+    found.find(Alarm.STALE, 1, 10)
+    # The later finding counts from now on.
+    found.find(Alarm.STALE, 7, 30)
+    assert found.is_open(Alarm.STALE, 7 + accesses, 30 + ticks) is is_open
+    assert not found.is_open(Alarm.GAP, 7, 30)
+    rung(ring)
+    found.find(Alarm.STALE, 7 + accesses, 30 + ticks)
+    assert len(rung(ring)) == (0 if is_open else 1)
+
+
+def test_a_caller_that_knows_of_an_episode_raises_its_alarm_at_once(
+    episodes: tuple[Episodes, Ring],
+) -> None:
+    found, ring = episodes
+    found.ring(Alarm.STALE, 10)
+    found.ring(Alarm.STALE, 11, 2.0, since=4)
+    assert rung(ring) == [(Alarm.STALE, 10, 0.0, 10), (Alarm.STALE, 11, 2.0, 4)]
+    assert not found.is_open(Alarm.STALE, 1, 12)

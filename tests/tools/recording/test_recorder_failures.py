@@ -39,6 +39,7 @@ from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import executable
 from tests.processes import children_of
 from tests.shared_runs import small_run
+from tests.warm import programs
 
 WATCHDOG_S = 30.0
 FIRST_BLOCK = 400
@@ -226,8 +227,8 @@ class AtTick(Display):
     def show(self, snapshot: Snapshot) -> None:
         """Look at the tick, and at the viewer's file."""
         if snapshot.tick > self._tick and len(self.struck) < self._times and self._has_view():
-            for pid in children_of(os.getpid()):
-                if pid not in self.struck and b"rack.tools.recording.recorder" in command_of(pid):
+            for pid in programs("rack.tools.recording.recorder"):
+                if pid not in self.struck:
                     self.struck.append(pid)
                     self.strike(pid)
 
@@ -248,10 +249,6 @@ class FillingDisk(AtTick):
         """Fill the disk."""
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, 4096))
         self.full_at = time.monotonic()
-
-
-def command_of(pid: int) -> bytes:
-    return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 def notes_of(recording: Recording) -> list[str]:

@@ -1,0 +1,218 @@
+"""Programs that tests start often, ready to run: forked from a process that has their libraries.
+
+Each rack has a crate and most have a recorder, and to import numpy, pydantic and pyarrow for them
+would be most of the suite's processor time. A stock process imports a program's libraries, and runs
+nothing of it. Each start is a fork of it that runs the program from the top of its `__main__` on: a
+child of the test's process, with the arguments, environment, folder and descriptors that
+`subprocess` would give it.
+
+What such a fork would not inherit starts as ever: in a process that a test has forked, or whose
+user, limits, processors or namespaces are not those that the tests began with. Racks that tests
+launch by a command start as ever, too.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import gc
+import importlib
+import os
+import pickle
+import resource
+import runpy
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Lock
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+from rack.boards.crate.line import environment
+from tests.processes import children_of
+
+LIBRARIES = {
+    "rack.boards.crate": ("rack.boards.crate.crate",),
+    "rack.tools.recording.recorder": (
+        "rack.boards.config.commands",
+        "rack.levels.systems.joint_boards.messages",
+        "rack.tools.recording.recorder.recorder",
+        "rack.tools.viewer.sink",
+    ),
+}
+"""What each program imports."""
+PR_SET_CHILD_SUBREAPER = 36
+FIRST_FREE = 1 << 10
+"""Descriptors wait up here for their own numbers, so that none takes another's."""
+MOST_FDS = 8
+MOST_BYTES = 1 << 17
+
+
+class Order(NamedTuple):
+    """A program to run; the descriptors sent with it are to have these numbers."""
+
+    module: str
+    arguments: Sequence[str]
+    environment: dict[str, str]
+    folder: str
+    numbers: Sequence[int]
+
+
+def standing() -> tuple[object, ...]:
+    """Return what a child inherits besides what an order says."""
+    limits = [getattr(resource, name) for name in dir(resource) if name.startswith("RLIMIT_")]
+    return (
+        os.getpid(),
+        os.getresuid(),
+        os.getresgid(),
+        os.nice(0),
+        os.sched_getscheduler(0),
+        os.sched_getaffinity(0),
+        [resource.getrlimit(limit) for limit in limits],
+        [Path(f"/proc/self/ns/{name}").readlink() for name in ("mnt", "net", "pid", "user")],
+    )
+
+
+USUAL = standing()
+
+
+class Stock:
+    """The near end of a process that has a program's libraries."""
+
+    def __init__(self, module: str) -> None:
+        self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._process = subprocess.Popen(
+            [sys.executable, "-u", "-m", "tests.warm", str(theirs.fileno()), module],
+            pass_fds=(theirs.fileno(),),
+            stdin=subprocess.DEVNULL,
+            env=environment(),
+        )
+        theirs.close()
+        self.pid = self._process.pid
+        self._lock = Lock()
+
+    def start(self, order: Order, fds: Sequence[int]) -> int:
+        """Start a program as a child of this process; return its process id."""
+        with self._lock:
+            # An orphan becomes the child of the next process above it that asks for orphans.
+            _adopt_orphans(True)
+            try:
+                socket.send_fds(self._line, [pickle.dumps(order)], fds)
+                return int(self._line.recv(MOST_BYTES))
+            finally:
+                _adopt_orphans(False)
+
+    def close(self) -> None:
+        """End it."""
+        self._line.close()
+        self._process.kill()
+        self._process.wait()
+
+
+STOCKS: dict[str, Stock] = {}
+"""By module of the program."""
+
+
+def fill() -> None:
+    """Start the stocks."""
+    STOCKS.update({module: Stock(module) for module in LIBRARIES})
+
+
+def clear() -> None:
+    """End the stocks."""
+    while STOCKS:
+        STOCKS.popitem()[1].close()
+
+
+def programs(module: str) -> list[int]:
+    """Return the children of this process that run a program, without its stock."""
+    stocks = {stock.pid for stock in STOCKS.values()}
+    return [
+        pid
+        for pid in children_of(os.getpid())
+        if pid not in stocks and module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
+
+
+class Popen(subprocess.Popen[bytes]):
+    """`subprocess.Popen` for `python -m MODULE ...` with a MODULE that is in stock."""
+
+    def _execute_child(self, *given: Any) -> None:
+        args, _, _, _, pass_fds, _, env, *_ = given
+        # Of stdin, stdout and stderr, the program's end and this process's, -1 where it has none.
+        pipes = given[10:16]
+        numbers = [0, 1, 2, *pass_fds]
+        if standing() != USUAL or max(numbers) >= FIRST_FREE:
+            super()._execute_child(*given)  # type: ignore[misc]
+            return
+        module, *arguments = args[args.index("-m") + 1 :]
+        order = Order(module, arguments, dict(env), str(Path.cwd()), numbers)
+        self.pid = STOCKS[module].start(order, [pipes[0], pipes[3], pipes[5], *pass_fds])
+        self._child_created = True
+        self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
+
+
+subprocess_in_stock = SimpleNamespace(**{**vars(subprocess), "Popen": Popen})
+"""What stands for the module `subprocess` where a rack's programs are started."""
+
+
+def _adopt_orphans(adopts: bool) -> None:
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(adopts), 0, 0, 0)
+
+
+def served(line: socket.socket) -> Order | None:
+    """Fork a process for each order, until the other end is closed; in such a process, return what
+    it is to run."""
+    while True:
+        data, fds, _, _ = socket.recv_fds(line, MOST_BYTES, MOST_FDS)
+        if not data:
+            return None
+        starter = os.fork()
+        if starter == 0:
+            starter = os.getpid()
+            if os.fork():
+                os._exit(0)
+            while os.getppid() == starter:
+                os.sched_yield()
+            line.send(str(os.getpid()).encode())
+            order: Order = pickle.loads(data)
+            _take_over(order, fds)
+            return order
+        os.waitpid(starter, 0)
+        for fd in fds:
+            os.close(fd)
+
+
+def _take_over(order: Order, fds: Sequence[int]) -> None:
+    """Be as the order's program is when it begins."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    waiting = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, FIRST_FREE) for fd in fds]
+    os.closerange(3, FIRST_FREE)
+    for fd, number in zip(waiting, order.numbers, strict=True):
+        os.dup2(fd, number)
+        os.close(fd)
+    os.chdir(order.folder)
+    os.environ.clear()
+    os.environ.update(order.environment)
+    sys.argv[1:] = order.arguments
+    given = order.environment["PYTHONPATH"].split(os.pathsep)
+    sys.path[:] = [order.folder, *dict.fromkeys([*given, *sys.path])]
+
+
+def main() -> None:
+    """Keep a program in stock; the arguments are the descriptor of the line, and its module."""
+    # Ctrl-C is for the tests.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    number, module = sys.argv[1:]
+    for library in LIBRARIES[module]:
+        importlib.import_module(library)
+    gc.freeze()
+    if order := served(socket.socket(fileno=int(number))):
+        runpy.run_module(order.module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()
