@@ -15,7 +15,7 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
-from tests.boards.test_host_side import HOSTED
+from tests.boards.host.test_board import HOSTED
 from tests.processes import RACK
 from tests.tools.command_line import rack
 

@@ -14,9 +14,9 @@ from rack.boards.config.timing import without_interrupts
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
 from rack.levels.timing.verdicts import INBOX, verdicts
+from tests.boards.host.test_board import HOSTED
 from tests.boards.lan.racks import rack_text
 from tests.boards.run.test_interrupts import BOARDS, RACK
-from tests.boards.test_host_side import HOSTED
 from tests.boards.test_queues import QUEUES
 
 INTERRUPT = "protocol.default=interrupt"

@@ -14,7 +14,7 @@ from rack.boards import Rack
 from rack.boards.host.bus_adapter import LONGEST_S
 from rack.tools.faults.ending import strikes
 from tests.boards.conftest import MakeConfig
-from tests.boards.test_host_side import ENDS, HOSTED, codes, status, watch
+from tests.boards.host.test_board import ENDS, HOSTED, codes, status, watch
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow

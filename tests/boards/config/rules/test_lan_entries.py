@@ -16,7 +16,7 @@ from rack.boards.errors import ConfigError
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text("one", "tcp/127.0.0.1:7447", [], "two", peers=["three"])
-TESTS = Path(__file__).parents[2]
+TESTS = Path(__file__).parents[3]
 MISTAKES = {
     "a rate that does not divide": (
         ["adapter.lan.import.other.rate_hz=15"],

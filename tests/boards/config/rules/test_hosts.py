@@ -8,7 +8,7 @@ from rack.boards.config import resolve
 from rack.boards.config.resolved import loads
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.errors import ConfigError
-from tests.boards.test_host_side import HOSTED
+from tests.boards.host.test_board import HOSTED
 
 IDLE = "rack.levels.host_program:HostProgram"
 MISTAKES = {
