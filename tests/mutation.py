@@ -321,7 +321,9 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
             _clear(run, folder)
     text = output.read_text(errors="replace")
     failed = tuple(
-        re.findall(r"^(?:FAILED|ERROR) (\S+\.py(?:::(?:\S|\[.*?\])+)?)", text, re.MULTILINE)
+        re.findall(
+            r"^(?:FAILED|ERROR) (\S+\.py(?:::[^\s\[]+(?:\[.*?\](?= - |$))?)?)", text, re.MULTILINE
+        )
     )
     # 5: all tests that there are were left out.
     if status in (0, 5):

@@ -1,0 +1,310 @@
+"""A bus adapter on a backplane without processes: what crosses it in which cycle, and what it
+counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from rack.backplane import semaphores
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import State
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.classes import find_class
+from rack.boards.config import resolve
+from rack.boards.config.resolved import Resolved
+from rack.boards.host.bus import HostBus
+from rack.boards.host.bus_adapter import BusAdapter
+from rack.boards.host.entries import NEVER, EntryConfig, Outward, Replayed
+from rack.boards.run.ports import InputPorts, OutputPorts
+from rack.levels.level import Ports
+from tests.boards.conftest import MakeConfig
+from tests.boards.host.test_board import HOSTED
+
+EVERY = 4
+"""Ticks of a cycle of the bridge."""
+NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
+
+
+class Site:
+    """A backplane with the bridge's adapter and its host board's program at their ends of it."""
+
+    def __init__(self, plan: Resolved, segment: Segment) -> None:
+        self.plan = plan
+        self.segment = segment
+        self.host = segment.block("program")
+        self.adapter = self.started()
+        self.tick = -EVERY
+
+    def started(self) -> BusAdapter:
+        """Return an adapter, as a board that begins has it, with its ports."""
+        (wiring,) = (task for task in self.plan.tasks if task.task == "bridge")
+        adapter = find_class(wiring.target, BusAdapter)(wiring.context)
+        adapter.attach(self.segment, None)
+        alarms = AlarmWriter(self.segment, "bridge")
+        self.inputs = InputPorts(self.segment, wiring.inputs, alarms)
+        self.outputs = OutputPorts(self.segment, wiring.outputs, alarms, self.inputs, wiring.sent)
+        return adapter
+
+    def restart(self) -> None:
+        """Replace the adapter, as after the end of its board's process."""
+        for writer in self.outputs.writers.values():
+            writer.close()
+        for _, entry in self.adapter._entries:
+            if isinstance(entry, Outward):
+                entry._writer.close()
+        self.adapter = self.started()
+
+    def cycle(self) -> None:
+        """Do the next cycle."""
+        self.tick += EVERY
+        self.inputs.read(self.tick)
+        self.adapter.process(self.inputs.values, self.outputs.messages, self.tick)
+        assert self.outputs.write(self.tick, None)
+
+    @property
+    def status(self) -> Any:
+        """The newest status."""
+        return open_observer(self.segment, "bridge.status").peek().value
+
+    def count(self, port: str) -> dict[str, int]:
+        """Return what the newest status counts of an entry, but for what is zero."""
+        record = getattr(self.status, port)
+        return {name: int(record[name]) for name in record.dtype.names if record[name]}
+
+    def crossed(self) -> list[float]:
+        """Return the numbers that are in the bridge's own mailbox, oldest first."""
+        reading = open_observer(self.segment, "bridge.numbers").peek()
+        values = [*reading.earlier, reading.value] if reading.is_there else []
+        return [message.value for message in values]
+
+
+MakeSite = Callable[..., Site]
+
+
+@pytest.fixture
+def make_site(config: MakeConfig) -> Iterator[MakeSite]:
+    """Make the one site of a test."""
+    with ExitStack() as stack:
+
+        def make(*settings: str) -> Site:
+            plan = resolve(config(*settings, text=HOSTED))
+            segment = Segment.create(plan.layout, "")
+            stack.callback(unlink, plan.layout.rack)
+            stack.callback(segment.close)
+            semaphores.create(plan.layout)
+            stack.callback(semaphores.unlink_all, plan.layout.rack)
+            semaphores.open_all(plan.layout)
+            return Site(plan, segment)
+
+        yield make
+
+
+@pytest.fixture
+def open_bus() -> Iterator[Callable[[Site], HostBus]]:
+    """Open the program's end of a site."""
+    with ExitStack() as stack:
+
+        def open_it(site: Site) -> HostBus:
+            bus = HostBus(site.segment, site.plan.hosts[0])
+            stack.callback(bus.close)
+            return bus
+
+        yield open_it
+
+
+OpenBus = Callable[[Site], HostBus]
+
+
+def test_each_message_crosses_once_and_in_order_as_many_as_a_cycle_may_take(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
+    site = make_site("board.bridge.params.pass.numbers.most=3")
+    bus = open_bus(site)
+    sent = [bus.send("numbers", value=float(k)) for k in range(1, 6)]
+    assert sent == [True] * 5
+    assert bus.sent("numbers") == 5
+    site.cycle()
+    assert site.count("numbers") == {"passed": 3, "waiting": 2}
+    site.segment.words[System.TICK] = 6
+    site.cycle()
+    # Written at tick 0, passed in the cycle of tick 4.
+    assert site.count("numbers") == {"passed": 5, "arrived": 4, "age": 4}
+    site.cycle()
+    assert site.count("numbers") == {"passed": 5, "arrived": 4, "age": 8}
+
+
+def test_of_messages_that_are_sampled_the_newest_crosses(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
+    site = make_site(*NEWEST)
+    bus = open_bus(site)
+    for k in range(1, 4):
+        assert bus.send("numbers", value=float(k))
+    site.cycle()
+    assert (site.crossed(), site.count("numbers")) == ([3.0], {"passed": 1, "superseded": 2})
+    site.cycle()
+    assert site.count("numbers") == {"passed": 1, "superseded": 2, "age": EVERY}
+
+
+@pytest.mark.parametrize("settings", [(), NEWEST])
+def test_what_no_number_may_be_is_refused_and_counted(
+    make_site: MakeSite, open_bus: OpenBus, settings: tuple[str, ...]
+) -> None:
+    site = make_site(*settings)
+    bus = open_bus(site)
+    site.cycle()
+    assert bus.send("numbers", value=float("nan"))
+    site.cycle()
+    nothing_yet = {"arrived": NEVER, "age": NEVER}
+    assert site.count("numbers") == {"refused": 1} | nothing_yet
+    assert not any(site.crossed())
+
+
+def test_a_full_ring_refuses_and_the_bridge_says_how_often(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
+    site = make_site()
+    bus = open_bus(site)
+    capacity = site.segment.layout.mailbox("program.numbers").capacity
+    answers = [bus.send("numbers") for _ in range(capacity + 2)]
+    assert answers == [True] * capacity + [False] * 2
+    site.cycle()
+    assert site.count("numbers")["full"] == 2
+
+
+def test_what_a_program_still_computes_does_not_cross(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
+    site = make_site()
+    assert open_bus(site).send("numbers", value=1.0)
+    site.host[Block.DEADLINE] = EVERY
+    site.cycle()
+    assert site.count("numbers") == {"waiting": 1, "arrived": NEVER, "age": NEVER}
+    site.cycle()
+    assert site.count("numbers") == {"passed": 1, "arrived": EVERY, "age": EVERY}
+
+
+def test_a_restarted_bridge_counts_on_and_repeats_what_it_said(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
+    site = make_site(*NEWEST)
+    bus = open_bus(site)
+    for value in (1.0, 2.0, float("nan")):
+        bus.send("numbers", value=value)
+    site.cycle()
+    before = site.count("numbers")
+    assert before == {"passed": 1, "refused": 1, "superseded": 1}
+    site.restart()
+    bus.send("numbers", value=float("nan"))
+    site.cycle()
+    assert site.crossed() == [2.0]
+    assert site.count("numbers") == before | {"refused": 2, "age": EVERY}
+    site.restart()
+    for value in (3.0, 4.0):
+        bus.send("numbers", value=value)
+    site.cycle()
+    assert site.crossed() == [4.0]
+    assert site.count("numbers") == {
+        "passed": 2,
+        "refused": 2,
+        "superseded": 2,
+        "arrived": 2 * EVERY,
+        "age": 2 * EVERY,
+    }
+
+
+def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: OpenBus) -> None:
+    site = make_site()
+    bus = open_bus(site)
+    semaphore = wake_semaphore(site.segment.rack, "program")
+    site.cycle()
+    assert (semaphore.value, site.count("sum")) == (0, {"arrived": NEVER, "age": NEVER})
+    level = OutputPorts(
+        site.segment,
+        {"status": "adder.status"},
+        AlarmWriter(site.segment, "adder"),
+        InputPorts(site.segment, {}, AlarmWriter(site.segment, "adder")),
+    )
+    level.messages.status.sum = 2.5
+    assert level.write(1, None)
+    site.host[Block.WAITS_UNTIL] = 50
+    for _ in range(2):
+        site.cycle()
+        assert semaphore.value == 1
+        assert site.host[Block.WAITS_UNTIL] == 0
+    # A sample crosses in each cycle; it was written at tick 1.
+    assert site.count("sum") == {"passed": 2, "arrived": 8, "age": 7}
+    assert bus.wait(0.0)
+    assert bus.read("sum").value.sum == 2.5
+    assert not bus.wait(0.0)
+
+
+STATES = [
+    (TaskState.RUNNING, 0, State.EXECUTING, ""),
+    (TaskState.RUNNING, 7, State.HOLDING, "host board 'program' is lost: it is being restarted"),
+    (TaskState.GIVEN_UP, 0, State.ERROR, "host board 'program' was given up"),
+    (TaskState.GIVEN_UP, 7, State.HOLDING, "host board 'program' is lost: it is being restarted"),
+    (TaskState.ENDED, 0, State.DONE, ""),
+]
+
+
+@pytest.mark.parametrize(("state", "lost", "expected", "reason"), STATES)
+def test_a_bridge_says_how_its_programs_are(
+    make_site: MakeSite, state: TaskState, lost: int, expected: State, reason: str
+) -> None:
+    site = make_site()
+    site.host[Block.STATE] = state
+    site.host[Block.LOST] = lost
+    site.cycle()
+    status = site.status
+    assert (status.state, status.error, status.reason) == (expected, 0, reason)
+    site.host[Block.STATE] = TaskState.RUNNING
+    site.host[Block.LOST] = 0
+    site.cycle()
+    assert (site.status.state, site.status.reason) == (State.EXECUTING, "")
+
+
+@pytest.mark.parametrize(("every", "phase", "due"), [(1, 0, [0, 1, 2, 3]), (3, 1, [1])])
+def test_an_entry_is_due_in_its_cycles(every: int, phase: int, due: list[int]) -> None:
+    entry = EntryConfig.model_validate({"from": "a.b", "every": every, "phase": phase})
+    assert [cycle for cycle in range(4) if entry.is_due(cycle)] == due
+
+
+class Out:
+    """A port that notes what is sent."""
+
+    def __init__(self) -> None:
+        self.raw = bytearray(1)
+        self.sent: list[int] = []
+
+    def send(self) -> None:
+        """Note it."""
+        self.sent.append(self.raw[0])
+
+
+@pytest.mark.parametrize(
+    ("is_queued", "since", "expected"),
+    [
+        (True, NEVER, [[1], [1, 2, 3], [1, 2, 3]]),
+        (True, 4, [[], [3], [3]]),
+        (False, 4, [1, 3, 3]),
+    ],
+)
+def test_a_replay_gives_out_what_was_written_at_its_ticks(
+    is_queued: bool, since: int, expected: list[object]
+) -> None:
+    rows = [(0, b"\1"), (4, b"\2"), (8, b"\3"), (12, b"\4")]
+    replayed = Replayed(rows, "port", is_queued, since)
+    out = Out()
+    seen: list[object] = []
+    for tick in (3, 8, 11):
+        replayed.exchange(Ports(), Ports(port=out), tick)
+        seen.append(list(out.sent) if is_queued else out.raw[0])
+    assert seen == expected
