@@ -28,7 +28,9 @@ from rack.boards.lan.clocks import (
     ANSWER_NS,
     MOST_ASKERS,
     RECENT,
+    UNKNOWN_NS,
     ClockOffset,
+    Clocks,
     PeerClock,
     Responder,
     RoundTrip,
@@ -36,10 +38,10 @@ from rack.boards.lan.clocks import (
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import Arrived
-from rack.boards.lan.peers import PeerRack
+from rack.boards.lan.peers import PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.viewer.window import free_port
-from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS
+from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS, Found
 
 ROOT = Path(__file__).resolve().parents[3]
 S, MS, US = 1_000_000_000, 1_000_000, 1_000
@@ -122,6 +124,13 @@ def test_what_cannot_be_a_round_trip_is_refused(bad: RoundTrip) -> None:
     assert found.best is None
 
 
+def test_a_round_trip_that_takes_no_time_is_one() -> None:
+    found = ClockOffset()
+    assert found.add(RoundTrip(100, 500, 500, 100))
+    assert found.add(RoundTrip(200, 600, 610, 210))
+    assert (len(found), found.steps) == (2, 0)
+
+
 def test_another_launch_and_a_loss_begin_anew() -> None:
     peer = PeerRack("b")
     clock = PeerClock(peer)
@@ -136,6 +145,24 @@ def test_another_launch_and_a_loss_begin_anew() -> None:
         change()
         clock.begin()
         assert (clock.offset.best is None) == (peer.offset_ns is None) == is_anew
+
+
+def test_what_was_measured_of_an_earlier_launch_is_forgotten() -> None:
+    peer = PeerRack("b")
+    peer.comes(7, 0)
+    clock = PeerClock(peer)
+    assert clock.time_ns(10 * S) == 0
+    clock.begin()
+    clock.epoch_ns, clock.period_ns, clock.clock_ns, clock.due_ns = 4 * S, 2 * MS, 5 * MS, 9
+    clock.sent[1] = 2
+    clock.begin()
+    # Two and a half times as fast as time, since 4 s.
+    assert (clock.time_ns(4 * S - 1), clock.time_ns(6 * S)) == (0, 5 * S)
+    assert (clock.due_ns, clock.sent) == (9, {1: 2})
+    peer.comes(8, 1)
+    clock.begin()
+    assert (clock.epoch_ns, clock.clock_ns, clock.due_ns, clock.sent) == (0, 0, 0, {})
+    assert clock.time_ns(6 * S) == 0
 
 
 @pytest.fixture
@@ -155,6 +182,51 @@ def test_a_message_counts_as_old_as_it_may_be(segment: Segment) -> None:
     assert grid.tick_of(head, peer, tick=50) == 10
     peer.uncertainty_ns = 3 * PERIOD_NS
     assert grid.tick_of(head, peer, tick=50) == 7
+
+
+def test_a_clock_that_does_not_answer_is_reported_after_its_time(segment: Segment) -> None:
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    peers = Peers(["b"])
+    clocks = Clocks(segment, peers, 1, OwnGrid(segment, 1))
+    bound = UNKNOWN_NS // PERIOD_NS
+    peer = peers["b"]
+    assert not clocks.is_unanswered(peer, 10 * bound)
+    peer.comes(7, 5)
+    assert [clocks.is_unanswered(peer, 5 + ticks) for ticks in (bound, bound + 1)] == [False, True]
+    peer.offset_ns = 0
+    assert not clocks.is_unanswered(peer, 5 + bound + 1)
+    peer.offset_ns = None
+    segment.words[System.LOCKSTEP] = 1
+    stepped = Clocks(segment, peers, 1, OwnGrid(segment, 1))
+    assert not stepped.is_unanswered(peer, 5 + bound + 1)
+
+
+def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> None:
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    segment.words[System.EPOCH_NS] = 100 * S
+    peers = Peers(["b"])
+    clocks = Clocks(segment, peers, 1, OwnGrid(segment, 1))
+    clocks.fill(out := Found(), "b", 4)
+    assert vars(out) == {
+        "steps": 0,
+        "offset": 0.0,
+        "ahead": 0.0,
+        "speed": 0.0,
+        "uncertainty": -1.0,
+        "round_trip": -1.0,
+    }
+    peers["b"].comes(7, 0)
+    clock = clocks._clocks["b"]
+    clock.epoch_ns, clock.period_ns, clock.clock_ns = 1100 * S, 2 * MS, 5 * MS
+    clock.offset.add(trip(101 * S, 1000 * S, 300 * US, 100 * US))
+    clocks._now_ns = 102 * S
+    clocks.fill(out, "b", tick=800)
+    # Of both ways' 0.4 ms the half, and what a clock drifts in a second.
+    assert out.uncertainty == pytest.approx(200e-6 + DRIFT_PPM * 1e-6, rel=1e-5)
+    assert (out.round_trip, out.speed, out.steps) == (400e-6, 2.5, 0)
+    assert out.offset == pytest.approx(1000.0001, abs=1e-9)
+    # Ours is at 2 s of simulated time, 1 s after its tick 0; theirs began at the same time.
+    assert out.ahead == pytest.approx(2.5 * 1.0001 - 2.0, abs=1e-6)
 
 
 class Answers:

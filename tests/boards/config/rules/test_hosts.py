@@ -137,3 +137,14 @@ def test_a_bridge_and_its_host_boards_are_in_the_layout() -> None:
     bridge = next(task for task in resolved.tasks if task.task == "bridge")
     assert dict(bridge.inputs) == {"sum": "adder.status"}
     assert set(bridge.outputs) == {"numbers", "status"}
+
+
+def test_a_host_board_with_a_mistake_hides_none_of_another_and_causes_none() -> None:
+    other = 'program = "host_programs:Nobody"\nbelow = "bridge"'
+    text = HOSTED.replace("[host.program]", "[host.program]\ncomputing_ms = -1")
+    with pytest.raises(ConfigError) as caught:
+        loads(f"{text}\n[host.other]\n{other}\n")
+    assert [mistake.place for mistake in caught.value.mistakes] == [
+        "host.program.computing_ms",
+        "host.other.program",
+    ]

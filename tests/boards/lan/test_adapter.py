@@ -1,0 +1,168 @@
+"""A network adapter on a backplane without processes: what it demands and says of the other
+racks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.message import Field, MessageType
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import System, is_on
+from rack.boards.classes import find_class
+from rack.boards.config import resolve
+from rack.boards.lan.adapter import LanAdapter
+from rack.boards.lan.clocks import UNKNOWN_NS
+from tests.boards.lan.racks import configs, rack_text
+
+EVERY = 8
+"""Ticks of the adapter's cycle."""
+PERIOD_NS = 2_500_000
+STOP = 'on_peer_loss = "stop"'
+FIRST, SECOND = 7, 8
+"""Launches of the other rack."""
+
+MakeAdapter = Callable[..., tuple[LanAdapter, Segment]]
+Change = tuple[str, int, bool]
+
+
+@pytest.fixture
+def make(rack_name: str, tmp_path: Path) -> Iterator[MakeAdapter]:
+    """Make the one adapter of a test: what comes and goes is what its list has."""
+    with ExitStack() as stack:
+
+        def make_one(
+            changes: list[Change], lan: str = "", *, lockstep: bool = False
+        ) -> tuple[LanAdapter, Segment]:
+            text = rack_text(rack_name, "tcp/127.0.0.1:7447", (), "b", peers=("b",), lan=lan)
+            mode = "lockstep" if lockstep else "realtime"
+            (config,) = configs([text], tmp_path, f"clock.mode={mode}")
+            plan = resolve(config)
+            segment = Segment.create(plan.layout, "")
+            stack.callback(unlink, rack_name)
+            stack.callback(segment.close)
+            segment.words[System.LOCKSTEP] = lockstep
+            segment.words[System.PERIOD_NS] = PERIOD_NS
+            (wiring,) = (task for task in plan.tasks if task.task == "lan")
+            adapter = find_class(wiring.target, LanAdapter)(wiring.context)
+            adapter.attach(segment, None)
+
+            def taken() -> Iterator[Change]:
+                while changes:
+                    yield changes.pop(0)
+
+            adapter._peers.watch(taken, lockstep)
+            return adapter, segment
+
+        yield make_one
+
+
+def test_a_lost_rack_stops_the_arm_at_once_and_one_that_is_back_lets_it_go(
+    make: MakeAdapter,
+) -> None:
+    changes: list[Change] = []
+    adapter, segment = make(changes, STOP)
+    stop = segment.words[System.PEER_STOP]
+
+    def look(tick: int, *seen: Change) -> int:
+        changes.extend(seen)
+        adapter._look(tick)
+        return segment.words[System.PEER_STOP]
+
+    # One that has not come yet is not lost.
+    assert look(8) == stop == 0
+    assert look(16, ("b", FIRST, True)) == 0
+    lost = look(24, ("b", FIRST, False))
+    assert [is_on(lost, tick) for tick in (23, 24)] == [False, True]
+    assert look(32) == lost
+    back = look(40, ("b", FIRST, True))
+    assert [is_on(back, tick) for tick in (39, 40)] == [True, False]
+
+
+def test_in_lockstep_a_demand_counts_from_the_next_cycle(make: MakeAdapter) -> None:
+    changes: list[Change] = [("b", FIRST, True)]
+    adapter, segment = make(changes, STOP, lockstep=True)
+    adapter._look(8)
+    changes.append(("b", FIRST, False))
+    adapter._look(16)
+    word = segment.words[System.PEER_STOP]
+    assert [is_on(word, tick) for tick in (16 + EVERY - 1, 16 + EVERY)] == [False, True]
+
+
+def test_where_a_rack_is_to_go_on_alone_no_loss_stops_the_arm(make: MakeAdapter) -> None:
+    changes: list[Change] = [("b", FIRST, True), ("b", FIRST, False)]
+    adapter, segment = make(changes, 'on_peer_loss = "go on"')
+    adapter._look(8)
+    assert adapter._peers.lost == ["b"]
+    assert segment.words[System.PEER_STOP] == 0
+
+
+def test_a_rack_that_comes_is_sent_everything_anew(make: MakeAdapter) -> None:
+    changes: list[Change] = []
+    adapter, _ = make(changes)
+    (export,) = adapter._exports.values()
+    export.is_asked = False
+    adapter._look(8)
+    assert not export.is_asked
+    changes.append(("stranger", FIRST, True))
+    adapter._look(16)
+    assert export.is_asked
+
+
+SENT = MessageType("sent", 1, (Field("value", "f8", "1", "a number"),))
+IMPORTED = {"from": "b/pulse.status", "type": "lan_levels:PULSE", "rate_hz": 50, "max_age_ms": 100}
+EXPORTED = {"from": "pulse.status", "rate_hz": 50}
+
+
+@pytest.mark.parametrize(
+    ("exports", "imports", "is_whole"),
+    [
+        ({"out": EXPORTED}, {"other": IMPORTED}, True),
+        ({"out": {**EXPORTED, "from": "nobody.status"}}, {"other": IMPORTED}, False),
+        ({"out": EXPORTED}, {"other": {**IMPORTED, "type": "lan_levels:NOTHING"}}, False),
+    ],
+)
+def test_ports_are_whole_if_every_message_is_known(
+    exports: dict[str, object], imports: dict[str, object], is_whole: bool
+) -> None:
+    params = {
+        "listen": ["tcp/127.0.0.1:7447"],
+        "peers": ["b"],
+        "export": exports,
+        "import": imports,
+    }
+    made = LanAdapter.made_ports(params, {"pulse.status": SENT})
+    assert made.is_whole is is_whole
+    assert {"status", "peer_b"} <= set(made.outputs)
+    assert ("other" in made.outputs) == (imports["other"] is IMPORTED)
+    assert list(made.inputs) == (["out"] if exports["out"] is EXPORTED else [])
+
+
+def test_what_keeps_the_exchange_from_its_work_is_said(make: MakeAdapter) -> None:
+    changes: list[Change] = []
+    adapter, _ = make(changes)
+
+    def said(tick: int, *seen: Change) -> str:
+        changes.extend(seen)
+        adapter._look(tick)
+        return adapter._trouble(tick)
+
+    assert said(0) == "rack 'b' is not there yet"
+    assert said(8, ("b", FIRST, True)) == ""
+    unknown = 8 + UNKNOWN_NS // PERIOD_NS
+    assert said(unknown) == ""
+    assert said(unknown + 1) == "clock of rack 'b' is not known: it does not answer pings"
+    adapter._peers["b"].offset_ns = 0
+    assert said(unknown + 1) == ""
+    assert said(unknown + 1, ("b", SECOND, True)) == "2 racks are named 'b'"
+    assert said(unknown + 1, ("b", FIRST, False)) == ""
+    assert said(unknown + 1, ("b", SECOND, False)) == "rack 'b' is lost"
+    assert said(unknown + 1, ("b", SECOND, True)) == ""
+    (entry,) = adapter._imports.values()
+    entry._basis = unknown
+    # Permitted are 100 ms.
+    assert said(unknown + 40) == ""
+    assert said(unknown + 41) == "'b/pulse.status' is older than max_age_ms"
