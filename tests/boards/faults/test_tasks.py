@@ -4,16 +4,27 @@ time costs."""
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from typing import cast
 
 import pytest
 
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.fault_table import Entry, FaultTable, Injection
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.faults.kind import KINDS
-from rack.boards.faults.tasks import ExtraComputing, LoadStep, overrun, slow_plan, take_core
+from rack.boards.faults.tasks import (
+    ExtraComputing,
+    LoadStep,
+    TaskFaults,
+    overrun,
+    slow_plan,
+    take_core,
+)
+from rack.levels.faults import Fault
+from rack.levels.level import Executor
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.machine import needs_fifo
@@ -84,3 +95,56 @@ def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(
     assert slow_plan(late, 4, 0) == slice_end + 2 * 3 * period
     # One that is beyond its slice already has them added.
     assert slow_plan(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period
+
+
+class Level:
+    """The part of an executor that has faults."""
+
+    def __init__(self) -> None:
+        self.injected: list[Fault] = []
+
+    def inject(self, faults: list[Fault]) -> None:
+        """Note them."""
+        self.injected = faults
+
+
+class Writes:
+    """The part of a task's ports that has faults."""
+
+    def __init__(self) -> None:
+        self.applied: list[str] = []
+
+    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
+        """Note their kinds."""
+        self.applied = [kind for kind, _ in faults]
+
+
+def test_a_task_has_the_faults_that_are_active_by_its_tick(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    segment = make_bus(task("level"), task("other"))
+    table = FaultTable(segment)
+    level = Level()
+    outputs = Writes()
+    faults = TaskFaults(segment, segment.layout.task("level"), outputs, cast(Executor, level))
+    kinds = ("overrun", "drop", "sensor-bias", "hog")
+    entries = [
+        table.add(Injection(KINDS[kind].number, 0, tick=4, seed=9, parameters=(1.0,)))
+        for kind in kinds
+    ]
+    table.add(Injection(KINDS["drop"].number, 1, tick=4))
+    assert (faults.refresh(3), faults.loads, outputs.applied) == (table.generation, [], [])
+    for entry in entries:
+        entry.words[Entry.STAGE] = Stage.ACTIVE
+        entry.words[Entry.FROM] = 4
+    # The clock works ahead: for this task they begin a tick later.
+    assert (faults.refresh(3), faults.loads, outputs.applied) == (-1, [], [])
+    assert faults.refresh(4) == table.generation
+    assert [load.entry[Entry.KIND] for load in faults.loads] == [KINDS["overrun"].number]
+    assert outputs.applied == ["drop"]
+    (struck,) = level.injected
+    assert (struck.kind, struck.seed, struck.since) == ("sensor-bias", 9, 4)
+    faults.count({0: True}, 6)
+    assert (entries[2][Entry.COUNT], entries[2][Entry.STRUCK_TICK]) == (1, 6)
+    faults.burn(7)
+    assert (entries[0][Entry.COUNT], entries[0][Entry.STRUCK_TICK]) == (1, 7)
