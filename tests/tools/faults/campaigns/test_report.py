@@ -1,0 +1,179 @@
+"""The report of a campaign, from hand-made results: what counts where, and how it reads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import pytest
+
+from rack.tools.faults.campaigns.campaign import Campaign, Order
+from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.faults.campaigns.report import SHOWN, document, markdown
+from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult
+from tests.tools.fault_events import LAYOUT, TICK_NS, found
+from tests.tools.faults.campaigns.test_statistics import judgement
+
+SECOND = 1_000_000_000 // TICK_NS
+RUN = TrialResult(
+    plan=Plan(0, "nominal", lockstep=True),
+    ended="task done",
+    ticks=10 * SECOND,
+    digest="abcd",
+    violations=0,
+    touches=0,
+    left=(),
+    wall_s=1.24,
+    notes=("a note of lockstep",),
+    misses={},
+    stray_misses=0,
+    faults=(),
+    unexplained=(),
+    shortfalls=(),
+)
+
+
+def run(number: int, *, lockstep: bool = False, **more: Any) -> TrialResult:
+    """Return a trial without faults that has gone well."""
+    plan = Plan(number, "faults", lockstep=lockstep)
+    return replace(RUN, plan=plan, notes=("no real time",), **more)
+
+
+TRIALS = [
+    run(1, faults=(judgement(), judgement(struck=-1, seen="not struck")), stray_misses=2),
+    run(
+        2,
+        lockstep=True,
+        ended="safely stopped",
+        stray_misses=5,
+        faults=(judgement(delay=None, struck=0), judgement("sensor-bias", size=0.02, joint="j1")),
+        shortfalls=("late",),
+    ),
+    run(3, ended="neither", violations=3, touches=1, left=("process 7",)),
+]
+
+
+class Made:
+    """The part of a campaign that its report reads."""
+
+    layout = LAYOUT
+    kinds = ("mute", "sensor-bias")
+    order = cast(Order, None)
+
+
+@pytest.fixture
+def report() -> dict[str, Any]:
+    """Return the document of three trials, one run with a known size, and one without faults."""
+    campaign = Made()
+    campaign.order = cast(Order, Ordered())
+    trip = found(7, "gap", "upper", "lower.status")
+    calm = run(0, ticks=20 * SECOND, unexplained=(trip,), misses={"plan_late": 2}, stray_misses=9)
+    swept = run(4, faults=(judgement("sensor-bias", delay=None, size=0.01, struck=40),))
+    results = Results(
+        RUN,
+        list(TRIALS),
+        [swept],
+        [Faultless("a load", 20.0, (calm,))],
+        ["overrun: did not strike"],
+    )
+    return document(cast(Campaign, campaign), results, 61.26)
+
+
+class Ordered:
+    """What was ordered."""
+
+    name = "small"
+    seed = 9
+    modes = (True, False)
+
+
+def test_the_figures_are_of_the_runs_that_they_are_about(report: dict[str, Any]) -> None:
+    summary = report["summary"]
+    assert {key: summary[key] for key in ("trials", "tasks_done", "safely_stopped", "neither")} == {
+        "trials": 3,
+        "tasks_done": 1,
+        "safely_stopped": 1,
+        "neither": 1,
+    }
+    assert (summary["injected"], summary["detected"], summary["not_struck"]) == (3, 2, 1)
+    assert (summary["limits_violated"], summary["touches"], summary["left_behind"]) == (3, 1, 1)
+    # The nominal run, three trials, one of the sweep, and 20 s without faults.
+    assert summary["simulated_s"] == 70.0
+    assert (summary["unexplained"], summary["unexplained_per_hour"]["an_hour"]) == (
+        1,
+        pytest.approx(3600 / 70, abs=1e-3),
+    )
+    # In lockstep no miss is stray, and those without faults are counted apart.
+    assert summary["stray_misses"] == 2
+    assert (summary["false_trips"], summary["faultless_s"]) == (1, 20.0)
+    assert summary["false_trips_per_hour"]["an_hour"] == 180.0
+    assert (report["wall_s"], report["clock_ms"], report["modes"]) == (
+        61.3,
+        2.5,
+        ["lockstep", "realtime"],
+    )
+    assert report["nominal"] == {"ticks": 4000, "seconds": 10.0, "digest": "abcd"}
+    assert report["machine"]["notes"] == ["no real time"]
+    assert report["shortfalls"] == ["trial 2: late", "overrun: did not strike"]
+
+
+def test_a_kind_counts_the_trials_in_which_it_struck(report: dict[str, Any]) -> None:
+    kinds = report["by_kind"]
+    assert {kind: (f["trials"], f["tasks_done"]) for kind, f in kinds.items()} == {
+        # One of them at tick 0.
+        "mute": (2, 1),
+        "sensor-bias": (1, 0),
+    }
+    points = report["sizes"]["sensor-bias"]["curve"]
+    assert [(point["size"], point["delay"]) for point in points] == [(0.01, None), (0.02, 5)]
+    assert [(fault["trial"], fault["kind"]) for fault in report["faults"]] == [
+        (1, "mute"),
+        (1, "mute"),
+        (2, "mute"),
+        (2, "sensor-bias"),
+    ]
+    assert [(trial["number"], trial["faults"]) for trial in report["trials"]] == [
+        (1, 2),
+        (2, 2),
+        (3, 0),
+    ]
+
+
+def test_the_text_says_what_the_document_holds(report: dict[str, Any]) -> None:
+    lines = markdown(report).splitlines()
+    assert lines[0] == "# Campaign on small, seed 9: fell short"
+    assert lines[2].startswith("3 trials, lockstep and realtime, in 61 s on ")
+    assert lines[3] == "- no real time"
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
+    cells = {row[0]: row[1:] for row in rows}
+    assert cells["injected"] == ["3; 1 more did not strike and were drawn again"]
+    assert cells["trials ended"] == ["1 task done, 1 safely stopped, 1 neither"]
+    assert cells["recovered from"] == ["3"]
+    assert cells["false detections"][0].startswith("1 in 0.02 simulated hours: 51.4 an hour, below")
+    assert cells["of these without faults, in real time"][0].startswith("1 in 20 s: 180 an hour")
+    # Injected, detected, in bound, recovered, at least; ticks; bound; ms; recovery; reactions.
+    mute = cells["mute"]
+    assert mute[:4] == ["2", "1", "1", "2"]
+    assert mute[4].endswith("%")
+    assert mute[5:8] == ["5", "5", "10"]
+    assert mute[-3:] == ["-", "-", "-"]
+    assert cells["under a load"] == [*("20", "1"), cells["under a load"][2], "2 plan late"]
+    assert "## sensor-bias: size against delay" in lines
+    assert cells["0.01"] == ["all", "-"]
+    assert cells["0.02"] == ["j1", "12.5"]
+    assert lines[-3:] == ["", "- trial 2: late", "- overrun: did not strike"]
+
+
+def test_a_campaign_without_shortfalls_has_passed(report: dict[str, Any]) -> None:
+    passed = {**report, "shortfalls": [], "by_kind": {}, "sizes": {}, "faultless": []}
+    calm = {**report["summary"], "faultless_s": 0.0, "latched": 2, "recovered": 3}
+    text = markdown({**passed, "summary": calm, "interrupted": True})
+    assert text.startswith("# Campaign on small, seed 9: passed\n")
+    assert "Interrupted: results until then." in text
+    assert "3, of which 2 ended the task, as permitted" in text
+    assert not any(
+        word in text for word in ("Shortfalls", "Faults by kind", "Faultless", "of these without")
+    )
+    many = markdown({**report, "shortfalls": [f"line {k}" for k in range(SHOWN + 1)]})
+    assert f"## Shortfalls: {SHOWN + 1}" in many
+    assert many.endswith(f"- line {SHOWN - 1}\n")
