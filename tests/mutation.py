@@ -4,7 +4,7 @@ takes an hour.
 Each mutant is a copy of the tree with one random change in one file: a comparison flipped, a
 statement dropped, a number greater, `and` for `or`, a condition negated, a sign. The tests that
 mirror the file must fail on it. What no test is to notice is not changed: annotations, messages,
-numbers of enumeration members, lengths of time-outs.
+numbers of enumeration members, lengths of time-outs, when garbage is collected, `strict` of `zip`.
 
 A test that fails on the unchanged copy as well kills nothing: it is left out, and the mutant is
 examined again. Tests marked `alone` are left out too: they judge the machine.
@@ -108,6 +108,11 @@ class Mutations:
     def of(self, node: ast.AST) -> Iterator[Mutation]:  # noqa: C901  # one match of all kinds
         """Yield the mutations of a node and of all below it that may matter."""
         match node:
+            case (
+                ast.Expr(value=ast.Call(func=ast.Attribute(value=ast.Name("gc"))))
+                | ast.keyword(arg="strict")
+            ):
+                return
             case ast.Compare(left=left, comparators=[right]):
                 yield from self._operator(left, right)
             case ast.BoolOp(values=values):

@@ -1,0 +1,124 @@
+"""A queue that is watched: what of its messages is reported, and when its writer counts as lost."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.backplane.mailbox.queue import QueueWriter
+from rack.backplane.ring import Ring
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_queue import WatchedQueue
+from rack.backplane.watch.watched_reader import watched
+from rack.backplane.words import Block
+from tests.backplane.bus import NAME, message_address, queue
+from tests.backplane.conftest import MakeBus
+
+CAPACITY = 4
+
+
+class Site:
+    """A queue with its writer, its watched reader, and the ring of the reader's alarms."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment = segment
+        self.writer = QueueWriter(segment, NAME)
+        self.task = ReadingTask()
+        self.room = CAPACITY
+        found = watched(
+            segment,
+            NAME,
+            AlarmWriter(segment, "reader"),
+            self.task,
+            room=lambda: self.room,
+        )
+        assert isinstance(found, WatchedQueue)
+        self.reader = found
+        self._ring: Ring = alarm_ring(segment, "reader")
+
+    def send(self, tick: int, *numbers: int) -> None:
+        """Send messages in a cycle of the writer, which knows what has been taken."""
+        self.writer.taken = self.reader.reader.taken
+        for number in numbers:
+            self.writer.message.id = number
+            assert self.writer.message.send()
+        self.writer.write(tick)
+
+    def read(self, tick: int) -> list[int]:
+        """Read at a tick; return the numbers of what was taken."""
+        reading = self.reader.read(tick)
+        messages = [*reading.earlier, reading.value] if reading.is_new else []
+        return [message.id for message in messages]
+
+    def alarms(self) -> list[tuple[int, int, float]]:
+        """Return code, tick and value of the alarms since the last call."""
+        rows = self._ring.drain().rows
+        return [(int(row["code"]), int(row["tick"]), float(row["value"])) for row in rows]
+
+
+@pytest.fixture
+def site(make_bus: MakeBus) -> Site:
+    return Site(make_bus(*queue(CAPACITY)))
+
+
+def test_messages_in_order_raise_no_alarm(site: Site) -> None:
+    taken = []
+    for tick in range(0, 40, 2):
+        site.send(tick, tick, tick + 1)
+        taken += site.read(tick + 1)
+    assert taken == list(range(40))
+    assert (site.alarms(), site.task.troubles) == ([], 0)
+
+
+def test_no_more_is_taken_than_there_is_room_for(site: Site) -> None:
+    site.send(0, 1, 2, 3)
+    site.room = 2
+    assert [site.read(1), site.read(2), site.read(3)] == [[1, 2], [3], []]
+    assert site.alarms() == []
+
+
+def test_a_lost_message_is_a_gap_and_a_trouble(site: Site) -> None:
+    site.send(0, 1)
+    assert site.read(1) == [1]
+    site.writer.visible_at(2, None)
+    site.writer.lose()
+    site.writer.lose()
+    site.writer.show()
+    assert site.read(3) == []
+    assert (site.alarms(), site.task.troubles) == ([(Alarm.GAP, 3, 2.0)], 1)
+    site.send(4, 7)
+    assert site.read(5) == [7]
+    assert (site.alarms(), site.task.troubles) == ([], 1)
+
+
+def test_a_damaged_message_is_reported_and_the_order_goes_on(site: Site) -> None:
+    site.send(0, 1, 2, 3)
+    address = message_address(site.segment, 2)
+    site.segment.view(address, 1)[0] ^= 1
+    assert site.read(1) == [1, 3]
+    (alarm,) = site.alarms()
+    assert alarm[:2] == (Alarm.DAMAGED, 1)
+    assert site.task.troubles == 1
+
+
+def test_a_message_of_an_earlier_release_is_out_of_order_and_one_of_the_same_is_not(
+    site: Site,
+) -> None:
+    site.send(8, 1)
+    site.send(8, 2)
+    assert site.read(9) == [1, 2]
+    assert site.alarms() == []
+    site.send(6, 3)
+    assert site.read(10) == [3]
+    assert site.alarms() == [(Alarm.DISORDER, 10, 2.0)]
+
+
+@pytest.mark.parametrize(("lost", "at", "is_lost"), [(0, 9, False), (9, 8, False), (9, 9, True)])
+def test_a_writer_is_lost_from_the_tick_after_its_loss(
+    site: Site, lost: int, at: int, is_lost: bool
+) -> None:
+    assert not site.reader.read(at).is_lost
+    site.segment.block("writer")[Block.LOST] = lost
+    assert site.reader.read(at).is_lost is is_lost
+    assert site.reader.is_writer_lost(at) is is_lost

@@ -1,0 +1,267 @@
+"""The end of a run judged from what is on its backplane: its cause, what held it, where objects
+ended."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import Field, MessageType, State, status
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System
+from rack.boards.config.layout import field_specs
+from rack.boards.events import (
+    HELD_MS,
+    Braking,
+    Ending,
+    Event,
+    Journal,
+    Outcome,
+    braked_text,
+    brakings,
+    statuses,
+)
+from rack.levels.tables import GoalConfig
+from tests.backplane.bus import CLOCK_NS, task
+from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+
+SILENT = 40
+STATUS = status("level_status", 1, Field("moves", "u2", "1", "of its program"))
+BRAKED = status("arm_status", 1, Field("braked", "u1", "1", "1: brakes are engaged"))
+SCENE = MessageType("scene", 1, (Field("position", "f8", "m", "of each body", (2, 3)),))
+ORDER = MessageType("order", 1, (Field("id", "u4", "1", "serial"),))
+TICK_MS = CLOCK_NS * 1e-6
+
+
+def box(name: str, kind: MessageType, writer: str) -> MailboxSpec:
+    """Return a mailbox of a type, as a level's."""
+    return MailboxSpec(
+        name=name,
+        writer=writer,
+        readers=(),
+        protocol="time-slice",
+        every=1,
+        delay=1,
+        depth=8,
+        message=kind.name,
+        version=kind.version,
+        size=kind.dtype({}).itemsize,
+        fields=field_specs(kind, {}),
+    )
+
+
+@pytest.fixture
+def bus(make_bus: MakeBus) -> Segment:  # noqa: F811
+    return make_bus(
+        task("upper"),
+        task("lower"),
+        box("upper.status", STATUS, "upper"),
+        box("lower.status", BRAKED, "lower"),
+        box("lower.scene", SCENE, "lower"),
+        box(
+            "lower.command", MessageType("command", 1, (Field("id", "u4", "1", "serial"),)), "lower"
+        ),
+    )
+
+
+def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
+    """Write a message at a tick."""
+    writer = open_writer(segment, name)
+    for field, value in fields.items():
+        setattr(writer.message, field, value)
+    writer.write(tick)
+    writer.close()
+
+
+def ending(segment: Segment, ends_run: str | None = "upper.status") -> Ending:
+    """Return what judges the end."""
+    return Ending(segment, ends_run, SILENT)
+
+
+@pytest.mark.parametrize(
+    ("state", "moves", "cause"),
+    [
+        (State.DONE, 0, "task done"),
+        (State.EXECUTING, 0, "time over"),
+        (State.IDLE, 3, "time over"),
+        (State.ERROR, 3, "task failed"),
+        (State.ERROR, 0, "task refused"),
+    ],
+)
+def test_the_last_status_of_the_level_that_ends_a_run_is_its_cause(
+    bus: Segment, state: State, moves: int, cause: str
+) -> None:
+    write(bus, "upper.status", 5, state=state, moves=moves, reason="so it is")
+    assert ending(bus).cause() == cause
+    assert ending(bus).final_state() == (state.name.lower(), "so it is")
+
+
+def test_an_error_of_a_level_that_counts_no_moves_is_a_failure(bus: Segment) -> None:
+    write(bus, "lower.status", 5, state=State.ERROR)
+    assert ending(bus, "lower.status").cause() == "task failed"
+
+
+def test_a_run_that_no_level_ends_is_over_in_time(bus: Segment) -> None:
+    assert ending(bus, None).cause() == "time over"
+    assert ending(bus, None).final_state() == ("", "")
+
+
+@pytest.mark.parametrize(("written", "at", "is_silent"), [(5, 45, False), (5, 46, True)])
+@pytest.mark.parametrize("state", [State.EXECUTING, State.DONE, State.ERROR])
+def test_a_level_that_is_silent_for_too_long_has_failed_unless_it_is_done(
+    bus: Segment, written: int, at: int, is_silent: bool, state: State
+) -> None:
+    write(bus, "upper.status", written, state=state, moves=1)
+    bus.words[System.TICK] = at
+    causes = {State.EXECUTING: "time over", State.DONE: "task done", State.ERROR: "task failed"}
+    is_failed = is_silent and state == State.EXECUTING
+    assert ending(bus).cause() == ("task failed" if is_failed else causes[state])
+    reason = "'upper.status' has not been written for 0.1025 s" if is_failed else ""
+    assert ending(bus).final_state() == (state.name.lower(), reason)
+
+
+def test_a_level_that_never_wrote_is_silent_from_the_start(bus: Segment) -> None:
+    bus.words[System.TICK] = SILENT
+    assert ending(bus).cause() == "time over"
+    bus.words[System.TICK] = SILENT + 1
+    assert ending(bus).cause() == "task refused"
+
+
+def test_errors_of_other_levels_are_latched(bus: Segment) -> None:
+    assert list(statuses(bus, "error")) == []
+    write(bus, "upper.status", error=4, reason="mine")
+    write(bus, "lower.status", error=0, reason="none")
+    assert [board for board, _ in statuses(bus, "error")] == ["upper", "lower"]
+    assert [board for board, _ in statuses(bus, "braked")] == ["lower"]
+    assert (ending(bus).latched(), ending(bus, None).latched()) == ([], ["level 'upper': mine"])
+    write(bus, "lower.status", 1, error=2, reason="no arm")
+    assert ending(bus).latched() == ["level 'lower': no arm"]
+
+
+RAN_MS = 40_000.0
+LONG = Braking("sensors", 400, HELD_MS + 0.1)
+SHORT = Braking("no torque", 800, HELD_MS)
+
+
+@pytest.mark.parametrize(
+    ("found", "is_held"),
+    [
+        ((), False),
+        ((SHORT,), False),
+        ((LONG,), True),
+        ((Braking("a stop is demanded", 400, 9 * HELD_MS),), False),
+        # Together more than half of the run.
+        ((SHORT,) * 4, False),
+        ((SHORT,) * 5, True),
+    ],
+)
+def test_brakes_hold_a_run_if_they_are_long_or_often_engaged(
+    bus: Segment, found: tuple[Braking, ...], is_held: bool
+) -> None:
+    lines = list(ending(bus).held([], found, RAN_MS))
+    text = f"held without a cause in sight, in {RAN_MS:g} ms: {braked_text(found)}" if found else ""
+    assert lines == ([text] if is_held else [])
+
+
+@pytest.mark.parametrize("kind", ["fault", "command"])
+def test_with_a_cause_in_sight_nothing_is_held(bus: Segment, kind: Any) -> None:
+    assert list(ending(bus).held([Event(0, 0, "miss", "", "")], [LONG], RAN_MS))
+    assert not list(ending(bus).held([Event(0, 0, kind, "", "")], [LONG], RAN_MS))
+    bus.words[System.DEMAND] = 1
+    assert not list(ending(bus).held([], [LONG], RAN_MS))
+
+
+def test_brakes_that_were_never_opened_count_from_when_the_level_has_its_state(
+    bus: Segment,
+) -> None:
+    write(bus, "lower.status", braked=1)
+    bus.block("lower")[Block.LEVEL_SINCE] = round((RAN_MS - HELD_MS) / TICK_MS)
+    (line,) = ending(bus).held([], [], RAN_MS + 1.0)
+    assert line.endswith("1 time, 5001 ms in all, longest 5001 ms at tick 14000: no torque (1)")
+    assert list(ending(bus).held([], [], RAN_MS)) == []
+    write(bus, "lower.status", 1, braked=1, reason="no sensor")
+    (line,) = ending(bus).held([], [], RAN_MS + 1.0)
+    assert line.endswith("no sensor (1)")
+
+
+def test_a_level_that_holds_for_long_is_named(bus: Segment) -> None:
+    write(bus, "upper.status", state=State.HOLDING, reason="waits for a part")
+    block = bus.block("upper")
+    block[Block.LEVEL_STATE] = State.HOLDING
+    block[Block.LEVEL_SINCE] = 400
+    assert list(ending(bus).held([], [], 1000.0 + HELD_MS)) == []
+    assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == [
+        "level 'upper' held for 5001 ms without a cause in sight: waits for a part"
+    ]
+    block[Block.LEVEL_STATE] = State.EXECUTING
+    assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == []
+
+
+def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
+    goal = GoalConfig(object="block", position=(0.1, 0.2, 0.3), tolerance_mm=5.0)
+    assert ending(bus).ends({1: goal}) == ()
+    write(bus, "lower.scene", position=[[0.0, 0.0, 0.0], [0.1, 0.2, 0.304]])
+    (end,) = ending(bus).ends({1: goal})
+    assert (end.object, end.off_mm, end.tolerance_mm) == ("block", 4.0, 5.0)
+    assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
+
+
+def test_times_of_brakes_are_those_of_their_events() -> None:
+    def event(tick: int, code: str, why: str, value: float = 0.0) -> Event:
+        return Event(0, tick, "reaction", "servo", "", code, subject=why, value=value)
+
+    start = event(10, "brakes_opened", "", 10)
+    events = [
+        start,
+        event(40, "brakes_closed", "sensors"),
+        event(50, "brakes_opened", "sensors", 10),
+        event(90, "brakes_closed", "no torque"),
+    ]
+    assert brakings(events, 100, TICK_MS) == (
+        Braking("sensors", 40, 25.0),
+        Braking("no torque", 90, 25.0),
+    )
+    assert brakings([start], 100, TICK_MS) == ()
+    assert brakings([], 100, TICK_MS) == ()
+    assert braked_text(brakings(events, 120, TICK_MS)) == (
+        "brakes engaged 2 times, 100 ms in all, longest 75 ms at tick 90: sensors (1),"
+        " no torque (1)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("cause", "faults", "worked"),
+    [
+        ("task done", (), True),
+        ("time over", (), True),
+        ("task done", ("late",), False),
+        ("stopped", (), False),
+        ("task failed", (), False),
+    ],
+)
+def test_a_run_has_worked_without_faults_and_uncut(
+    cause: Any, faults: tuple[str, ...], worked: bool
+) -> None:
+    assert Outcome(cause, 1, "", "", "", faults).worked is worked
+
+
+def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
+    heard: list[Event] = []
+    journal = Journal(heard.append)
+    journal.add("launch", "rack", "first")
+    journal.segment = bus
+    bus.words[System.TICK] = 7
+    bus.words[System.STATE] = Run.STARTING
+    journal.add("ready", "rack", "second")
+    bus.words[System.STATE] = Run.RUNNING
+    journal.add("died", "upper", "third", "loss", at_ns=0, subject="a")
+    journal.add("died", "upper", "fourth", tick=3)
+    assert heard == journal.events
+    assert [event.tick for event in heard] == [-1, -1, 7, 3]
+    assert (heard[2].code, heard[2].subject, heard[2].board) == ("loss", "a", "upper")
+    # At the machine's start, by CLOCK_MONOTONIC.
+    assert heard[2].time_ns < heard[0].time_ns <= heard[1].time_ns <= heard[3].time_ns
+    Journal(None).add("launch", "rack", "nobody listens")
