@@ -7,7 +7,7 @@ STAMP := $(VENV)/installed
 FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
 .DEFAULT_GOAL := help
-.PHONY: help run test quick mutants golden lint lock clean
+.PHONY: help run test quick mutants golden reference lint lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
@@ -26,6 +26,9 @@ mutants: $(STAMP) ## check that a campaign notices when a detector is switched o
 
 golden: $(STAMP) ## write the digests of the shipped racks anew, after a change of what they do
 	$(BIN)/python -m tests.golden
+
+reference: $(STAMP) ## write configs/REFERENCE.md anew, after a change of what a config may hold
+	$(BIN)/python -m tests.reference
 
 lint: $(STAMP) ## check style and types
 	$(BIN)/ruff check .

@@ -333,6 +333,9 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
     # 5: all tests that there are were left out.
     if status in (0, 5):
         return Verdict("survived")
+    if status == 4 and "while loading conftest" in text:
+        # It cannot be imported.
+        return Verdict("killed")
     if status is not None and not failed:
         # No test has failed: nothing was tested.
         raise SystemExit(f"pytest ended with status {status}:\n{text[-2000:]}")
