@@ -1,0 +1,118 @@
+"""A task as the clock sees it: what a release writes, when it is finished, lost, and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rack.backplane.clock.released_task import ReleasedTask, by_priority
+from rack.backplane.layout import TaskSpec
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, TaskState
+from tests.backplane.bus import layout, task
+from tests.backplane.conftest import MakeBus
+
+EVERY, PHASE = 4, 1
+
+
+@pytest.fixture
+def spec() -> TaskSpec:
+    return replace(task("level", every=EVERY), phase=PHASE)
+
+
+@pytest.fixture
+def bus(make_bus: MakeBus, spec: TaskSpec) -> Segment:
+    return make_bus(task("first"), spec)
+
+
+@pytest.fixture
+def released(bus: Segment, spec: TaskSpec) -> ReleasedTask:
+    return ReleasedTask(bus, spec)
+
+
+def words(found: ReleasedTask) -> tuple[int, int, int]:
+    """Return release, deadline and missed releases."""
+    return found.block[Block.RELEASED], found.block[Block.DEADLINE], found.missed
+
+
+def test_a_release_is_the_newest_of_its_own_grid(released: ReleasedTask) -> None:
+    assert released.index == 1
+    for tick, release in ((1, 1), (4, 1), (5, 5), (11, 9)):
+        released.release(tick)
+        assert words(released)[:2] == (release, release + EVERY)
+        assert released.deadline == release + EVERY
+        released.block[Block.DONE] = release
+
+
+def test_missed_releases_count_from_the_last_that_was_finished(released: ReleasedTask) -> None:
+    block = released.block
+    block[Block.DONE] = block[Block.RELEASED]
+    missed = []
+    for tick in (1, 5, 9, 13):
+        released.release(tick)
+        missed.append(released.missed)
+    assert missed == [0, 1, 2, 3]
+    # It finishes each one late.
+    for done, tick in ((1, 17), (5, 21), (9, 25)):
+        block[Block.DONE] = done
+        released.release(tick)
+        assert released.missed == 2
+    block[Block.DONE] = block[Block.RELEASED]
+    released.release(29)
+    assert released.missed == 0
+    block[Block.DONE] = 28
+    released.release(33)
+    assert released.missed == 1
+
+
+def test_a_task_is_free_from_its_deadline_on_unless_it_is_lost(released: ReleasedTask) -> None:
+    released.block[Block.DEADLINE] = 9
+    assert [released.is_free(tick) for tick in (8, 9)] == [False, True]
+    released.block[Block.LOST] = 3
+    assert not released.is_free(9)
+
+
+def test_a_tick_waits_for_a_task_whose_deadline_it_is(released: ReleasedTask) -> None:
+    released.release(5)
+    released.block[Block.DONE] = 1
+    assert [released.is_finished(tick) for tick in (8, 9)] == [True, False]
+    assert not released.is_settled()
+    released.is_stopped = True
+    assert released.is_settled()
+    released.is_stopped = False
+    released.block[Block.DONE] = 5
+    assert released.is_settled()
+    assert released.is_finished(9)
+
+
+def test_a_lost_task_is_as_it_was_found_until_it_has_rejoined(released: ReleasedTask) -> None:
+    released.release(5)
+    assert released.lost_tick == -1
+    released.lose(7)
+    block = released.block
+    assert (released.lost_tick, block[Block.STATE]) == (7, TaskState.ABSENT)
+    assert released.is_settled()
+    released.missed = 3
+    released.is_stopped = True
+    released.rejoin()
+    assert (released.lost_tick, released.missed, released.is_stopped) == (-1, 0, False)
+    assert (block[Block.DONE], block[Block.DEADLINE]) == (5, 0)
+
+
+@pytest.mark.parametrize("state", TaskState)
+def test_its_state_says_whether_it_is_ready_or_given_up(
+    released: ReleasedTask, state: TaskState
+) -> None:
+    released.block[Block.STATE] = state
+    assert released.is_ready == (state.name in ("READY", "RUNNING", "ENDED"))
+    assert released.is_given_up == (state.name == "GIVEN_UP")
+
+
+def test_executors_come_first_then_the_faster_then_the_earlier() -> None:
+    planner = replace(task("plan", every=1), role="planner")
+    late = replace(task("late", every=2), phase=1)
+    slow = task("slow", every=8)
+    fast = task("fast", every=2)
+    found = by_priority(layout("r", (), [planner, slow, late, fast]))
+    assert [spec.name for spec in found] == ["fast", "late", "slow", "plan"]

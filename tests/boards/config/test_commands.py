@@ -1,0 +1,91 @@
+"""An operator's command in a config as the message that it becomes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.message import Message
+from rack.boards.config import RackConfig, load, wire
+from rack.boards.config.commands import DOWN, asked, request, setting_name, takes
+from rack.boards.errors import ConfigError
+from rack.levels.operator import Goal, Operation
+
+HOME = [0.1 * k for k in range(6)]
+
+
+@pytest.fixture(scope="module")
+def nasrem() -> RackConfig:
+    return load("nasrem")
+
+
+def message_of(config: RackConfig, **given: object) -> tuple[Message, int]:
+    """Return the message of a command, and the tick at which it is given."""
+    layout = wire(config)
+    made = request(asked(given), config, layout)
+    box = layout.mailboxes[made.mailbox]
+    assert box.name == f"{given['level']}.operator"
+    message = Message(message_dtype(box.fields, box.size))
+    message.raw[:] = np.frombuffer(made.message, np.uint8)
+    return message, made.tick
+
+
+def test_a_goal_of_joints_has_them_all(nasrem: RackConfig) -> None:
+    message, tick = message_of(nasrem, level="servo", what="setpoint", joints=HOME, tick=40)
+    assert (message.what, message.goal, message.count, tick) == (
+        Operation.SETPOINT,
+        Goal.JOINTS,
+        6,
+        40,
+    )
+    assert message.joints[:6].tolist() == pytest.approx(HOME)
+    assert not message.joints[6:].any()
+    assert not message.position.any()
+
+
+def test_a_goal_of_a_place_points_down_unless_it_is_said(nasrem: RackConfig) -> None:
+    given = {"level": "task", "what": "goto", "position": [0.4, 0.1, 0.3]}
+    message, tick = message_of(nasrem, **given, at=1.0)
+    assert (message.goal, message.count, tick) == (Goal.DIRECTION, 0, 400)
+    assert message.position.tolist() == [0.4, 0.1, 0.3]
+    assert tuple(message.direction) == DOWN
+    message, _ = message_of(nasrem, **given, direction=[1.0, 0.0, 0.0])
+    assert message.direction.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_a_quaternion_becomes_a_unit_one(nasrem: RackConfig) -> None:
+    message, _ = message_of(
+        nasrem,
+        level="task",
+        what="goto",
+        position=[0.4, 0.1, 0.3],
+        quaternion=[0.0, 3.0, 0.0, 4.0],
+    )
+    assert message.goal == Goal.POSE
+    assert message.quaternion.tolist() == pytest.approx([0.0, 0.6, 0.0, 0.8])
+
+
+def test_a_hold_is_nothing_but_a_hold(nasrem: RackConfig) -> None:
+    message, _ = message_of(nasrem, level="task", what="hold")
+    assert (message.what, message.goal, message.count, message.name) == (
+        Operation.HOLD,
+        Goal.NONE,
+        0,
+        "",
+    )
+
+
+def test_every_mistake_of_a_command_is_said(nasrem: RackConfig) -> None:
+    with pytest.raises(ConfigError, match="unknown key"):
+        asked({"level": "task", "what": "hold", "speed": 2})
+    with pytest.raises(ConfigError, match="primitive"):
+        request(asked({"level": "nobody", "what": "hold"}), nasrem, wire(nasrem))
+
+
+def test_what_a_level_takes_has_the_names_that_it_knows(nasrem: RackConfig) -> None:
+    commands = {Operation.HOLD: (), Operation.SETPOINT: (Goal.JOINTS, Goal.POSE)}
+    assert takes(nasrem, "primitive", commands) == "hold, setpoint joints|pose"
+    config = load("configs/examples/own-modification/gentle.toml")
+    assert takes(config, "servo", {Operation.MODIFY: ()}) == "modify gentle"
+    assert setting_name(config, "servo", 0) == "gentle"
