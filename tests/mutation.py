@@ -37,7 +37,7 @@ from tests.processes import runs
 
 ROOMS = ("backplane", "boards", "levels/timing", "levels/systems/state_table", "tools/faults")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
-FEW = 6
+FEW = 8
 """Files of tests for one mutant, at most: the mirror, then those nearest to it."""
 BOUND_S, TEST_BOUND_S = 400, 60
 """Time for the tests of one mutant, and for each of them: beyond, it has timed out."""

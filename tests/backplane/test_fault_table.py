@@ -10,7 +10,7 @@ from rack.backplane.address_map import FAULT_ENTRIES
 from rack.backplane.errors import FaultTableError
 from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
 from rack.backplane.words import System
-from tests.backplane.bus import mailbox
+from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
 
@@ -102,3 +102,20 @@ def test_two_who_inject_at_once_take_two_entries(make_bus: MakeBus) -> None:
     entries = FaultTable(segment).staged((Stage.WAITING,))
     assert sorted(entry[Entry.SEED] for entry in entries) == sorted([1, 2, 3] * each)
     assert segment.words[System.INJECTED] == 3 * each
+
+
+def test_a_fault_that_waits_can_be_taken_back_and_one_that_has_begun_cannot(
+    make_bus: MakeBus,
+) -> None:
+    table = FaultTable(make_bus(task("level")))
+    entry = table.add(Injection(1, 0, tick=40, when=(2, 1, 7)))
+    table.disarm(entry)
+    # Neither its tick nor its condition begins it.
+    assert (entry[Entry.FROM], entry[Entry.WHEN_BOX]) == (NEVER, -1)
+    assert table.free(entry)
+    assert entry.stage == Stage.FREE
+    begun = table.add(Injection(1, 0, tick=40))
+    begun.words[Entry.STAGE] = Stage.ACTIVE
+    assert not table.free(begun)
+    assert begun.stage == Stage.ACTIVE
+    assert table.staged((Stage.ACTIVE, Stage.OVER)) == [begun]

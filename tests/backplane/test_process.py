@@ -2,13 +2,39 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import resource
+import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from rack.backplane.process import cores_kept_awake, is_alive, name_process, pin, start_time
+from rack.backplane.process import (
+    GONE,
+    STOPPED,
+    WAITING,
+    children_of,
+    compute_until,
+    cores_kept_awake,
+    die_with_parent,
+    how_ended,
+    is_alive,
+    mapped_and_locked,
+    name_process,
+    pin,
+    processor_ns,
+    readable,
+    refusal,
+    set_priority,
+    start_time,
+    state_of,
+    take_processor,
+)
+from tests.backplane.bus import task
+from tests.machine import needs_fifo
 from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -96,3 +122,115 @@ def test_cores_sleep_as_usual_where_the_request_is_refused(
         " directory"
     )
     assert not (tmp_path / "missing").exists()
+
+
+def test_the_kernel_says_in_which_state_a_process_is() -> None:
+    assert state_of(os.getpid()) == "R"
+    with forked(signal.pause) as pid:
+        wait_until(lambda: state_of(pid) in WAITING)
+        os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: state_of(pid) in STOPPED)
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: state_of(pid) in GONE)
+        assert state_of(pid) == "Z"
+        assert start_time(pid) == 0
+    assert (state_of(pid), processor_ns(pid), mapped_and_locked(pid)) == ("X", 0, (0, 0))
+
+
+def test_processor_time_is_that_of_the_process() -> None:
+    target = time.process_time_ns() + 30_000_000
+    compute_until(target)
+    used = time.process_time_ns()
+    assert used >= target
+    # The kernel counts in steps of 10 ms.
+    assert abs(processor_ns(os.getpid()) - used) < 25_000_000
+
+
+def test_a_descriptor_is_waited_for_within_a_bound() -> None:
+    reading, writing = os.pipe()
+    try:
+        began = time.monotonic()
+        assert not readable(reading, 0.02)
+        assert time.monotonic() - began >= 0.02
+        assert not readable(reading, -1.0)
+        os.write(writing, b"x")
+        assert readable(reading, 0.0)
+    finally:
+        os.close(reading)
+        os.close(writing)
+
+
+def test_a_refusal_names_the_limit_that_is_reached() -> None:
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    processes = resource.getrlimit(resource.RLIMIT_NPROC)[0]
+    text = refusal(OSError(errno.EMFILE, "Too many"))
+    assert text == f"Too many: at most {files} open files are permitted (ulimit -n)"
+    text = refusal(OSError(errno.EAGAIN, "Not now"))
+    assert text == f"Not now: at most {processes} processes are permitted (ulimit -u)"
+    assert refusal(OSError(errno.EACCES, "No")) == f"[Errno {errno.EACCES}] No"
+
+
+def test_a_status_says_how_a_process_ended() -> None:
+    assert [how_ended(status) for status in (0, 3, -9)] == [
+        "exit status 0",
+        "exit status 3",
+        "signal SIGKILL",
+    ]
+
+
+@needs_fifo
+def test_a_priority_is_that_of_the_process_itself() -> None:
+    def take() -> bool:
+        assert set_priority(7)
+        assert os.sched_getscheduler(0) == os.SCHED_FIFO
+        assert os.sched_getparam(0).sched_priority == 7
+        assert set_priority(0)
+        return os.sched_getscheduler(0) == os.SCHED_OTHER
+
+    before = os.sched_getscheduler(1)
+    assert exit_status(fork(take)) == 0
+    assert os.sched_getscheduler(1) == before
+
+
+@needs_fifo
+def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
+    core = min(os.sched_getaffinity(0))
+
+    def take() -> bool:
+        assert take_processor(replace(task("level"), core=core, priority=5)) == 5
+        assert os.sched_getaffinity(0) == {core}
+        mapped, locked = mapped_and_locked(os.getpid())
+        assert mapped >= locked > 0
+        return os.sched_getparam(0).sched_priority == 5
+
+    def be_ordinary() -> bool:
+        assert take_processor(replace(task("level"), core=core)) == 0
+        return Path("/proc/self/timerslack_ns").read_text().strip() == "1"
+
+    assert exit_status(fork(take)) == 0
+    assert exit_status(fork(be_ordinary)) == 0
+
+
+def test_a_child_dies_with_its_parent() -> None:
+    reading, writing = os.pipe()
+
+    def parent() -> None:
+        me = os.getpid()
+
+        def child() -> None:
+            die_with_parent(me)
+            os.write(writing, str(os.getpid()).encode())
+            signal.pause()
+
+        fork(child)
+        signal.pause()
+
+    with forked(parent) as pid:
+        child = int(os.read(reading, 20))
+        assert child in children_of(pid)
+        assert is_alive(child)
+    wait_until(lambda: not is_alive(child))
+    # One that is started too late ends at once.
+    assert exit_status(fork(lambda: die_with_parent(1))) == 1
+    os.close(reading)
+    os.close(writing)

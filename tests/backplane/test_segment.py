@@ -190,6 +190,16 @@ def test_failed_creations_leave_no_file_open(rack_name: str) -> None:
     assert descriptors() == before
 
 
+def test_a_segment_that_was_made_and_closed_leaves_no_file_open(rack_name: str) -> None:
+    before = descriptors()
+    for _ in range(3):
+        segment = Segment.create(layout(rack_name, []), "")
+        segment.close()
+        unlink(rack_name)
+    del segment
+    assert descriptors() == before
+
+
 @pytest.mark.slow
 def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str) -> None:
     spec, rng, complete = layout(rack_name, [mailbox(depth=4096)]), random.Random(1), 0

@@ -213,3 +213,36 @@ def test_a_later_message_of_an_earlier_release_is_out_of_order(link: MakeLink) -
     publish(rack, 18, 21)
     rack.reader.cycle(21)
     assert rack.alarms() == [(21, Alarm.DISORDER)]
+
+
+def test_a_bad_read_is_a_trouble_of_its_task(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    task = rack.reader.ports.task
+    assert task.troubles == 0
+    rack.writer.cycle(20)
+    rack.segment.bytes[message_address(rack.segment, 21)] ^= 1
+    rack.reader.cycle(21)
+    assert (task.troubles, rack.alarms()) == (1, [(21, Alarm.DAMAGED)])
+    rack.writer.cycle(21)
+    rack.reader.cycle(22)
+    assert (task.troubles, rack.alarms()) == (1, [])
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_a_lost_message_is_missing_from_the_tick_at_which_it_would_be_visible(
+    link: MakeLink, every: int
+) -> None:
+    rack = link(rates=(every, 1))
+    rack.run(0, 8 * every)
+    writer = rack.writer.ports.writers["point"]
+    writer.lose()
+    found = {}
+    for tick in range(8 * every, 12 * every):
+        rack.reader.cycle(tick)
+        if alarms := rack.alarms():
+            found[tick] = alarms
+        if tick == 9 * every:
+            rack.writer.cycle(tick)
+    # Written at 8 cycles, visible one later.
+    assert found == {9 * every: [(9 * every, Alarm.GAP)]}

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.watch.alarms import Alarm
+from rack.backplane.watch.alarms import CLEAN_READS, Alarm
+from rack.boards.faults.messages import forge
 from rack.levels.level import Output
-from tests.backplane.bus import POINT
+from tests.backplane.bus import NAME, POINT
 from tests.link import MakeLink, links
 
 
@@ -61,3 +62,34 @@ def test_delayed_messages_of_a_slow_output_arrive_between_its_own(link: MakeLink
     rack.fault("delay", 1)
     rack.run(0, 32)
     assert [released for released, _, _ in rack.written()] == [3, 7, 11, 15, 19, 23, 27]
+
+
+def test_a_forged_message_in_a_tasks_own_mailbox_is_reported_once_an_episode(
+    link: MakeLink,
+) -> None:
+    rack = link()
+    rack.run(0, 10)
+    rung = []
+    for first in (10, 10 + 3 * CLEAN_READS):
+        # What another process writes shows at the task's next message.
+        for tick in (first, first + 1):
+            forge(rack.segment, NAME, tick)
+            rack.writer.cycle(tick)
+        for tick in range(first + 2, first + 3 * CLEAN_READS):
+            rack.writer.cycle(tick)
+        rung.append([code for _, code in rack.alarms("writer")])
+    assert rung == [[Alarm.MASQUERADE]] * 2
+
+
+def test_a_tasks_traffic_is_what_it_wrote_since_it_was_asked(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 5)
+    size = rack.segment.layout.mailbox(NAME).size
+    assert rack.writer.ports.take_traffic() == (5, 5 * size)
+    assert rack.writer.ports.take_traffic() == (0, 0)
+    accesses, read = rack.reader.ports.take_traffic()
+    assert accesses == 5
+    assert 0 < read <= 5 * size
+    rack.run(5, 6)
+    assert rack.writer.ports.take_traffic() == (1, size)
+    assert rack.reader.ports.take_traffic()[0] == 1
