@@ -1,0 +1,119 @@
+"""Host boards as the rack sees them: restarted by its policy, done, given up, or stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from typing import cast
+
+import pytest
+
+from rack.backplane.process import STOPPED, state_of
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, TaskState
+from rack.boards.config import resolve
+from rack.boards.crate.hosts import HostBoards
+from rack.boards.crate.line import CrateLine
+from rack.boards.crate.recovery import Supervision
+from rack.boards.crate.requests import Ended, PowerOff, PowerOn
+from rack.boards.events import Event, Journal
+from tests.boards.conftest import MakeConfig
+from tests.boards.host.test_board import HOSTED
+from tests.processes import FORKS, forked, wait_until
+
+SETTINGS = ("supervision.restarts=2", "supervision.within_s=1.0")
+
+
+class Site:
+    """Host boards, the requests that they have made of the crate, and what was recorded."""
+
+    def __init__(self, segment: Segment, boards: HostBoards, asked: list[object]) -> None:
+        self.boards, self.asked = boards, asked
+        self.block = segment.block("program")
+
+
+@pytest.fixture
+def journal() -> Journal:
+    return Journal(None)
+
+
+@pytest.fixture
+def site(config: MakeConfig, journal: Journal) -> Iterator[Site]:
+    hosted = f'{HOSTED}\n[host.prompt]\nexternal = true\nbelow = "bridge"\n'
+    settings = (*SETTINGS, 'host.prompt.program="rack.levels.host_program:HostProgram"')
+    made = config(*settings, text=hosted)
+    plan = resolve(made)
+    segment = Segment.create(plan.layout, "")
+    asked: list[object] = []
+
+    class Crate:
+        """Notes what it is asked."""
+
+        def ask(self, request: object) -> None:
+            """Note it."""
+            asked.append(request)
+
+    supervision = Supervision(made, plan.layout)
+    crate = cast(CrateLine, Crate())
+    yield Site(segment, HostBoards(segment, plan.hosts, supervision, crate, journal), asked)
+    segment.close()
+    unlink(plan.layout.rack)
+
+
+def told(journal: Journal) -> list[tuple[str, str]]:
+    """Return code and text of the events since the last call."""
+    found = [(event.code, event.text) for event in journal.events]
+    journal.events.clear()
+    return found
+
+
+def test_the_rack_starts_its_own_and_no_prompts(site: Site) -> None:
+    site.boards.start()
+    assert [cast(PowerOn, request).name for request in site.asked] == ["program"]
+    assert "program" in site.boards
+    assert "prompt" not in site.boards
+
+
+def test_one_that_ends_is_restarted_so_many_times_within_a_time(
+    site: Site, journal: Journal
+) -> None:
+    def lose(tick: int) -> bool:
+        return site.boards.lose(Ended("program", 1, -9, 0, tick), "killed")
+
+    assert [lose(tick) for tick in (10, 20, 30)] == [True, True, False]
+    assert [cast(PowerOn, request).name for request in site.asked] == ["program"] * 2
+    died = ("died", "host board 'program' ended: killed")
+    found = told(journal)
+    assert [code for code, _ in found] == ["died", "restart", "died", "restart", "died", "given_up"]
+    assert found[0] == died
+    assert found[1][1].startswith("restart 1 of at most 2 in 1 s")
+    assert found[-1] == ("given_up", "gave up on 'program'")
+    assert site.block[Block.STATE] == TaskState.GIVEN_UP
+
+
+def test_one_whose_program_is_done_is_not_restarted(site: Site, journal: Journal) -> None:
+    site.block[Block.STATE] = TaskState.ENDED
+    assert site.boards.lose(Ended("program", 1, 0, 0, 10), "exit status 0")
+    assert told(journal) == [("done", "host board 'program': its program is done")]
+    assert site.asked == []
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_one_that_a_signal_has_stopped_is_ended_once(site: Site, journal: Journal) -> None:
+    with forked(signal.pause) as pid:
+        site.block[Block.PID] = pid
+        site.boards.look()
+        assert (site.asked, told(journal)) == ([], [])
+        os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: state_of(pid) in STOPPED)
+        site.boards.look()
+        site.boards.look()
+        assert site.asked == [PowerOff("program")]
+        (event,) = cast("list[Event]", journal.events)
+        assert (event.kind, event.code, event.subject) == ("detection", "hang", "program")
+        assert event.text == "'program' is not responding: stopped by a signal"
+        # Its successor may be stopped, too.
+        site.boards.lose(Ended("program", pid, -9, 0, 10), "killed")
+        site.boards.look()
+        assert site.asked.count(PowerOff("program")) == 2

@@ -1,0 +1,132 @@
+"""Waits during a launch: their time limits, what is said of them, and what the crate answers."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import cast
+
+import pytest
+
+from rack.boards.crate import patience
+from rack.boards.crate.line import CrateLine
+from rack.boards.crate.patience import COMPILE_S, PATIENCE_S, Patience, await_opened
+from rack.boards.crate.requests import Compiling, Opened, PreloadFailed, Preloading
+from rack.boards.errors import LaunchError
+from rack.boards.events import Journal
+
+LIMIT_S = 60.0
+
+
+class Clock:
+    """Stands for the module `time`: a moment that the test moves on."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        """Return it."""
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(patience, "time", made)
+    return made
+
+
+def said(journal: Journal) -> list[str]:
+    """Return what was reported."""
+    assert {event.kind for event in journal.events} <= {"waiting"}
+    return [event.text for event in journal.events]
+
+
+def test_a_wait_is_reported_each_time_it_has_doubled(clock: Clock) -> None:
+    journal = Journal(None)
+    wait = Patience(journal, LIMIT_S)
+    assert wait.left_s == PATIENCE_S
+    for passed in (1.9, 2.0, 2.1, 3.9, 4.0, 7.9, 8.1):
+        clock.now = 1000.0 + passed
+        wait.report("loading")
+    assert said(journal) == [f"loading, {seconds} s so far" for seconds in (2, 4, 8)]
+    assert wait.left_s == pytest.approx(16.0 - 8.1)
+
+
+def test_a_wait_is_over_beyond_its_limit_which_can_begin_again(clock: Clock) -> None:
+    wait = Patience(Journal(None), LIMIT_S)
+    clock.now += LIMIT_S
+    assert (wait.is_over, wait.left_s) == (False, 0.0)
+    clock.now += 0.5
+    assert wait.is_over
+    wait.renew(10.0)
+    assert (wait.is_over, wait.limit_s) == (False, 10.0)
+    clock.now += 10.5
+    assert wait.is_over
+
+
+class Line:
+    """A crate that answers at its times; each wait for it moves the clock on."""
+
+    def __init__(self, clock: Clock, *answers: tuple[float, object]) -> None:
+        self._clock = clock
+        self._answers = deque(answers)
+        self.line = self
+        self.output: list[str] = []
+
+    def poll(self, timeout_s: float) -> bool:
+        """Wait for the next answer."""
+        if self._answers and self._answers[0][0] <= self._clock.now - 1000.0 + timeout_s:
+            self._clock.now = max(self._clock.now, 1000.0 + self._answers[0][0])
+            return True
+        self._clock.now += timeout_s + 0.001
+        return False
+
+    def receive(self) -> object:
+        """Return it."""
+        return self._answers.popleft()[1]
+
+    def printed(self) -> list[str]:
+        """Return what the crate has printed."""
+        return self.output
+
+
+def opened(clock: Clock, *answers: tuple[float, object], output: str = "") -> tuple[list[str], str]:
+    """Wait for a crate with these answers; return what was said, and why it failed."""
+    journal = Journal(None)
+    line = Line(clock, *answers)
+    line.output = output.split("\n") if output else []
+    why = ""
+    try:
+        await_opened(cast(CrateLine, line), journal, LIMIT_S)
+    except LaunchError as error:
+        why = str(error)
+    return said(journal), why
+
+
+def test_a_crate_that_opens_soon_is_not_spoken_of(clock: Clock) -> None:
+    assert opened(clock, (0.5, Preloading("a:B")), (1.9, Opened())) == ([], "")
+
+
+def test_each_class_has_its_own_time_limit_and_compiling_a_longer_one(clock: Clock) -> None:
+    lines, why = opened(clock, (50.0, Preloading("a:B")), (105.0, Opened()))
+    assert why == ""
+    assert lines[0] == "the crate is starting, 2 s so far"
+    assert lines[-1] == "preloading 'a:B', 32 s so far"
+    lines, why = opened(clock, (0.0, Compiling("terms")), (COMPILE_S - 1.0, Opened()))
+    assert why == ""
+    assert lines[0] == "compiling 'terms', which is kept for later launches, 2 s so far"
+
+
+def test_a_crate_that_does_not_open_is_named_with_what_it_does(clock: Clock) -> None:
+    assert opened(clock)[1] == "the crate is starting: not done within 60 s"
+    assert opened(clock, (0.0, Preloading("a:B")))[1] == "preloading 'a:B': not done within 60 s"
+    why = opened(clock, (0.0, Compiling("terms")))[1]
+    assert why == "compiling 'terms', which is kept for later launches: not done within 300 s"
+    assert opened(clock, output="one\ntwo")[1] == "one\ntwo"
+
+
+def test_a_crate_that_fails_or_ends_says_why(clock: Clock) -> None:
+    failed = PreloadFailed("a:B", "no such file")
+    assert opened(clock, (0.0, failed))[1] == "'a:B' cannot be preloaded: no such file"
+    assert opened(clock, (0.0, None))[1] == "the crate has ended"
+    assert opened(clock, (0.0, None), output="killed")[1] == "killed"
