@@ -1,0 +1,178 @@
+"""Faults put into a rack while it runs, on its memory alone: the test is its clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.fault_table import NEVER, Entry, FaultTable, Stage
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Run, System
+from rack.boards.config import load, resolve
+from rack.boards.errors import ConfigError
+from rack.tools.console.answer import Failure
+from rack.tools.faults import live
+from rack.tools.faults.live import LiveRack
+from tests.processes import in_thread, wait_until
+
+TICK = 100
+
+
+class Running:
+    """A rack that runs, as far as its memory says; `live` is a look at it."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment = segment
+        segment.words[System.STATE] = Run.RUNNING
+        segment.words[System.TICK] = TICK
+        self.table = FaultTable(segment)
+        self.live = LiveRack(segment.rack)
+
+    def begin(self, number: int, until: int = TICK + 9) -> None:
+        """Begin a fault, as the clock does."""
+        words = self.table.entries[number].words
+        words[Entry.FROM] = TICK + 1
+        words[Entry.UNTIL] = until
+        words[Entry.STAGE] = Stage.ACTIVE
+
+    def end(self, number: int, acted: int = 3) -> None:
+        """End it."""
+        words = self.table.entries[number].words
+        words[Entry.COUNT] = acted
+        words[Entry.STAGE] = Stage.OVER
+
+    def serve(self) -> None:
+        """Begin the first fault as soon as it waits, and end it."""
+        wait_until(lambda: self.table.entries[0].stage == Stage.WAITING)
+        self.begin(0)
+        self.end(0)
+
+
+@pytest.fixture
+def rack(small: Path, rack_name: str) -> Iterator[Running]:
+    config = load(small, [f"name={rack_name}"])
+    segment = Segment.create(resolve(config).layout, config.text())
+    yield Running(segment)
+    segment.close()
+    unlink(rack_name)
+
+
+def test_a_fault_that_begins_at_the_next_tick_is_waited_for(rack: Running) -> None:
+    def serve() -> None:
+        wait_until(lambda: rack.table.entries[0].stage == Stage.WAITING)
+        rack.begin(0)
+
+    with in_thread(serve):
+        found = rack.live.inject({"board": "lower", "kind": "drop", "probability": "0.5"}, False)
+    assert (found["fault"], found["stage"], found["waits_for"]) == (0, "active", "")
+    assert found["message"].endswith(f": from tick {TICK + 1} to tick {TICK + 8}")
+    rack.begin(0, NEVER)
+    assert rack.live._state(rack.table.entries[0]).endswith("to the end of the run")
+
+
+@pytest.mark.parametrize(("acted", "text"), [(1, "acted once"), (3, "acted 3 times")])
+def test_one_that_is_over_says_when_it_acted(rack: Running, acted: int, text: str) -> None:
+    def serve() -> None:
+        wait_until(lambda: rack.table.entries[0].stage == Stage.WAITING)
+        rack.begin(0)
+        rack.end(0, acted)
+
+    with in_thread(serve):
+        found = rack.live.inject({"board": "lower", "kind": "mute", "cycles": "4"}, True, 20.0)
+    assert found["stage"] == "over"
+    assert found["message"].endswith(f": ticks {TICK + 1} to {TICK + 8}, {text}")
+
+
+def test_one_with_a_tick_to_come_is_armed_and_can_be_withdrawn(rack: Running) -> None:
+    found = rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
+    assert (found["stage"], found["waits_for"]) == (
+        "waiting",
+        f"tick {TICK + 1}; the rack is at tick {TICK}",
+    )
+    hint = f"to withdraw it: rack inject {rack.segment.rack} --withdraw 0"
+    assert found["message"].endswith(f"armed, waits for {found['waits_for']}; {hint}")
+    with pytest.raises(Failure, match="fault 1 is not waiting; waiting: 0"):
+        rack.live.withdraw(1)
+    ticks = iter((TICK + 1, TICK + 2))
+
+    def tick() -> None:
+        wait_until(lambda: rack.table.entries[0][Entry.FROM] == NEVER)
+        for now in ticks:
+            rack.segment.words[System.TICK] = now
+
+    with in_thread(tick):
+        withdrawn = rack.live.withdraw(0)
+    assert (withdrawn["stage"], withdrawn["message"]) == ("free", f"{found['text']}: withdrawn")
+    assert rack.live.faults() == []
+    with pytest.raises(Failure, match="fault 0 is not waiting; waiting: none"):
+        rack.live.withdraw(0)
+
+
+def test_one_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
+    rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
+
+    def begin() -> None:
+        wait_until(lambda: rack.table.entries[0][Entry.FROM] == NEVER)
+        rack.begin(0)
+        rack.segment.words[System.TICK] = TICK + 2
+
+    with (
+        in_thread(begin),
+        pytest.raises(Failure, match="it had begun before it could be withdrawn"),
+    ):
+        rack.live.withdraw(0)
+
+
+def test_waits_have_an_end(rack: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "BEGIN_S", 0.02)
+    with pytest.raises(Failure, match=r"the clock has not begun it within 0\.02 s"):
+        rack.live.inject({"board": "lower", "kind": "kill"}, False)
+    later = {"board": "lower", "kind": "kill", "tick": TICK + 50}
+    with pytest.raises(Failure, match=r"timed out after 0\.02 s: .* armed"):
+        rack.live.inject(later, True, 0.02)
+
+    def stop() -> None:
+        wait_until(lambda: len(rack.table.staged((Stage.WAITING,))) == 3)
+        rack.segment.words[System.STATE] = Run.STOPPED
+
+    with in_thread(stop), pytest.raises(Failure, match="the run ended before it began"):
+        rack.live.inject(later, True)
+    with pytest.raises(Failure, match=f"rack '{rack.segment.rack}': its run is over"):
+        rack.live.inject(later, False)
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"kind": "self-test"}, "a running rack has passed its self-tests"),
+        ({"kind": "kill", "tick": TICK}, f"has passed; the rack is at tick {TICK}"),
+        ({"kind": "hog", "for": 0.1}, "hog needs real time"),
+        ({"kind": "kill", "speed": 2}, "kill has no such parameter"),
+    ],
+)
+def test_what_a_running_rack_cannot_have_is_refused(
+    rack: Running, given: dict[str, object], why: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        rack.live.inject({"board": "lower", **given}, False)
+    assert why in str(caught.value)
+    assert rack.live.faults() == []
+
+
+def test_the_table_has_what_each_waits_for_and_no_numbers_that_are_not_known(
+    rack: Running,
+) -> None:
+    for tick in (TICK + 1, TICK + 2):
+        rack.live.inject({"board": "lower", "kind": "kill", "tick": tick}, False)
+    rack.begin(1)
+    entry = rack.table.entries[1].words
+    entry[Entry.STRUCK_TICK] = 0
+    _, first, second = map(str.rstrip, rack.live.text())
+    numbers = first.removesuffix(f"  tick {TICK + 1}; the rack is at tick {TICK}").split()
+    assert numbers[-5:] == ["waiting", str(TICK + 1), "-", "-", "0"]
+    # Begins, first acted, until, acted.
+    assert second.split()[-4:] == [str(TICK + 1), "0", str(TICK + 9), "0"]
+    # Two faults of one run do not draw the same random numbers.
+    assert rack.table.entries[0][Entry.SEED] != rack.table.entries[1][Entry.SEED]
