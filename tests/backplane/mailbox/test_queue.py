@@ -117,6 +117,16 @@ def test_late_messages_become_visible_at_the_next_boundary(make_bus: MakeBus) ->
     assert [ids(reader.read(tick)) for tick in (4, 7, 8)] == [[], [], [1]]
 
 
+@pytest.mark.parametrize(("now", "in_time"), [(None, True), (7, True), (8, False)])
+def test_a_write_says_whether_it_is_in_time(
+    make_bus: MakeBus, now: int | None, in_time: bool
+) -> None:
+    writer, _ = ends(make_bus(*queue(4, rates=(4, 1))))
+    assert writer.write(4, now)  # nothing to write is never late
+    assert writer.message.send()
+    assert writer.write(4, now) is in_time
+
+
 def test_a_new_reader_continues_after_the_last(make_bus: MakeBus) -> None:
     segment = make_bus(*queue(8))
     writer = open_writer(segment, NAME)

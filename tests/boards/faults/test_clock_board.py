@@ -3,19 +3,29 @@ under way."""
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
+from typing import Any
+
+import pytest
 
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
-from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Injection, Stage
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.process import STOPPED, WAITING, is_alive, state_of
+from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore
+from rack.backplane.watch.alarms import Alarm, alarm_ring
 from rack.backplane.words import Block, System
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.faults.kind import KINDS
-from tests.backplane.bus import mailbox, task
+from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
-from tests.processes import BOUND_S
+from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
+
+pytestmark = pytest.mark.filterwarnings(FORKS)
 
 CYCLE_S = 0.05
 """Longer than the clock takes for all ticks of the slow task's period."""
@@ -58,3 +68,196 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # n
         for _ in "ab"
     ]
     assert (entry[Entry.FROM], entry[Entry.UNTIL]) == (3, 9)
+
+
+class Site:
+    """Two mailboxes, of a writer and of another task, and the clock's faults, tick by tick."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment = segment
+        segment.words[System.LOCKSTEP] = 1
+        segment.words[System.PERIOD_NS] = 2_500_000
+        self.table = FaultTable(segment)
+        self.driver = LockstepDriver(segment, lambda _: None, False, 8)
+        self.stage = FaultStage(segment, self.driver)
+        self._ring = alarm_ring(segment, "clock")
+        self.write_other = open_writer(segment, "other.point")
+
+    def add(self, kind: str, task: int = 0, **more: Any) -> FaultEntry:
+        """Add a fault, of the writer if nothing else is said."""
+        defaults = tuple(p.default or 1.0 for p in KINDS[kind].parameters)
+        return self.table.add(Injection(KINDS[kind].number, task, parameters=defaults, **more))
+
+    def alarms(self) -> list[tuple[Alarm, int, int, float]]:
+        """Return code, tick, subject and value of the alarms since the last call."""
+        rows = self._ring.drain().rows
+        return [
+            (Alarm(row["code"]), int(row["tick"]), int(row["subject"]), float(row["value"]))
+            for row in rows
+        ]
+
+    def advance(self, *ticks: int) -> list[tuple[Alarm, int, int, float]]:
+        """Do these ticks; return the alarms."""
+        for tick in ticks:
+            self.stage.advance(tick)
+        return self.alarms()
+
+
+@pytest.fixture
+def site(make_bus: MakeBus) -> Site:  # noqa: F811
+    return Site(
+        make_bus(
+            task("writer"),
+            task("reader", slot=3),
+            task("other", slot=4),
+            mailbox(),
+            mailbox(name="other.point", writer="other"),
+        )
+    )
+
+
+def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
+    entry = site.add("mute", tick=5, ticks=3)
+    generation = site.table.generation
+    assert (site.advance(3, 4), entry.stage) == ([], Stage.WAITING)
+    assert [found.index for found in site.stage.open] == [entry.index]
+    assert site.advance(5) == [(Alarm.FAULT_BEGINS, 5, entry.index, 0.0)]
+    assert (entry[Entry.FROM], entry[Entry.UNTIL], entry.stage) == (5, 8, Stage.ACTIVE)
+    assert site.table.generation == generation + 1
+    assert site.advance(6, 7) == []
+    entry.words[Entry.COUNT] = 2
+    assert site.advance(8) == [(Alarm.FAULT_ENDS, 8, entry.index, 2.0)]
+    assert (entry[Entry.UNTIL], entry.stage) == (8, Stage.OVER)
+    assert site.table.generation == generation + 2
+    assert (site.advance(9), site.stage.open, site.stage.injected) == ([], [], 1)
+
+
+def test_a_fault_without_an_end_lasts_to_the_end_of_the_run(site: Site) -> None:
+    entry = site.add("mute", tick=5)
+    site.advance(5, 6, 10**6)
+    assert (entry[Entry.UNTIL], entry.stage) == (NEVER, Stage.ACTIVE)
+
+
+def test_a_fault_of_the_clock_that_strikes_once_is_over_a_tick_later(site: Site) -> None:
+    entry = site.add("clock-skip", task=-1, tick=5)
+    assert site.driver.skip == 0
+    site.advance(5)
+    assert (entry[Entry.UNTIL], site.driver.skip) == (6, 1)
+    assert (entry[Entry.STRUCK_TICK], entry[Entry.COUNT]) == (5, 1)
+    (ended,) = [alarm for alarm in site.advance(6) if alarm[0] is Alarm.FAULT_ENDS]
+    assert ended == (Alarm.FAULT_ENDS, 6, entry.index, 1.0)
+
+
+def test_messages_are_seen_to_flow_again_after_a_fault_of_them(site: Site) -> None:
+    writer = open_writer(site.segment, NAME)
+    site.add("mute", tick=2, ticks=3)
+    site.advance(2)
+    writer.write(3)
+    site.advance(5)
+    box = site.segment.layout.mailboxes.index(site.segment.layout.mailbox(NAME))
+    # A message made while it was active is none of those after it.
+    assert (site.stage.awaited, site.advance(6)) == ({box: 5}, [])
+    site.write_other.write(6)
+    assert site.advance(7, 8) == []
+    writer.write(8)
+    # Visible a tick later, and read as of the tick before.
+    assert site.advance(9) == []
+    assert site.advance(10) == [(Alarm.FLOWS, 10, box, 5.0)]
+    assert (site.stage.awaited, site.advance(11)) == ({}, [])
+
+
+def test_a_restarted_clock_awaits_the_messages_that_its_predecessor_did(site: Site) -> None:
+    site.add("mute", tick=2, ticks=3)
+    site.advance(2, 5)
+    restarted = FaultStage(site.segment, site.driver)
+    assert restarted.awaited == site.stage.awaited == {0: 5}
+
+
+def test_a_condition_holds_as_of_the_tick_before(site: Site) -> None:
+    entry = site.add("mute", when=(1, 0, 7), ticks=1)
+    site.write_other.message.id = 6
+    site.write_other.write(0)
+    assert site.advance(1, 2) == []
+    site.write_other.message.id = 7
+    site.write_other.write(2)
+    assert site.advance(3) == []
+    assert site.advance(4) == [(Alarm.FAULT_BEGINS, 4, entry.index, 0.0)]
+
+
+def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) -> None:
+    absent = site.add("kill", tick=1)
+    site.advance(1)
+    assert (absent[Entry.COUNT], absent.stage) == (0, Stage.ACTIVE)
+    block = site.segment.block("writer")
+    with forked(signal.pause) as pid:
+        block[Block.PID] = pid
+
+        def crate() -> None:
+            wait_until(lambda: not is_alive(pid))
+            block[Block.LOST] = 3
+            site.segment.words[System.LOSSES] += 1
+            done_semaphore(site.segment.rack, "writer").release()
+
+        entry = site.add("kill", tick=2)
+        with in_thread(crate):
+            site.advance(2)
+        assert not is_alive(pid)
+        assert (entry[Entry.COUNT], entry[Entry.STRUCK_TICK]) == (1, 2)
+    # Its process is gone: there is nobody to strike.
+    again = site.add("kill", tick=3)
+    site.advance(3)
+    assert again[Entry.COUNT] == 0
+
+
+def test_a_hanging_task_goes_on_when_its_fault_ends_and_if_it_is_lost_the_fault_is_over(
+    site: Site,
+) -> None:
+    block = site.segment.block("writer")
+    with forked(signal.pause) as pid:
+        block[Block.PID] = pid
+        site.add("hang", tick=1, ticks=3)
+        site.advance(1)
+        wait_until(lambda: state_of(pid) in STOPPED)
+        target = next(one for one in site.driver.tasks if one.spec.name == "writer")
+        assert target.is_stopped
+        site.advance(4)
+        wait_until(lambda: state_of(pid) in WAITING)
+        assert not target.is_stopped
+        lasting = site.add("hang", tick=5)
+        site.advance(5)
+        wait_until(lambda: state_of(pid) in STOPPED)
+        block[Block.LOST] = 7
+        site.advance(6)
+        assert (lasting.stage, lasting[Entry.UNTIL]) == (Stage.OVER, 6)
+        assert state_of(pid) in STOPPED
+
+
+def test_in_lockstep_a_phase_does_not_matter(site: Site) -> None:
+    entry = site.add("clock-skip", task=-1, tick=5, phase=500)
+    site.advance(5)
+    assert entry[Entry.COUNT] == 1
+    site.stage.within(5)
+    assert entry[Entry.COUNT] == 1
+
+
+def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -> None:
+    site.segment.words[System.LOCKSTEP] = 0
+    site.segment.words[System.EPOCH_NS] = time.monotonic_ns() - 5 * 2_500_000
+    site.stage = FaultStage(site.segment, site.driver)
+    entry = site.add("clock-skip", task=-1, tick=5, phase=900)
+    site.advance(5)
+    assert (entry[Entry.COUNT], entry.stage) == (0, Stage.ACTIVE)
+    site.stage.within(5)
+    assert entry[Entry.COUNT] == 1
+    assert entry[Entry.STRUCK_NS] >= site.segment.words[System.EPOCH_NS] + 5.9 * 2_500_000
+    site.stage.within(6)
+    assert entry[Entry.COUNT] == 1
+
+
+def test_a_babble_floods_the_rings_while_it_lasts(site: Site) -> None:
+    site.add("babble", tick=2, ticks=2)
+    flooded = []
+    for tick in range(1, 5):
+        site.advance(tick)
+        flooded.append(site.driver.is_flooded)
+    assert flooded == [False, True, True, False]
