@@ -58,7 +58,8 @@ OPERATOR = re.compile(
 )
 RUNNING: set[int] = set()
 """Sessions of runs."""
-TIME_OUT = re.compile(r"_?(bound|wait|time_?out|patience)\w*", re.IGNORECASE)
+TIME_OUT = re.compile(r"(?i:_?(?:bound|wait|time_?out|patience)\w*)|[A-Z_]+_S")
+"""Names of real times to wait, to look again, to give up."""
 
 
 @dataclass(frozen=True)

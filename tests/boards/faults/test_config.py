@@ -11,6 +11,7 @@ from rack.boards.config import FAULTS, load, loads, names, wire
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
+from tests import reference
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -138,3 +139,7 @@ def test_load_reports_a_mistake_of_supervision(small: Path, setting: str, expect
         load(small, [setting])
     assert expected in str(error.value)
     assert len(error.value.mistakes) == 1
+
+
+def test_the_page_of_all_keys_has_those_of_faults() -> None:
+    assert reference.is_on_page("fault")
