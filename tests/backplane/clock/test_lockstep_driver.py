@@ -192,3 +192,37 @@ def test_a_stop_ends_lockstep_though_a_task_hangs(make_bus: MakeBus) -> None:
     with in_thread(LockstepDriver(segment, lambda tick: None, False, HISTORY).run):
         segment.words[System.STOP_REQUEST] = 1
     assert segment.words[System.STATE] == Run.STOPPED
+
+
+def test_a_task_that_still_works_is_waited_for_and_moves_to_the_front(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast", slot=2), task("middle", slot=3), task("slow", slot=4))
+    segment.words[System.LOCKSTEP] = 1
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    for found in driver.tasks:
+        found.block[Block.RELEASED] = found.block[Block.DONE] = 5
+        found.block[Block.DEADLINE] = 6
+    before = list(driver._last_first)
+    late = before[1]
+    late.block[Block.DONE] = 4
+    waited = []
+
+    class Reports:
+        """Stands for its semaphore: the wait for it is when it finishes."""
+
+        def wait(self) -> bool:
+            """Let it finish."""
+            waited.append(late.spec.name)
+            late.block[Block.DONE] = 5
+            return False
+
+        def take(self) -> bool:
+            """Take nothing."""
+            return False
+
+    late.done = Reports()  # type: ignore[assignment]
+    assert driver._wait_for_all(6)
+    assert driver._last_first == [late, before[0], before[2]]
+    assert waited == [late.spec.name]
+    late.block[Block.DONE] = 4
+    assert driver._wait_for_all(6)
+    assert driver._last_first == [late, before[0], before[2]]

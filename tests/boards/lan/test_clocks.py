@@ -23,11 +23,18 @@ from hypothesis import strategies as st
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
+from rack.boards.lan import clocks
 from rack.boards.lan.clocks import (
     _PING_KIND,
+    _PONG,
+    _PONG_KIND,
     ANSWER_NS,
+    EAGER,
+    EAGER_NS,
     MOST_ASKERS,
+    PING_NS,
     RECENT,
+    UNANSWERED,
     UNKNOWN_NS,
     ClockOffset,
     Clocks,
@@ -187,14 +194,14 @@ def test_a_message_counts_as_old_as_it_may_be(segment: Segment) -> None:
 def test_a_clock_that_does_not_answer_is_reported_after_its_time(segment: Segment) -> None:
     segment.words[System.PERIOD_NS] = PERIOD_NS
     peers = Peers(["b"])
-    clocks = Clocks(segment, peers, 1, OwnGrid(segment, 1))
+    found = Clocks(segment, peers, 1, OwnGrid(segment, 1))
     bound = UNKNOWN_NS // PERIOD_NS
     peer = peers["b"]
-    assert not clocks.is_unanswered(peer, 10 * bound)
+    assert not found.is_unanswered(peer, 10 * bound)
     peer.comes(7, 5)
-    assert [clocks.is_unanswered(peer, 5 + ticks) for ticks in (bound, bound + 1)] == [False, True]
+    assert [found.is_unanswered(peer, 5 + ticks) for ticks in (bound, bound + 1)] == [False, True]
     peer.offset_ns = 0
-    assert not clocks.is_unanswered(peer, 5 + bound + 1)
+    assert not found.is_unanswered(peer, 5 + bound + 1)
     peer.offset_ns = None
     segment.words[System.LOCKSTEP] = 1
     stepped = Clocks(segment, peers, 1, OwnGrid(segment, 1))
@@ -205,8 +212,8 @@ def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> Non
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = 100 * S
     peers = Peers(["b"])
-    clocks = Clocks(segment, peers, 1, OwnGrid(segment, 1))
-    clocks.fill(out := Found(), "b", 4)
+    found = Clocks(segment, peers, 1, OwnGrid(segment, 1))
+    found.fill(out := Found(), "b", 4)
     assert vars(out) == {
         "steps": 0,
         "offset": 0.0,
@@ -216,11 +223,11 @@ def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> Non
         "round_trip": -1.0,
     }
     peers["b"].comes(7, 0)
-    clock = clocks._clocks["b"]
+    clock = found._clocks["b"]
     clock.epoch_ns, clock.period_ns, clock.clock_ns = 1100 * S, 2 * MS, 5 * MS
     clock.offset.add(trip(101 * S, 1000 * S, 300 * US, 100 * US))
-    clocks._now_ns = 102 * S
-    clocks.fill(out, "b", tick=800)
+    found._now_ns = 102 * S
+    found.fill(out, "b", tick=800)
     # Of both ways' 0.4 ms the half, and what a clock drifts in a second.
     assert out.uncertainty == pytest.approx(200e-6 + DRIFT_PPM * 1e-6, rel=1e-5)
     assert (out.round_trip, out.speed, out.steps) == (400e-6, 2.5, 0)
@@ -398,3 +405,124 @@ def test_a_way_that_is_slower_than_the_way_back_is_within_the_uncertainty(rack_n
         # The error is real, and stated.
         assert DELAY_S / 4 < abs(seen["offset"]) <= seen["uncertainty"]
         assert seen["uncertainty"] >= DELAY_S / 2
+
+
+class Wire:
+    """Two racks' clocks with a network between them that keeps every message until the test passes
+    it on."""
+
+    def __init__(self, segment: Segment) -> None:
+        segment.words[System.PERIOD_NS] = PERIOD_NS
+        segment.words[System.EPOCH_NS] = 100 * S
+        self._heard: dict[str, Any] = {}
+        self.sent: list[Arrived] = []
+        self.peers = Peers(["b"])
+        self.clocks = Clocks(segment, self.peers, LAUNCH, OwnGrid(segment, 1))
+        self.sealer = Sealer(b"secret")
+        self.clocks.open(self, self.sealer)  # type: ignore[arg-type]
+        self.peers["b"].comes(OTHER, 0)
+
+    def on(self, key: str, callback: Any) -> None:
+        """Note who listens."""
+        self._heard[key] = callback
+
+    def publish(self, key: str) -> Any:
+        """Keep what is sent."""
+        return lambda payload, envelope: self.sent.append(Arrived(key, envelope, payload))
+
+    def answer(self, rack: str, ping: Arrived, **more: Any) -> None:
+        """Answer a ping, as rack `b` does at once, or otherwise."""
+        head = self.sealer.opened(ping.key, ping.envelope, ping.payload)
+        assert isinstance(head, Envelope)
+        now = time.monotonic_ns()
+        told = {"launch": LAUNCH, "period": 1_000_000, "clock": CLOCK_NS, "kind": _PONG_KIND}
+        told |= {"from": OTHER, "serial": head.serial, **more}
+        payload = _PONG.pack(told["launch"], now, 50 * S, told["period"], told["clock"])
+        key = f"rack/b/pong/{rack}"
+        back = Envelope(told["kind"], told["from"], told["serial"], told["serial"], 0, 0, now)
+        seal = self.sealer.seal(key, back, payload)
+        self._heard[f"rack/*/pong/{rack}"](Arrived(key, seal, payload + more.get("more", b"")))
+
+    def take(self) -> tuple[int, int]:
+        """Do a cycle; return the answers taken and refused so far."""
+        self.clocks.exchange()
+        return self.clocks.taken, self.clocks.refused
+
+
+LAUNCH, OTHER = 11, 22
+
+
+@pytest.fixture
+def wire(segment: Segment) -> Wire:
+    return Wire(segment)
+
+
+def test_a_rack_is_asked_often_until_its_clock_is_known_and_seldom_then(
+    wire: Wire, segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [time.monotonic_ns()]
+    monkeypatch.setattr(clocks, "monotonic_ns", lambda: now[0])
+    clock = wire.clocks._clocks["b"]
+    for trips in range(EAGER + 2):
+        wire.take()
+        assert len(wire.sent) == trips + 1
+        pause = PING_NS if trips >= EAGER else EAGER_NS
+        assert clock.due_ns == now[0] + pause
+        monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
+        wire.answer(segment.rack, wire.sent[-1])
+        now[0] += pause - 1
+        wire.take()
+        assert (len(wire.sent), len(clock.offset)) == (trips + 1, trips + 1)
+        now[0] += 1
+
+
+def test_an_answer_is_taken_once_and_gives_offset_and_grid(wire: Wire, segment: Segment) -> None:
+    peer = wire.peers["b"]
+    assert wire.take() == (0, 0)
+    assert (peer.offset_ns, peer.uncertainty_ns) == (None, 0)
+    wire.answer(segment.rack, wire.sent[0])
+    wire.answer(segment.rack, wire.sent[0])
+    assert wire.take() == (1, 1)
+    clock = wire.clocks._clocks["b"]
+    assert (clock.epoch_ns, clock.period_ns, clock.clock_ns) == (50 * S, 1_000_000, CLOCK_NS)
+    assert peer.offset_ns is not None
+    assert abs(peer.offset_ns) <= peer.uncertainty_ns
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"launch": LAUNCH + 1},
+        {"from": OTHER + 1},
+        {"period": 0},
+        {"clock": 0},
+        {"serial": 5},
+        {"kind": _PING_KIND},
+        {"more": b"x"},
+    ],
+)
+def test_what_is_no_answer_to_a_ping_is_refused(
+    wire: Wire, segment: Segment, wrong: dict[str, Any]
+) -> None:
+    wire.take()
+    wire.answer(segment.rack, wire.sent[0], **wrong)
+    assert wire.take() == (0, 1)
+    wire.answer(segment.rack, wire.sent[0])
+    assert wire.take() == (1, 1)
+
+
+def test_a_rack_that_is_not_there_is_not_asked(wire: Wire) -> None:
+    wire.peers["b"].goes(OTHER, 1)
+    wire.take()
+    assert wire.sent == []
+
+
+def test_of_pings_without_answers_the_newest_are_remembered(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = wire.clocks._clocks["b"]
+    for _ in range(UNANSWERED + 3):
+        clock.due_ns = 0
+        wire.take()
+    assert len(clock.sent) == UNANSWERED
+    assert min(clock.sent) == max(clock.sent) - UNANSWERED + 1
