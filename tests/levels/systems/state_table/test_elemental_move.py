@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rack.backplane import semaphores
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment, unlink
@@ -17,7 +18,7 @@ from rack.boards.config import load
 from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.run.control_loop import VirtualControlLoop
 from rack.levels.level import Executor
-from rack.levels.systems.state_table.elemental_move import MoveTable
+from rack.levels.systems.state_table.elemental_move import STILL_M_S, MoveTable
 
 LEVEL = "elemental_move"
 LAST = {"words": "pick block1", "in_state": "reaching", "sent": 7, "reached": 1, "put": -1}
@@ -119,3 +120,121 @@ def test_it_recalls_its_last_messages_in_its_first_cycle_only(
         task.inputs.read(tick)
         task.process(tick)
     assert recalled == [1]
+
+
+class Arm:
+    """The level, with what it reads of the arm and of the world as the test has it."""
+
+    def __init__(self, bench: Bench) -> None:
+        wiring = next(wiring for wiring in bench.plan.tasks if wiring.task == LEVEL)
+        level = find_class(wiring.target, Executor)(wiring.context)
+        assert isinstance(level, MoveTable)
+        task = VirtualControlLoop(bench.segment, wiring, level)
+        task.inputs.read(50)
+        self.level = level
+        self.values = task.inputs.values
+        self.messages = task.outputs.messages
+        self.world = Message(self.values.world.value.record.dtype)
+        self.below = Message(self.values.status.value.record.dtype)
+        self.world.revision = 1
+        self.place = np.array([0.4, -0.2, 0.1])
+        self.world.position[0] = self.place
+        self.world.quaternion[:] = (1.0, 0.0, 0.0, 0.0)
+
+    def look(self, *, lost: bool = False) -> dict[str, str]:
+        """Return what it sees."""
+        self.values.world = Reading(self.world, Verdict.NEW, lost)
+        self.values.status = Reading(self.below, Verdict.NEW)
+        return self.level.look(self.values, 50)
+
+
+@pytest.fixture
+def arm(bench: Bench) -> Arm:
+    return Arm(bench)
+
+
+def test_it_sees_the_world_once_it_is_sensed(arm: Arm) -> None:
+    assert arm.look()["world"] == "seen"
+    assert arm.look(lost=True)["world"] == "unseen"
+    arm.world.revision = 0
+    assert arm.look()["world"] == "unseen"
+    assert arm.look()["target"] == "moving"
+
+
+def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
+    assert arm.look()["target"] == "there"
+    arm.level._row = 0
+    arm.level._aim[:] = arm.place
+    moved = arm.level.table.plan.moved
+    for offset, speed, seen in (
+        (0.0, 0.0, "there"),
+        (0.99 * moved, 0.99 * STILL_M_S, "there"),
+        (1.01 * moved, 0.0, "displaced"),
+        (0.0, 1.01 * STILL_M_S, "moving"),
+    ):
+        arm.world.position[0] = arm.place + np.array([0.0, offset, 0.0])
+        arm.world.velocity[0] = (speed, 0.0, 0.0)
+        assert arm.look()["target"] == seen
+
+
+def test_what_was_put_down_is_its_support_until_it_is_elsewhere(arm: Arm) -> None:
+    arm.below.held = 1
+    arm.below.object = 0
+    assert arm.look()["gripper"] == "holds"
+    arm.level.do_open()
+    arm.below.held = 0
+    arm.level._aim[:] = arm.place
+    found = arm.look()
+    assert (found["gripper"], found["support"]) == ("free", "there")
+    arm.world.position[0] = arm.place + 1.0
+    assert arm.look()["support"] == "elsewhere"
+    assert arm.look(lost=True)["support"] == "there"
+    # Nothing was in the gripper this time.
+    arm.level.do_open()
+    assert arm.look()["support"] == "there"
+
+
+def test_gripper_and_home_are_commands_of_their_own(arm: Arm) -> None:
+    arm.look()
+    given = []
+    for do in (arm.level.do_open, arm.level.do_close, lambda: arm.level.do_move("home")):
+        do()
+        arm.level.give(arm.messages, 50)
+        command = arm.messages.command
+        given.append((command.id, command.words, command.speed, command.object))
+    plan = arm.level.table.plan
+    assert given == [
+        (1, "open", 1.0, -1),
+        (2, "close", 1.0, -1),
+        (3, "move", plan.home_speed, -1),
+    ]
+    np.testing.assert_array_equal(arm.messages.command.joints, arm.level._cell.home)
+
+
+def test_a_pose_over_an_object_is_above_where_it_rests(arm: Arm) -> None:
+    arm.look()
+    name = arm.level.context.scene.objects[0]
+    arm.level._words = f"pick {name}"
+    pose, taught = next(iter(arm.level.table.plan.pose.items()))
+    arm.level.do_move(pose)
+    arm.level.give(arm.messages, 50)
+    command = arm.messages.command
+    assert (command.words, command.object, command.speed) == ("move", 0, taught.speed)
+    np.testing.assert_array_equal(command.aim, arm.place)
+    reached = arm.level._ik.tool_at(command.joints)
+    above = arm.place + np.array([0.0, 0.0, taught.height])
+    np.testing.assert_allclose(reached.position, above, atol=1e-4)
+    # In the gripper it is raised from where it was.
+    arm.below.held = 1
+    arm.world.position[0] = arm.place + np.array([0.0, 0.0, 0.05])
+    arm.look()
+    arm.level.do_move(pose)
+    np.testing.assert_array_equal(arm.level._aim, arm.place)
+
+
+def test_a_pose_out_of_reach_sends_nothing(arm: Arm) -> None:
+    arm.world.position[0] = (9.0, 0.0, 0.0)
+    arm.look()
+    arm.level._words = f"pick {arm.level.context.scene.objects[0]}"
+    arm.level.do_move(next(iter(arm.level.table.plan.pose)))
+    assert (arm.level._sent, arm.look()["reach"]) == (0, "no")
