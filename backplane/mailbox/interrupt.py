@@ -86,7 +86,6 @@ class InterruptLine:
     number lost there."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
-        self.spec = spec
         self.service_ns = how_sent(spec).service_ns
         self.lost = 0
         """Messages lost here because too many waited."""

@@ -1,0 +1,185 @@
+"""The course of a campaign, without its trials: which are made, kept, and drawn again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+from rack.boards.config import load
+from rack.tools.console.answer import Failure
+from rack.tools.faults.campaigns import campaign as module
+from rack.tools.faults.campaigns.campaign import Campaign, Order
+from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.faults.campaigns.results import TrialResult
+from rack.tools.faults.campaigns.workers import TrialJob
+from tests.tools.faults.campaigns.test_report import RUN
+from tests.tools.faults.campaigns.test_statistics import judgement
+
+
+class Progress:
+    """Notes what is shown."""
+
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+        self.ended: list[str] = []
+
+    def begin(self, text: str) -> None:
+        """Note it."""
+        self.begun.append(text)
+
+    def end(self, text: str, *others: object, **more: object) -> None:
+        """Note it."""
+        self.ended.append(text)
+
+    def total(self, seconds: float) -> None:
+        """Take it."""
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *given, **more: None
+
+
+def struck(plan: Plan) -> TrialResult:
+    """Return a trial in which every fault of its plan has struck and was found."""
+    faults = tuple(judgement(table["kind"]) for table in plan.faults)
+    return replace(RUN, plan=plan, ticks=4000, faults=faults)
+
+
+class Trials:
+    """Stands for the workers: each trial ends as `ends` says; `made` are their plans."""
+
+    def __init__(self, ends: Callable[[Plan], TrialResult]) -> None:
+        self.ends = ends
+        self.made: list[Plan] = []
+
+    def __call__(self, config: object) -> Self:
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        return
+
+    def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
+        """Keep the result of each."""
+        for job in jobs:
+            assert alone is not job.plan.lockstep
+            self.made.append(job.plan)
+            job.path.parent.mkdir(parents=True, exist_ok=True)
+            job.path.write_text(json.dumps({"finding": asdict(self.ends(job.plan))}))
+            yield job
+
+
+MakeCampaign = Callable[..., tuple[Campaign, Trials]]
+
+
+@pytest.fixture
+def make(
+    small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> MakeCampaign:
+    """Make a campaign in a folder of the test, whose trials all go well unless it says
+    otherwise."""
+    config = load(small, [f"name={rack_name}"])
+
+    def make_one(
+        ends: Callable[[Plan], TrialResult] = struck, **given: Any
+    ) -> tuple[Campaign, Trials]:
+        trials = Trials(ends)
+        monkeypatch.setattr(module, "Workers", trials)
+        order = Order(**{**ORDER, "config": config, "name": "small", **given})
+        return Campaign(order, tmp_path / "out", Progress()), trials  # type: ignore[arg-type]
+
+    return make_one
+
+
+ORDER: dict[str, Any] = {
+    "kinds": "mute,drop",
+    "injections": 3,
+    "kills": 0,
+    "sizes": 0,
+    "seed": 5,
+    "modes": (True,),
+    "seconds": None,
+}
+
+
+def test_each_kind_strikes_as_often_as_ordered(make: MakeCampaign) -> None:
+    campaign, trials = make()
+    results = campaign.run()
+    kinds = [table["kind"] for plan in trials.made for table in plan.faults]
+    assert (kinds.count("mute"), kinds.count("drop"), len(kinds)) == (3, 3, 6)
+    assert [plan.number for plan in trials.made] == list(range(len(trials.made)))
+    assert trials.made[0].purpose == "nominal"
+    assert (results.lacking, results.is_interrupted) == ([], False)
+    assert [run.plan for run in results.trials] == trials.made[1:]
+
+
+def test_what_did_not_strike_is_drawn_again_and_in_the_end_said(make: MakeCampaign) -> None:
+    def never_mute(plan: Plan) -> TrialResult:
+        found = struck(plan)
+        faults = [
+            replace(one, seen="not struck") if one.kind == "mute" else one for one in found.faults
+        ]
+        return replace(found, faults=tuple(faults))
+
+    campaign, trials = make(never_mute)
+    results = campaign.run()
+    kinds = [table["kind"] for plan in trials.made for table in plan.faults]
+    assert (kinds.count("mute"), kinds.count("drop")) == (3 * module.ROUNDS, 3)
+    assert results.lacking == [f"mute: struck 0 of 3 times, in {module.ROUNDS} draws"]
+
+
+def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
+    first, trials = make()
+    before = first.run()
+    second, again = make()
+    after = second.run()
+    assert again.made == []
+    assert after.trials == before.trials
+    # A file of another plan, drawn by another version, is none.
+    path = first.folder / "trials" / "0001.json"
+    found = json.loads(path.read_text())
+    found["finding"]["plan"]["number"] = 99
+    path.write_text(json.dumps(found))
+    third, once_more = make()
+    third.run()
+    assert once_more.made == [trials.made[1]]
+
+
+def test_a_folder_of_another_campaign_is_refused(make: MakeCampaign) -> None:
+    make()[0].run()
+    with pytest.raises(Failure, match="holds another campaign; it differs in seed") as caught:
+        make(seed=6)[0].run()
+    assert caught.value.status == 2
+
+
+@pytest.mark.parametrize(
+    ("end", "why"),
+    [
+        ({"ended": "neither"}, "the task is not done even without faults: "),
+        ({"shortfalls": ("left behind: x",)}, "without faults: left behind: x"),
+    ],
+)
+def test_a_rack_whose_task_fails_without_faults_has_no_campaign(
+    make: MakeCampaign, end: dict[str, Any], why: str
+) -> None:
+    campaign, trials = make(lambda plan: replace(struck(plan), **end))
+    with pytest.raises(Failure, match=why):
+        campaign.run()
+    assert len(trials.made) == 1
+
+
+def test_a_trial_that_falls_short_leaves_a_plan_that_repeats_it(make: MakeCampaign) -> None:
+    def late(plan: Plan) -> TrialResult:
+        return replace(struck(plan), shortfalls=("late",) if plan.number == 1 else ())
+
+    campaign, trials = make(late)
+    campaign.run()
+    (path,) = campaign.folder.glob("trial-*.toml")
+    assert path.name == "trial-0001.toml"
+    assert path.read_text() == trials.made[1].toml("small")
