@@ -1,0 +1,155 @@
+"""The bus as a program of the host side has it: ports, times, turns, and the crate's memory."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from rack.backplane.errors import MailboxError
+from rack.backplane.semaphores import done_semaphore, wake_semaphore
+from rack.backplane.words import Block, System, TaskState
+from rack.boards.host.bus import WORD, HostBus
+from tests.boards.host.test_bus_adapter import (  # noqa: F401  fixtures
+    MakeSite,
+    OpenBus,
+    make_site,
+    open_bus,
+)
+from tests.processes import BOUND_S, in_thread, wait_until
+
+TICK_S = 0.0025
+
+
+def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+    site = make_site()
+    site.host[Block.WAITS_UNTIL] = 9
+    bus = open_bus(site)
+    assert (site.host[Block.STATE], site.host[Block.WAITS_UNTIL]) == (TaskState.RUNNING, 0)
+    with pytest.raises(MailboxError, match="host board 'program' is run by process"):
+        HostBus(site.segment, site.plan.hosts[0])
+    bus.close()
+    HostBus(site.segment, site.plan.hosts[0]).close()
+
+
+def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+    site = make_site()
+    bus = open_bus(site)
+    for value, given in ((1.5, {}), (2.5, {"id": 40}), (3.5, {})):
+        assert bus.send("numbers", value=value, **given)
+    site.cycle()
+    reading = bus.read("sum")
+    assert not reading.is_there
+    ids = []
+    entry = site.adapter._entries[0][1]
+    ring = entry._ring._slots  # type: ignore[attr-defined]
+    for serial in (1, 2, 3):
+        assert ring.fetch(serial)
+        ids.append((ring.message.id, ring.message.value, ring.message.colour))
+    # A field that is not given is zero, whatever the message before it had.
+    assert ids == [(1, 1.5, 0), (40, 2.5, 0), (3, 3.5, 0)]
+    assert bus.sent("numbers") == 3
+
+
+def test_unknown_ports_and_fields_are_named(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+    bus = open_bus(make_site())
+    with pytest.raises(AttributeError, match="no port 'number'; ports: numbers"):
+        bus.send("number", value=1.0)
+    with pytest.raises(AttributeError, match="no port 'numbers'; ports: sum"):
+        bus.read("numbers")
+    with pytest.raises(AttributeError, match="speed"):
+        bus.send("numbers", speed=1.0)
+    assert bus.sent("numbers") == 0
+
+
+def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+    site = make_site()
+    bus = open_bus(site)
+    assert bus.tasks == ["bridge", "adder"]
+    site.segment.block("adder")[Block.CYCLES] = 77
+    address = bus.address("adder")
+    assert bus.words(address + WORD * Block.CYCLES) == [77]
+    assert bus.words(address, 3) == list(site.segment.block("adder")[:3])
+    assert bus.address("adder.status") == site.segment.map.mailboxes["adder.status"]
+    size = site.segment.map.size
+    assert len(bus.words(size - WORD)) == 1
+    for wrong, count in ((size - WORD, 2), (size, 1), (-WORD, 1), (4, 1), (0, 0)):
+        with pytest.raises(ValueError, match="the bus has 0 to"):
+            bus.words(wrong, count)
+    with pytest.raises(LookupError, match="nothing on the bus is called 'x'; known: "):
+        bus.address("x")
+
+
+def test_in_real_time_a_program_waits_for_a_message_or_its_time(
+    make_site: MakeSite,  # noqa: F811
+    open_bus: OpenBus,  # noqa: F811
+) -> None:
+    site = make_site("clock.mode=realtime")
+    bus = open_bus(site)
+    site.segment.words[System.TICK] = 40
+    assert bus.tick == 40
+    assert abs(bus.time_s - time.monotonic()) < 1.0
+    began = time.monotonic()
+    assert not bus.wait(0.02)
+    assert time.monotonic() - began >= 0.02
+    assert not bus.wait(-1.0)
+    semaphore = wake_semaphore(site.segment.rack, "program")
+    with in_thread(semaphore.release):
+        assert bus.wait(BOUND_S)
+    bus.await_turn()
+    bus.finish()
+    assert site.host[Block.STATE] == TaskState.ENDED
+    assert done_semaphore(site.segment.rack, "program").value == 0
+
+
+def test_in_lockstep_time_is_that_of_its_turns(
+    make_site: MakeSite,  # noqa: F811
+    open_bus: OpenBus,  # noqa: F811
+) -> None:
+    site = make_site("host.program.computing_ms=5")
+    site.segment.words[System.LOCKSTEP] = 1
+    site.host[Block.RELEASED] = 8
+    bus = open_bus(site)
+    done = done_semaphore(site.segment.rack, "program")
+    wake = wake_semaphore(site.segment.rack, "program")
+    assert (bus.tick, bus.time_s) == (8, pytest.approx(8 * TICK_S))
+    seen: list[tuple[bool, int]] = []
+
+    def wait(timeout_s: float) -> None:
+        seen.append((bus.wait(timeout_s), bus.tick))
+
+    for timeout_s, until in ((0.05, 28), (0.0, 9), (1e300, 8 + round(1e9 / TICK_S))):
+        site.host[Block.RELEASED] = 8
+        site.host[Block.DONE] = 0
+        with in_thread(lambda timeout_s=timeout_s: wait(timeout_s)):
+            wait_until(lambda: done.value)
+            assert (site.host[Block.DONE], site.host[Block.DEADLINE]) == (8, 10)
+            assert site.host[Block.WAITS_UNTIL] == until
+            assert done.take()
+            # Its next turn, because a message has come.
+            site.host[Block.WAITS_UNTIL] = 0
+            site.host[Block.RELEASED] = 12
+            wake.release()
+    assert seen == [(True, 12)] * 3
+    bus.finish()
+    assert (done.value, site.host[Block.DONE]) == (1, 12)
+
+
+def test_a_program_in_lockstep_runs_only_in_its_turn(
+    make_site: MakeSite,  # noqa: F811
+    open_bus: OpenBus,  # noqa: F811
+) -> None:
+    site = make_site()
+    site.segment.words[System.LOCKSTEP] = 1
+    block = site.host
+    bus = open_bus(site)
+    for word, blocked, free in ((Block.LOST, 5, 0), (Block.DONE, 8, 4)):
+        block[Block.RELEASED] = 8
+        block[Block.DONE] = 4
+        block[word] = blocked
+        passed: list[bool] = []
+        with in_thread(lambda passed=passed: passed.append(bus.await_turn() is None)):
+            assert passed == []
+            block[word] = free
+            wake_semaphore(site.segment.rack, "program").release()
+        assert passed == [True]
