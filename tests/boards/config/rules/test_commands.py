@@ -1,0 +1,173 @@
+"""Mistakes of an operator's commands: each one line, its place, its value and what is valid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.backplane.address_map import OPERATOR_ENTRIES
+from rack.boards.config import RackConfig, load
+from rack.boards.config.cell import built_cell
+from rack.boards.config.commands import asked
+from rack.boards.config.rules.commands import command_mistakes
+
+HOME = [0.0, 0.7, -2.4, 0.0, -1.4, 0.0]
+PLACE = {"position": [0.4, 0.1, 0.3]}
+
+
+@pytest.fixture(scope="module")
+def nasrem() -> RackConfig:
+    return load("nasrem")
+
+
+@pytest.fixture(scope="module")
+def gentle() -> RackConfig:
+    """A rack whose servo level has a control modification."""
+    return load("configs/examples/own-modification/gentle.toml")
+
+
+def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: Any) -> list[str]:
+    """Return what is wrong with a command."""
+    return [str(found) for found in command_mistakes([("", asked(given))], config, broken)]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"level": "task", "what": "hold"},
+        {"level": "task", "what": "resume", "tick": 0},
+        {"level": "task", "what": "goto", "home": True},
+        {"level": "task", "what": "goto", **PLACE, "at": 2.0},
+        {"level": "task", "what": "goto", **PLACE, "quaternion": [0.0, 1.0, 0.0, 0.0]},
+        {"level": "task", "what": "goto", **PLACE, "direction": [0.0, 0.0, -1.0]},
+        {"level": "servo", "what": "setpoint", "joints": HOME},
+    ],
+)
+def test_what_is_permitted_has_no_mistakes(nasrem: RackConfig, given: dict[str, Any]) -> None:
+    assert mistakes(nasrem, **given) == []
+
+
+GOALS = "of 'task' takes one of: joints|pose|direction|home"
+MISTAKES: list[tuple[dict[str, Any], str]] = [
+    (
+        {"level": "nobody", "what": "hold"},
+        'level = "nobody": no level of this name takes commands; levels that do: servo, primitive,'
+        " elemental_move, task",
+    ),
+    (
+        {"level": "primitive", "what": "goto", "home": True},
+        "what = \"goto\": 'primitive' does not take goto; it takes: hold, resume",
+    ),
+    ({"level": "task", "what": "hold", "home": True}, "home: hold takes no goal; remove it"),
+    ({"level": "task", "what": "goto"}, f"goal: missing; goto {GOALS}"),
+    (
+        {"level": "task", "what": "goto", "home": True, **PLACE},
+        f"goal: several given: direction|home; goto {GOALS}",
+    ),
+    (
+        {"level": "servo", "what": "setpoint", **PLACE},
+        "position: not a goal for setpoint of 'servo'; permitted: joints",
+    ),
+    (
+        {"level": "servo", "what": "setpoint", "home": True},
+        "home: not a goal for setpoint of 'servo'; permitted: joints",
+    ),
+    (
+        {"level": "task", "what": "goto", "quaternion": [1.0, 0.0, 0.0, 0.0]},
+        "position: missing; tool position, m",
+    ),
+    (
+        {"level": "task", "what": "goto", "direction": [1.0, 0.0, 0.0]},
+        "position: missing; tool position, m",
+    ),
+    (
+        {
+            "level": "task",
+            "what": "goto",
+            **PLACE,
+            "direction": [0.0, 0.0, 1.0],
+            "quaternion": [1.0, 0.0, 0.0, 0.0],
+        },
+        "direction = [0.0, 0.0, 1.0]: quaternion is also given; permitted: one of quaternion,"
+        " direction",
+    ),
+    (
+        {"level": "task", "what": "goto", **PLACE, "direction": [0.0, 0.0, 0.0]},
+        "direction = [0.0, 0.0, 0.0]: all zero; its length must not be zero",
+    ),
+    (
+        {"level": "task", "what": "goto", **PLACE, "quaternion": [0.0, 0.0, 0.0, 0.0]},
+        "quaternion = [0.0, 0.0, 0.0, 0.0]: all zero; its length must not be zero",
+    ),
+    (
+        {"level": "servo", "what": "setpoint", "joints": HOME[:5]},
+        f"joints = {HOME[:5]}: 5 values; permitted: 6, one per joint: j1, j2, j3, j4, j5, j6",
+    ),
+    (
+        {"level": "servo", "what": "setpoint", "joints": [9.0, *HOME[1:]]},
+        "joints = 9.0: out of range for joint 'j1'; permitted: -2.78753 to 2.78753 rad",
+    ),
+    (
+        {"level": "task", "what": "hold", "tick": 4, "at": 1.0},
+        "at = 1.0: tick is also given; permitted: one of tick, at",
+    ),
+    (
+        {"level": "task", "what": "hold", "name": "x"},
+        'name = "x": hold takes no name; remove it',
+    ),
+    (
+        {"level": "servo", "what": "modify", "name": "x", "on": True},
+        "name = \"x\": modify of 'servo' knows: none",
+    ),
+]
+
+
+@pytest.mark.parametrize(("given", "line"), MISTAKES)
+def test_a_mistake_is_one_line(nasrem: RackConfig, given: dict[str, Any], line: str) -> None:
+    assert mistakes(nasrem, **given) == [line]
+
+
+def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
+    robot = nasrem.robot
+    assert robot is not None
+    ends = built_cell(robot, nasrem.scene, nasrem.clock_ns).limits.position.T.tolist()
+    for joints in ends:
+        assert mistakes(nasrem, level="servo", what="setpoint", joints=joints) == []
+
+
+def test_no_more_commands_than_the_table_holds_can_wait(nasrem: RackConfig) -> None:
+    hold = ("", asked({"level": "task", "what": "hold"}))
+    assert command_mistakes([hold] * OPERATOR_ENTRIES, nasrem) == []
+    (found,) = command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem)
+    many = OPERATOR_ENTRIES + 1
+    assert str(found) == (
+        f"command = {many}: too many pending commands; permitted: {OPERATOR_ENTRIES}"
+    )
+
+
+def test_a_modification_is_put_in_or_taken_out_by_its_name(gentle: RackConfig) -> None:
+    def of(**given: Any) -> list[str]:
+        return mistakes(gentle, level="servo", what="modify", **given)
+
+    assert of(name="gentle", on=True) == of(name="gentle", on=False) == []
+    (unknown,) = of(name="rough", on=True)
+    assert "rough" in unknown
+    assert "gentle" in unknown
+    (unsaid,) = of(name="gentle")
+    assert "on" in unsaid
+    (unnamed,) = of(on=True)
+    assert "name" in unnamed
+
+
+def test_every_mistake_of_a_command_is_said(nasrem: RackConfig) -> None:
+    found = mistakes(
+        nasrem, level="servo", what="setpoint", joints=[9.0, -9.0, *HOME[2:]], tick=4, at=1.0
+    )
+    assert len(found) == 3
+
+
+def test_of_a_broken_board_only_its_own_mistakes_are_said(nasrem: RackConfig) -> None:
+    broken = frozenset({"task"})
+    assert mistakes(nasrem, broken, level="task", what="goto") == []
+    assert len(mistakes(nasrem, broken, level="servo", what="goto")) == 1
