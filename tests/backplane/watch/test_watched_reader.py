@@ -1,0 +1,116 @@
+"""Readers that are opened for a task: which kind for which mailbox, and reading on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.layout import TickGrid
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_queue import WatchedQueue
+from rack.backplane.watch.watched_reader import (
+    GridReader,
+    SporadicReader,
+    WatchedReader,
+    everything,
+    watched,
+)
+from rack.backplane.words import Block
+from tests.backplane.bus import NAME, mailbox, queue, task
+from tests.backplane.conftest import MakeBus
+from tests.link import Link, MakeLink, links
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    with links(rack_name) as make:
+        yield make
+
+
+def test_each_mailbox_has_the_checks_that_suit_its_writer(make_bus: MakeBus) -> None:
+    segment = make_bus(
+        *queue(4),
+        mailbox(name="writer.other"),
+        mailbox(name="reader.operator", writer="clock"),
+        task("writer"),
+        task("reader", slot=3),
+    )
+    alarms = AlarmWriter(segment, "reader")
+    kinds = {
+        name: type(watched(segment, name, alarms, ReadingTask()))
+        for name in (NAME, "writer.other", "reader.operator")
+    }
+    assert kinds == {
+        NAME: WatchedQueue,
+        "writer.other": WatchedReader,
+        "reader.operator": SporadicReader,
+    }
+    assert everything() > 1 << 30
+
+
+class Grid:
+    """A reading task that reads on a grid."""
+
+    def __init__(self, rack: Link, every: int, phase: int) -> None:
+        self._rack = rack
+        ports = rack.reader.ports
+        found = watched(rack.segment, NAME, AlarmWriter(rack.segment, "reader"), ports.task)
+        assert isinstance(found, WatchedReader)
+        self.watched = found
+        self.reader = GridReader(found, TickGrid(every, phase))
+
+    def read(self, tick: int) -> tuple[str, bool, int]:
+        """Return verdict, loss, and what the message holds."""
+        reading = self.reader.read(tick)
+        return reading.verdict.name, reading.is_lost, reading.value.id
+
+
+def test_between_its_ticks_the_last_reading_stands(link: MakeLink) -> None:
+    rack = link()
+    grid = Grid(rack, every=3, phase=1)
+    assert grid.read(0)[:2] == ("NONE", False)
+    seen = []
+    for tick in range(8):
+        rack.writer.cycle(tick)
+        accesses = grid.watched.reader.accesses
+        seen.append((*grid.read(tick), grid.watched.reader.accesses - accesses))
+    # Read at ticks 1, 4 and 7: what was written a tick before.
+    assert seen == [
+        ("NONE", False, 0, 0),
+        ("NEW", False, 0, 1),
+        ("OLD", False, 0, 0),
+        ("OLD", False, 0, 0),
+        ("NEW", False, 3, 1),
+        ("OLD", False, 3, 0),
+        ("OLD", False, 3, 0),
+        ("NEW", False, 6, 1),
+    ]
+
+
+def test_a_loss_shows_between_its_ticks_too(link: MakeLink) -> None:
+    rack = link()
+    grid = Grid(rack, every=4, phase=0)
+    for tick in range(9):
+        rack.writer.cycle(tick)
+        grid.read(tick)
+    block = rack.segment.block("writer")
+    block[Block.LOST] = 10
+    assert [grid.read(tick)[1] for tick in (9, 10, 11, 12)] == [False, True, True, True]
+    block[Block.LOST] = 0
+    # The last reading stands until the next one.
+    assert [grid.read(tick)[1] for tick in (13, 15)] == [True, True]
+    rack.writer.cycle(15)
+    assert grid.read(16)[1] is False
+
+
+def test_a_read_without_a_message_is_lost_only_with_its_writer(link: MakeLink) -> None:
+    rack = link()
+    found = Grid(rack, every=1, phase=0).watched
+    assert found.is_writer_lost(5) is False
+    rack.writer.cycle(0)
+    found.read(1)
+    rack.segment.block("writer")[Block.LOST] = 2
+    assert [found.is_writer_lost(tick) for tick in (1, 2)] == [False, True]
+    assert [found.read(tick).is_lost for tick in (1, 2)] == [False, True]
