@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from rack.backplane.mailbox.slots import message_dtype
@@ -335,3 +336,67 @@ def test_clients_cannot_fill_the_table(bench: Bench) -> None:
     for _ in range(desks.MOST_CLIENTS):
         assert bench.asked("give", packed_request(bench.command(tick=10_000))).code is Code.GRANTED
     assert bench.asked("give", packed_request(bench.command(tick=10_000))).code is Code.FULL
+    # A place is free again once its client has gone on.
+    (first, *_) = OperatorTable(bench.segment).waiting()
+    first.words[RequestWord.STAGE] = RequestStage.FREE
+    bench.cycle()
+    assert bench.asked("give", packed_request(bench.command(tick=10_000))).code is Code.GRANTED
+
+
+def test_a_tick_that_has_come_is_past_and_the_next_is_not(bench: Bench) -> None:
+    now = bench.tick + 8
+    assert bench.asked("give", packed_request(bench.command(tick=now))).code is Code.PAST
+    now = bench.tick + 8
+    assert bench.asked("give", packed_request(bench.command(tick=now + 1))).code is Code.GRANTED
+
+
+def test_a_client_withdraws_its_own_commands_alone(bench: Bench) -> None:
+    ticket = bench.asked("give", packed_request(bench.command(tick=10_000))).content
+    other = Ticket.unpacked(ticket)
+    assert other is not None
+    bench.asked("withdraw", Ticket(other.entry, other.number + 1).packed())
+    assert len(OperatorTable(bench.segment).waiting()) == 1
+    bench.asked("withdraw", b"")
+    assert len(OperatorTable(bench.segment).waiting()) == 1
+    bench.asked("withdraw", ticket)
+    assert OperatorTable(bench.segment).waiting() == []
+
+
+def test_a_desk_counts_on_from_its_predecessor_and_in_lockstep_shows_nothing(
+    bench: Bench,
+) -> None:
+    group = np.zeros((), [("answered", "u4"), ("refused", "u4"), ("dropped", "u4")])
+    bench.asked("read", HEAD)
+    bench.asked("stop", b"", "watcher")
+    bench.desk.fill(group)
+    assert group.tolist() == (1, 1, 0)
+    group["dropped"] = 7
+    successor = Desk(bench.segment, OwnGrid(bench.segment, 8), Permit(RIGHTS, ("o",)), [])  # type: ignore[arg-type]
+    successor.resume(group)
+    blank = np.zeros_like(group)
+    successor.fill(blank)
+    assert blank.tolist() == (1, 1, 7)
+    bench.segment.words[System.LOCKSTEP] = 1
+    stepped = Desk(bench.segment, OwnGrid(bench.segment, 8), Permit(RIGHTS, ("o",)), [])  # type: ignore[arg-type]
+    stepped.resume(group)
+    blank = np.zeros_like(group)
+    stepped.fill(blank)
+    assert blank.tolist() == (0, 0, 0)
+
+
+def test_those_who_watch_see_the_end_and_others_are_not_waited_for(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(desks, "LINGER_S", 0.05)
+    began = time.monotonic()
+    bench.desk.close()
+    assert time.monotonic() - began < 0.05
+    bench.asked("read", HEAD)
+    bench.line.ask("read", HEAD)
+    bench.line.ask("stop")
+    began = time.monotonic()
+    bench.line.answers.clear()
+    bench.desk.close()
+    assert time.monotonic() - began >= 0.05
+    assert [got.answer.code for got in bench.line.answers] == [Code.GRANTED]
+    assert bench.segment.words[System.EMERGENCY_STOP] == 0
