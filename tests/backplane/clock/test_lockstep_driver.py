@@ -20,7 +20,7 @@ from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, forked, in_thread
+from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 HISTORY = 8
@@ -226,3 +226,70 @@ def test_a_task_that_still_works_is_waited_for_and_moves_to_the_front(make_bus: 
     late.block[Block.DONE] = 4
     assert driver._wait_for_all(6)
     assert driver._last_first == [late, before[0], before[2]]
+
+
+def test_a_wait_without_a_report_looks_around(make_bus: MakeBus) -> None:
+    segment = make_bus(task("level"))
+    segment.words[System.LOCKSTEP] = 1
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    (level,) = driver.tasks
+    with forked(signal.pause) as pid:
+        level.block[Block.PID] = pid
+        assert driver._look_around(level)
+        assert not level.is_stopped
+        os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: process.state_of(pid) in process.STOPPED)
+        # Time must not wait for it.
+        assert driver._look_around(level)
+        assert level.is_stopped
+    segment.words[System.STOP_REQUEST] = 1
+    assert not driver._look_around(level)
+    segment.words[System.STOP_REQUEST] = 0
+    assert driver._look_around(level)
+    driver._launcher = driver._launcher[0], driver._launcher[1] + 1
+    assert not driver._look_around(level)
+
+
+@pytest.mark.parametrize(
+    ("ticks", "drained", "flooded", "is_ahead"),
+    [
+        (HISTORY, 0, False, False),
+        (HISTORY + 1, 0, False, True),
+        (5, 3, True, True),
+        (5, 4, True, False),
+        (5, 3, False, False),
+    ],
+)
+def test_how_far_the_clock_may_be_ahead_of_its_recorder(
+    make_bus: MakeBus, ticks: int, drained: int, flooded: bool, is_ahead: bool
+) -> None:
+    segment = make_bus(task("level"))
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    segment.words[System.FOLLOWER_TICK] = 0
+    segment.words[System.FOLLOWER_DRAINED] = drained
+    driver.is_flooded = flooded
+    assert driver._is_ahead(ticks) is is_ahead
+
+
+def test_the_host_holds_the_clock_before_a_tick_and_lets_it_go(make_bus: MakeBus) -> None:
+    segment = make_bus(task("level"))
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    words = segment.words
+    assert driver._wait_for_step(5)
+    words[System.HOLD_AT] = 7
+    assert driver._wait_for_step(5)
+    assert words[System.HELD] == 0
+
+    def let_go() -> None:
+        wait_until(lambda: words[System.HELD])
+        assert words[System.HELD] == 7
+        words[System.HOLD_AT] = 8
+
+    with in_thread(let_go):
+        assert driver._wait_for_step(6)
+    assert words[System.HELD] == 0
+    words[System.STOP_REQUEST] = 1
+    assert driver._wait_for_step(7)
+    words[System.STOP_REQUEST] = 0
+    driver._launcher = driver._launcher[0], driver._launcher[1] + 1
+    assert not driver._wait_for_step(7)
