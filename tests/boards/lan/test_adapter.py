@@ -9,13 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.message import Field, MessageType
+from rack.backplane.message import Field, Message, MessageType, State
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System, is_on
 from rack.boards.classes import find_class
 from rack.boards.config import resolve
 from rack.boards.lan.adapter import LanAdapter
 from rack.boards.lan.clocks import UNKNOWN_NS
+from rack.boards.lan.envelope import Flaw, Sealer
+from rack.boards.lan.messages import status_of
+from rack.levels.level import Ports
+from rack.levels.peer import PEER
 from tests.boards.lan.racks import configs, rack_text
 
 EVERY = 8
@@ -166,3 +170,25 @@ def test_what_keeps_the_exchange_from_its_work_is_said(make: MakeAdapter) -> Non
     # Permitted are 100 ms.
     assert said(unknown + 40) == ""
     assert said(unknown + 41) == "'b/pulse.status' is older than max_age_ms"
+
+
+def test_in_real_time_the_status_counts_what_the_seals_refused(make: MakeAdapter) -> None:
+    adapter, _ = make([])
+    # What is imported needs a link to be counted.
+    adapter._imports.clear()
+
+    class Link:
+        """The link's end that counts."""
+
+        sealer = Sealer(b"secret")
+
+    Link.sealer.resume([3] * len(Flaw))
+    out = Message(status_of(adapter._table.exports, adapter._table.imports).dtype({}))
+    peer = Message(PEER.dtype({}))
+    write = Ports(status=out, peer_b=peer)
+    adapter._report(write, 8)
+    assert out.flaws.tolist() == (0,) * len(Flaw)
+    assert (out.state, out.reason) == (State.HOLDING, "rack 'b' is not there yet")
+    adapter._link = Link()  # type: ignore[assignment]
+    adapter._report(write, 8)
+    assert out.flaws.tolist() == (3,) * len(Flaw)
