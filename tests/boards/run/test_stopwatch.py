@@ -131,7 +131,8 @@ def test_a_cycle_is_late_if_it_is_the_first_follows_skipped_ones_or_begins_late(
     assert not site.watch.is_late
     site.watch.start(ahead + 1, 1)
     assert site.watch.is_late
-    # Its grid point is long past.
+    # Its grid point is past, by a period.
+    site.segment.words[System.EPOCH_NS] -= PERIOD_NS
     site.watch.start(0, 0)
     assert site.watch.is_late
 

@@ -46,8 +46,8 @@ def test_a_process_left_behind_is_noticed_whoever_its_parent_is(
         assert left_behind(rack, before) == [f"process {pid} ({rack}:lower)"]
         # One that was there before is left out only as a descendant, not under the rack's name.
         assert left_behind(rack, children()) == [f"process {pid} ({rack}:lower)"]
-        assert left_behind("other", before) == [f"process {pid} ({rack}:lower)"]
-        assert left_behind("other", children()) == []
+        assert left_behind(f"q{os.getpid()}x", before) == [f"process {pid} ({rack}:lower)"]
+        assert left_behind(f"q{os.getpid()}x", children()) == []
 
 
 @pytest.mark.slow
