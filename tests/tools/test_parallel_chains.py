@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_check_has_one_line_for_boards_with_equal_figures(jointed: Path) -> None:
-    done = rack("check", jointed)
+    done = rack("check", jointed, "--verbose")
     assert done.returncode == 0, done.stdout
     text = done.stdout
     assert f"system response, {TOGETHER}:" in text

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,7 +24,11 @@ from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
 from rack.tools.console.tables import print_wrapped, table, terminal_width
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, repair
+from rack.tools.timing.summary import summary_lines
 from rack.tools.timing.tables import forecast_lines
+
+if TYPE_CHECKING:
+    from rack.levels.robot.abilities import Abilities
 
 From = Annotated[
     Path | None,
@@ -46,7 +51,11 @@ Fix = Annotated[
 ]
 
 Verbose = Annotated[
-    bool, typer.Option("--verbose", help="add what the arm does while it waits for a new torque")
+    bool,
+    typer.Option(
+        "--verbose",
+        help="add slots, mailboxes, every equation, and what an arm does while no torque comes",
+    ),
 ]
 PATIENCE = (
     "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
@@ -65,10 +74,12 @@ def check(
     verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
-    """Validate a config, show its inventory, and predict its timing.
+    """Validate a config, and predict whether its levels meet their cycles.
 
-    It prints slots, cores, rates, and mailboxes with their bus addresses; or every mistake, one per
-    line. On a terminal the tables show as many columns as fit; --json has all.
+    It prints every mistake, one per line; or five lines: does the rack fit, where is it tightest,
+    how soon does it respond, what can its arm do at rest, and what to do. --verbose adds slots,
+    cores, rates, mailboxes with their bus addresses, and every equation. On a terminal the tables
+    show as many columns as fit; --json has all.
 
     The timing rests on budgets: the longest processor time of each part of a level's cycle. They
     are in the config, in [board.<name>.budget], or measured, with --from RUN. [timing] has the
@@ -90,6 +101,7 @@ def check(
     \b
     Examples:
       rack check fig3
+      rack check nasrem --verbose
       rack check fig3 --fix > fits.toml
       rack check nasrem --from runs/nasrem-20250101-120000
     """
@@ -106,18 +118,23 @@ def check(
     lacking = shared_out(found)
     stock = inventory(found, judged.layout, lacking)
     forecast = Forecast.of(judged.timing, not lacking)
+    arm = _abilities(found)
     if as_json:
-        print_json(stock | {"timing": forecast.document() | {"repair": fitting.document()}})
+        timing = forecast.document() | {"repair": fitting.document()}
+        print_json(stock | {"arm": None if arm is None else asdict(arm), "timing": timing})
     else:
         width = terminal_width()
-        patience = [PATIENCE.format(**found) for found in stock["patience"]] if verbose else []
-        lines = [
-            *inventory_lines(stock, width),
-            *patience,
-            *forecast_lines(forecast, width),
-            "",
-            *fitting.lines(),
-        ]
+        joints = () if found.robot is None else found.robot.joints
+        head, *rest = inventory_lines(stock, width)
+        lines = [head, *lacking, *summary_lines(forecast, fitting, arm, joints, width)]
+        if verbose:
+            lines += [
+                *rest[len(lacking) :],
+                *(PATIENCE.format(**one) for one in stock["patience"]),
+                *forecast_lines(forecast, width),
+            ]
+        else:
+            lines.append("--verbose shows every task, mailbox and equation")
         print_wrapped("\n".join(lines))
     sys.exit(0 if forecast.holds else 1)
 
@@ -140,6 +157,17 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
         )
     ran_as = rack_timing(recording.rack_config, recording.layout)
     return with_budgets(config, without_interrupts(ran_as, measured_budgets(recording, percentile)))
+
+
+def _abilities(config: RackConfig) -> Abilities | None:
+    """Return what the arm of a rack can do at rest; None for a hand, or without one."""
+    robot = config.robot
+    if robot is None or robot.hand is not None:
+        return None
+    # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
+    from rack.levels.robot.abilities import abilities
+
+    return abilities(built_cell(robot, config.scene, config.clock_ns))
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:

@@ -31,7 +31,7 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
         yield from _levels(forecast.levels, width)
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
-        yield from _verdicts(paper, width)
+        yield from verdict_table(paper, width)
     if forecast.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
         yield from _responses(forecast.responses, width)
@@ -137,7 +137,7 @@ def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
     yield from table([*head, "d R_i"], rows, width, ("C", "R", "W", "U", "P", "d"))
 
 
-def _verdicts(verdicts: Iterable[EquationVerdict], width: int | None) -> Iterator[str]:
+def verdict_table(verdicts: Iterable[EquationVerdict], width: int | None) -> Iterator[str]:
     """Yield a line per verdict: both sides, the margin, whether it holds."""
     head = ["eq.", "of", "left", "", "right", "margin", "", "meaning"]
     yield from table(

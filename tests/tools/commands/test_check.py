@@ -45,7 +45,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def check(*words: object) -> subprocess.CompletedProcess[str]:
-    return rack("check", *words)
+    return rack("check", *words, *(() if "--json" in words else ("--verbose",)))
 
 
 def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
@@ -76,7 +76,8 @@ def test_the_figures_of_overload_fail_their_check(name: str) -> None:
 def test_a_rack_that_fails_shows_where_and_which_changes_help(small: Path) -> None:
     done = check(small, *FAILS, *ALONE)
     assert done.returncode == 1
-    assert {line.split()[0] for line in failures(done)} == {"3.8", "1", "load:"}
+    # First what fails, then the tables with the rest.
+    assert {line.split()[0] for line in failures(done)} == {"3.8", "1", "load:", "response", "load"}
     assert "  board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in done.stdout
 
 
@@ -243,7 +244,7 @@ def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
     (line,) = (
         line
-        for line in check(*words, "--verbose").stdout.splitlines()
+        for line in check(*words).stdout.splitlines()
         if line.startswith("patience: ")
     )
     assert line.startswith(
@@ -253,7 +254,7 @@ def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
         "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque put in"
         " 10.372 J" in line
     )
-    assert "patience" not in check(*words).stdout
+    assert "patience" not in rack("check", *words).stdout
     (found,) = json.loads(check(*words, "--json").stdout)["patience"]
     assert (found["board"], found["ms"], found["cycles"], found["energy_j"]) == (
         "servo",

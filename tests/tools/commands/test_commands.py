@@ -256,7 +256,7 @@ def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
     assert len(set(addresses.values())) == 4
     assert max(addresses.values()) < shown["segment_bytes"]
     assert shown["timing"]["plan_ms"] == {"lower": 10.0}
-    text = rack("check", small).stdout
+    text = rack("check", small, "--verbose").stdout
     assert all(f"0x{address:06x}" in text for address in addresses.values())
 
 

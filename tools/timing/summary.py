@@ -1,0 +1,73 @@
+"""What a check says first: does the rack fit, where is it tightest, how soon does it respond, what
+can its arm do, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.verdicts import EQUATIONS, EquationVerdict
+from rack.tools.console.tables import ms
+from rack.tools.timing.repair import Repair
+from rack.tools.timing.tables import verdict_table
+
+if TYPE_CHECKING:
+    # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
+    from rack.levels.robot.abilities import Abilities
+
+
+def summary_lines(
+    forecast: Forecast,
+    fitting: Repair,
+    arm: Abilities | None,
+    joints: Sequence[str],
+    width: int | None,
+) -> Iterator[str]:
+    """Yield it as text for people, with every verdict that fails; `arm` is None where there is
+    none."""
+    failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
+    count = len(forecast.verdicts)
+    if failing:
+        yield f"does not fit: {len(failing)} of {count} equations and bounds fail"
+    elif count:
+        yield f"fits: all {count} equations and bounds hold"
+    else:
+        yield "fits, as far as is known: no board has a budget; --from RUN takes those measured"
+    if tightest := _tightest(forecast.verdicts):
+        yield f"tightest: {_margin(tightest)}"
+    system = forecast.system
+    if system.levels:
+        down, up = system.command_ms, system.status_ms
+        yield f"response: a command down {down:g} ms, a status up {up:g} ms"
+    if arm is not None:
+        yield (
+            f"arm: its tool reaches {arm.reach:.2f} m, holds {arm.payload:.1f} kg at rest; gravity"
+            f" leaves {arm.left:.0%} of the torque of {joints[arm.joint]}"
+        )
+    if failing:
+        yield ""
+        yield from verdict_table(failing, width)
+        yield ""
+        yield from fitting.lines()
+    else:
+        yield "to do: nothing"
+    yield from forecast.notes
+
+
+def _tightest(verdicts: Sequence[EquationVerdict]) -> EquationVerdict | None:
+    """Return the verdict with the least part of its right side left; an equality has no margin."""
+    bounds = [found for found in verdicts if found.sign != "=" and found.right > 0.0]
+    return min(bounds, key=lambda found: found.margin / found.right, default=None)
+
+
+def _margin(verdict: EquationVerdict) -> str:
+    what = verdict.equation
+    if what in EQUATIONS:
+        what = f"eq. {what}".replace("eq. fig.", "fig.")
+    sides = (verdict.left, verdict.right)
+    left, right = (ms(side) if verdict.unit == "ns" else f"{side:.3g}" for side in sides)
+    unit = " ms" if verdict.unit == "ns" else ""
+    part = verdict.margin / verdict.right
+    rest = f"{part:.0%} left" if part >= 0.0 else f"{-part:.0%} too much"
+    return f"{verdict.subject}, {what}: {left} of {right}{unit}, {rest}"
