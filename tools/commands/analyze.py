@@ -16,7 +16,7 @@ from rack.tools.console.tables import print_wrapped, terminal_width
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
-from rack.tools.timing.analysis.tables import text
+from rack.tools.timing.analysis.tables import brief, text
 from rack.tools.timing.operator_response import show
 
 Percentile = Annotated[
@@ -39,6 +39,10 @@ OnlyResponse = Annotated[
         "--response", help="instead: the response to an operator's commands, with its bounds"
     ),
 ]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", help="add the tables, and the cycles that broke an equation"),
+]
 
 
 def analyze(
@@ -46,6 +50,7 @@ def analyze(
     percentile: Percentile = 100.0,
     response: OnlyResponse = False,
     out: Out = None,
+    verbose: Verbose = False,
     as_json: Json = False,
 ) -> None:
     """Compare a run with the timing model: every equation that `rack check` predicts, with its
@@ -55,8 +60,9 @@ def analyze(
     its host counts the stall as processor time: cycles in which one is seen are not judged. Not
     every one is seen; --percentile 99 leaves out whatever happens less than once in 100 cycles.
 
-    It lists the cycles that broke an equation, and the tasks that had their core meanwhile. It
-    writes analysis.json, residuals.png and residuals.svg.
+    It says how the run ended, what held, what was tightest, and what to do. --verbose adds every
+    level, task and equation, and the cycles that broke one, with the tasks that had their core
+    meanwhile. It writes analysis.json, residuals.png and residuals.svg.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
 
@@ -80,8 +86,6 @@ def analyze(
     if as_json:
         print_json(found)
     else:
-        print_wrapped(
-            f"{text(analysis, terminal_width())}\n\n{folder}/analysis.json, residuals.png,"
-            " residuals.svg"
-        )
+        shown = text(analysis, terminal_width()) if verbose else brief(analysis)
+        print_wrapped(f"{shown}\n\n{folder}/analysis.json, residuals.png, residuals.svg")
     sys.exit(0 if analysis.holds else 1)

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
     from rack.levels.robot.abilities import Abilities
 
+RESPONSES = "3.2", "3.3"
+"""Equations of the system's response."""
+
 
 def summary_lines(
     forecast: Forecast,
@@ -34,8 +37,7 @@ def summary_lines(
         yield f"fits: all {count} equations and bounds hold"
     else:
         yield "fits, as far as is known: no board has a budget; --from RUN takes those measured"
-    if tightest := _tightest(forecast.verdicts):
-        yield f"tightest: {_margin(tightest)}"
+    yield from tightest(forecast.verdicts)
     system = forecast.system
     if system.levels:
         down, up = system.command_ms, system.status_ms
@@ -55,10 +57,16 @@ def summary_lines(
     yield from forecast.notes
 
 
-def _tightest(verdicts: Sequence[EquationVerdict]) -> EquationVerdict | None:
-    """Return the verdict with the least part of its right side left; an equality has no margin."""
-    bounds = [found for found in verdicts if found.sign != "=" and found.right > 0.0]
-    return min(bounds, key=lambda found: found.margin / found.right, default=None)
+def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
+    """Yield the verdict with the least part of its right side left; an equality has no margin, and
+    the system's response is exact."""
+    bounds = [
+        found
+        for found in verdicts
+        if found.sign != "=" and found.equation not in RESPONSES and found.right > 0.0
+    ]
+    if bounds:
+        yield f"tightest: {_margin(min(bounds, key=lambda found: found.margin / found.right))}"
 
 
 def _margin(verdict: EquationVerdict) -> str:

@@ -13,7 +13,7 @@ from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
-from rack.tools.timing.analysis.tables import text
+from rack.tools.timing.analysis.tables import brief, text
 from tests.shared_runs import slow_run
 from tests.tools.command_line import rack
 from tests.tools.recordings import MS, Cycle, recorded
@@ -75,7 +75,7 @@ def test_a_rack_that_is_predicted_to_hold_is_seen_to_hold(rack_name: str, tmp_pa
 @pytest.mark.alone
 def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_path: Path) -> None:
     folder = run_of("fig4-overload", rack_name, tmp_path / "run")
-    done = rack("analyze", folder, *USUAL, "--out", tmp_path / "analysis")
+    done = rack("analyze", folder, *USUAL, "--out", tmp_path / "analysis", "--verbose")
     assert done.returncode == 1, done.stderr
     assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == [
         *("analysis.json", "residuals.png", "residuals.svg"),
@@ -96,6 +96,33 @@ def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_pa
     assert "more: --json has them all" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("missed", "said"), [(0, "no cycle missed or skipped"), (3, "3 cycles missed, 2 skipped")]
+)
+def test_what_matters_comes_first_and_the_tables_on_demand(
+    small: Path, tmp_path: Path, missed: int, said: str
+) -> None:
+    config = load(small, ["clock.mode=realtime", *BUDGET])
+    counts = {"missed": missed, "skipped": 2 * (missed > 0)}
+    outcome = {"kind": "outcome", "outcome": {"cause": "task done"}, "tasks": {"lower": counts}}
+    traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(40)] for name in ("lower", "upper")}
+    folder = recorded(tmp_path / "run", config, traces, [outcome]).folder
+    done = rack("analyze", folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = done.stdout.splitlines()
+    assert found[0] == f"small: task done, {said}"
+    assert found[1].startswith("all ")
+    assert found[1].endswith(" equations held")
+    (tightest,) = [line for line in found if line.startswith("tightest: ")]
+    assert tightest.endswith("% left")
+    assert "to do: nothing" in found
+    assert "--verbose shows every level, task and equation" in found
+    more = rack("analyze", folder, "--verbose").stdout.splitlines()
+    assert more[:4] == found[:4]
+    assert any(line.startswith("Equations: ") for line in more)
+    assert not any(line.startswith("Equations: ") for line in found)
+
+
 def test_a_folder_without_a_run_is_refused_in_one_line(tmp_path: Path) -> None:
     done = rack("analyze", tmp_path)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
@@ -114,6 +141,7 @@ def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Pa
     assert not analysis.holds
     found = text(analysis)
     assert "not as predicted: lower 3.1" in found
+    assert f"to do: rack check CONFIG --from {tmp_path / 'run'} lists changes" in found
     assert "lower: 2.8 of 2.5 ms used in the worst cycle, 1.2 usually" in found
     assert "over its budget: X 2.6 of 1 ms" in found
     assert "lower: 1 of 40 (2.5 %)" in found
@@ -129,6 +157,8 @@ def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(
     analysis = Analysis.of(recording)
     assert not analysis.holds
     assert "failed in more than 1 of 100 cycles: none" in text(analysis)
+    assert "to do: nothing about the config: it failed in single cycles" in brief(analysis)
+    assert "to do: nothing\n" in brief(Analysis.of(recording, 99.0))
     assert Analysis.of(recording, 99.0).holds
     # The cycle is listed all the same.
     assert [breach.tick for breach in Analysis.of(recording, 99.0).breaches] == [SETTLED + 7]

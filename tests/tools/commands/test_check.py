@@ -242,11 +242,7 @@ def test_the_static_schedule_is_in_the_json_document() -> None:
 @pytest.mark.slow
 def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
-    (line,) = (
-        line
-        for line in check(*words).stdout.splitlines()
-        if line.startswith("patience: ")
-    )
+    (line,) = (line for line in check(*words).stdout.splitlines() if line.startswith("patience: "))
     assert line.startswith(
         "patience: 'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms). "
     )

@@ -12,6 +12,7 @@ from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.timing.analysis.breaches import Breach, Broken
 from rack.tools.timing.analysis.document import summary, task_document, worst_words
+from rack.tools.timing.summary import tightest
 
 SHOWN = 10
 """Most cycles in the list of those that broke an equation; the document has them all."""
@@ -47,6 +48,11 @@ EQUATIONS_DROPPED = ("meaning", "margin", "predicted", "holds")
 def text(analysis: Analysis, width: int | None = None) -> str:
     """Return everything as text for a screen or two, its tables at most `width` wide."""
     return "\n".join(_lines(analysis, width))
+
+
+def brief(analysis: Analysis) -> str:
+    """Return what matters most: how the run ended, what held, and what to do."""
+    return "\n".join([*_head(analysis), "--verbose shows every level, task and equation"])
 
 
 def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
@@ -85,9 +91,11 @@ def _head(analysis: Analysis) -> Iterator[str]:
     config = analysis.config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.fails]
+    yield f"{config.name}: {_ended(analysis)}"
     yield (
-        f"{config.name}: {len(pairs) - len(failing)} of {len(pairs)} equations held in"
-        f" {analysis.recording.folder}"
+        f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
+        if failing
+        else f"all {len(pairs)} equations held"
     )
     if failing:
         yield f"failed: {_named(failing)}"
@@ -96,6 +104,8 @@ def _head(analysis: Analysis) -> Iterator[str]:
             yield f"failed in more than 1 of 100 cycles: {_named(mostly) if mostly else 'none'}"
     if differing := [pair for pair in pairs if pair.disagrees]:
         yield f"not as predicted: {_named(differing)}"
+    yield from tightest([pair.measured for pair in pairs if pair.measured is not None])
+    yield _advice(analysis, failing)
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
     if analysis.predicted.is_lockstep:
@@ -118,6 +128,33 @@ def _head(analysis: Analysis) -> Iterator[str]:
         if count
     )
     yield from map(str, analysis.recording.gaps())
+
+
+def _ended(analysis: Analysis) -> str:
+    """Return how the run ended, and the cycles that it missed."""
+    ended = analysis.recording.ended
+    cause = ended.get("outcome", {}).get("cause", "no end recorded")
+    counts = ended.get("tasks", {}).values()
+    missed = sum(count["missed"] for count in counts)
+    skipped = sum(count["skipped"] for count in counts)
+    if not missed + skipped:
+        return f"{cause}, no cycle missed or skipped"
+    return f"{cause}, {missed} cycles missed, {skipped} skipped"
+
+
+def _advice(analysis: Analysis, failing: list[Pair]) -> str:
+    """Return what to do about equations that failed."""
+    if not failing:
+        return "to do: nothing"
+    if any(pair.fails for pair in analysis.mostly):
+        return (
+            f"to do: rack check CONFIG --from {analysis.recording.folder} lists changes that make"
+            " it fit"
+        )
+    return (
+        "to do: nothing about the config: it failed in single cycles; --percentile 99 leaves them"
+        " out, --verbose says what had their core"
+    )
 
 
 def _named(pairs: list[Pair]) -> str:
