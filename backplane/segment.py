@@ -37,6 +37,10 @@ VERSION = 14
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
+PROCESSOR = "x86_64"
+"""Stores become visible to other cores in program order: mailboxes, rings and control blocks need
+that (see `rack.backplane.mailbox.slots`). On arm64 they would need barriers, which nobody has
+argued or tested."""
 
 
 class Launch(NamedTuple):
@@ -75,8 +79,11 @@ class Segment:
     def create(cls, layout: Layout, config: str) -> Self:
         """Make the segment of a rack, mode 0600, all of it allocated.
 
-        Raises `SegmentError` when the name is in use or memory is short.
+        Raises `SegmentError` when the name is in use, memory is short, or the processor is another.
         """
+        if (machine := os.uname().machine) != PROCESSOR:
+            why = f"the backplane's memory order is argued for {PROCESSOR} alone"
+            raise SegmentError(f"rack '{layout.rack}': the processor here is {machine}; {why}")
         texts = [json.dumps(asdict(layout)).encode(), config.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, norm
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import OFF
 
@@ -85,7 +85,7 @@ class Statics:
         data.qpos[self._cell.qpos] = position
         mujoco.mj_kinematics(self._model, data)
         out = data.site_xpos[self._cell.tool] - data.xanchor[self._base]
-        return float(np.linalg.norm(np.cross(out, data.xaxis[self._base])))
+        return norm(np.cross(out, data.xaxis[self._base]))
 
     def held(self, position: Array) -> tuple[Array, float]:
         """Return the part of each joint's torque that gravity leaves, (joints,), and the mass at
@@ -97,7 +97,9 @@ class Statics:
         mujoco.mj_jacSite(self._model, data, self._jacobian, None, cell.tool)
         torque = cell.bounds.torque
         own = (data.qfrc_bias - data.qfrc_passive)[cell.dof]
-        a_kg = -(self._model.opt.gravity @ self._jacobian)[cell.dof]
+        x, y, z = self._model.opt.gravity
+        rows = self._jacobian[:, cell.dof]
+        a_kg = -(x * rows[0] + y * rows[1] + z * rows[2])
         loaded = np.abs(a_kg) > 1e-9
         room = (torque - np.sign(a_kg) * own)[loaded] / np.abs(a_kg[loaded])
         return 1.0 - np.abs(own) / torque, float(room.min(initial=math.inf))

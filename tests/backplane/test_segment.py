@@ -8,6 +8,7 @@ import resource
 import stat
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -158,6 +159,19 @@ def test_a_closed_segment_leaves_no_file_open_and_stays_readable(make_bus: MakeB
     assert found.words[Head.SIZE] == len(made.bytes)
     del found
     assert descriptors() == before
+
+
+def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
+    rack_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
+    before = descriptors()
+    assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (
+        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is argued"
+        " for x86_64 alone"
+    )
+    assert descriptors() == before
+    assert rack_name not in racks()
 
 
 def too_large(rack: str) -> Layout:

@@ -90,9 +90,9 @@ def test_predictions_from_budgets_agree_with_measurements() -> None:
     assert tight is not None
     assert loose is not None
     assert (tight.fits, loose.fits) == (False, True)
-    # On its executor's core the planner needs more than three cycles: every plan is late, but for
-    # one that the executor did not disturb, at the beginning. On its own core hardly one is.
+    # On its executor's core the planner needs more than three cycles: plans are late, but for those
+    # that the executor did not disturb. On its own core hardly one is.
     assert tight.cycles > 5
-    assert tight.missed >= tight.cycles - 1
+    assert tight.missed > tight.cycles / 2
     assert loose.missed < loose.cycles / 2
     assert any("FAILS" in line for line in measured.lines())
