@@ -39,9 +39,9 @@ from tests.processes import runs
 ROOMS = ("backplane", "boards", "levels/timing", "levels/systems/state_table", "tools/faults")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 FEW = 8
-"""Files of tests for one mutant, at most: the mirror, then those nearest to it."""
-BOUND_S, TEST_BOUND_S = 400, 60
-"""Time for the tests of one mutant, and for each of them: beyond, it has timed out."""
+"""Files of tests for one mutant, at most, besides its mirrored folder."""
+BOUND_S, TEST_BOUND_S = 900, 60
+"""Time for the tests of one mutant, and for each of them: a test beyond has timed out."""
 FLIPPED = {"==": "!=", "!=": "==", "<": "<=", "<=": "<", ">": ">=", ">=": ">"}
 FLIPPED |= {
     "is": "is not",
@@ -247,8 +247,8 @@ def _names(file: str) -> set[str]:
 
 @cache
 def mirrors(file: str) -> list[str]:
-    """Return the few files of tests nearest to a source: its mirror, then those named after it,
-    then importers of it.
+    """Return the files of tests nearest to a source: its mirror, those named after it, the rest of
+    the mirrored folder, and a few importers of it.
 
     Then those that import its importers: not all that a module does is seen from within it.
     """
@@ -271,9 +271,12 @@ def mirrors(file: str) -> list[str]:
             test.stem in titles and folder.is_relative_to(test.parent)
         ):
             return 0
-        if names & _imports(test):
-            return 2 - test.stem.startswith(f"test_{title}")
-        return 3 if through & _imports(test) else 4
+        is_importer = bool(names & _imports(test))
+        if is_importer and test.stem.startswith(f"test_{title}"):
+            return 1
+        if test.parent == folder:
+            return 2 if is_importer else 3
+        return 4 if is_importer else 5 if through & _imports(test) else 6
 
     def distance(test: Path) -> int:
         return (
@@ -283,7 +286,8 @@ def mirrors(file: str) -> list[str]:
         )
 
     ranked = sorted((likeness(test), distance(test), str(test.relative_to(ROOT))) for test in TESTS)
-    return [test for _, _, test in ranked[:FEW]]
+    near = sum(rank <= 3 for rank, _, _ in ranked)
+    return [test for _, _, test in ranked[: near + FEW]]
 
 
 @dataclass(frozen=True)
@@ -341,7 +345,10 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
     if status is not None and not failed:
         # No test has failed: nothing was tested.
         raise SystemExit(f"pytest ended with status {status}:\n{text[-2000:]}")
-    return Verdict("timed out" if status is None or "Failed: Timeout" in text else "killed", failed)
+    if status is None:
+        # No test has ended it.
+        return Verdict("undecided")
+    return Verdict("timed out" if "Failed: Timeout" in text else "killed", failed)
 
 
 def _clear(run: subprocess.Popen[bytes], folder: Path) -> None:
@@ -373,7 +380,7 @@ class Bench:
     """Whether a test passes on the unchanged tree."""
 
     def examined(self, mutation: Mutation) -> str:
-        """Return what became of a mutant: killed, survived, timed out."""
+        """Return what became of a mutant: killed, survived, timed out, undecided."""
         tests, left_out = mirrors(mutation.file), set[str]()
         # One path for all copies: code that is compiled is kept by it.
         self._copy([mutation.patch()])

@@ -188,7 +188,8 @@ def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tab
     if len(chain) >= MAX_DEPTH:
         why = f"chain of extends too long; permitted: {MAX_DEPTH} files"
         raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
-    own = anchor(_tables(path), path.parent)
+    # Its own: a file may extend newer ones.
+    own = {"format": 1, **anchor(_tables(path), path.parent)}
     merged: Tables = {}
     for base in _bases(own.pop("extends", []), path):
         merged = _extended(merged, _read(base, (*chain, path), known))

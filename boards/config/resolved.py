@@ -193,7 +193,7 @@ class Resolved:
         """Return notes for the launch to report: cores replaced, priorities refused, idle cores
         held awake, ..."""
         refused = self._refused(segment)
-        found = [*shared_out(self.config), *network_notes(self.config)]
+        found = [*self.config.changed, *shared_out(self.config), *network_notes(self.config)]
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
         found += self._unlocked(segment)
         if self.clock(None).keeps_awake:

@@ -55,6 +55,13 @@ Restarts = Annotated[int, Field(ge=0, le=10_000)]
 Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
+FORMAT = 2
+"""The newest format of configs: that of rack 0.2."""
+CHANGED = (
+    'config format 1, from before rack 0.2: since then clock.idle_cores is "sleep" unless it is'
+    " given, and classes of levels have moved (old names still work); write format = 2 when that"
+    " suits you"
+)
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -470,6 +477,13 @@ class TaskPlace(NamedTuple):
 class RackConfig(Table):
     """A rack: everything that a run depends on."""
 
+    format: int = Field(
+        1,
+        ge=1,
+        le=FORMAT,
+        description="2: as described here; 1, without this key: from before rack 0.2, whose changes"
+        " a launch tells",
+    )
     name: RackName = Field(
         description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40"
     )
@@ -510,6 +524,11 @@ class RackConfig(Table):
         if self.adapter.lan is not None and LAN not in self.board:
             self.board[LAN] = self.adapter.lan.board()
         return self
+
+    @property
+    def changed(self) -> list[str]:
+        """What has changed since the format of this config: a line, if it is not the newest."""
+        return [CHANGED] if self.format < FORMAT else []
 
     @property
     def clock_ns(self) -> int:

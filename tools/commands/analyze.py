@@ -11,6 +11,7 @@ import typer
 
 from rack.tools.console.answer import print_json
 from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_wrapped, terminal_width
 from rack.tools.recording.recording import Recording
@@ -62,7 +63,7 @@ def analyze(
 
     It says how the run ended, what held, what was tightest, and what to do. --verbose adds every
     level, task and equation, and the cycles that broke one, with the tasks that had their core
-    meanwhile. It writes analysis.json, residuals.png and residuals.svg.
+    meanwhile. It writes analysis.json and, with matplotlib, residuals.png and residuals.svg.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
 
@@ -71,8 +72,6 @@ def analyze(
       rack analyze runs/nasrem-20250101-120000
       rack analyze runs/nasrem-20250101-120000 --percentile 99.9
     """
-    from rack.tools.timing.analysis.residuals import plot  # matplotlib takes a second to import
-
     folder = run if out is None else out
     if response:
         sys.exit(0 if show(Recording(run), folder, as_json) else 1)
@@ -82,10 +81,16 @@ def analyze(
     progress(0.9)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "analysis.json").write_text(json.dumps(found, indent=2) + "\n")
-    plot(analysis, folder / "residuals")
+    files = f"{folder}/analysis.json, residuals.png, residuals.svg"
+    if can_draw():
+        from rack.tools.timing.analysis.residuals import plot
+
+        plot(analysis, folder / "residuals")
+    else:
+        files = f"{folder}/analysis.json; {NO_PICTURES}"
     if as_json:
         print_json(found)
     else:
         shown = text(analysis, terminal_width()) if verbose else brief(analysis)
-        print_wrapped(f"{shown}\n\n{folder}/analysis.json, residuals.png, residuals.svg")
+        print_wrapped(f"{shown}\n\n{files}")
     sys.exit(0 if analysis.holds else 1)

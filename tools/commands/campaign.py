@@ -13,6 +13,7 @@ import typer
 
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Json, Settings
+from rack.tools.console.pictures import can_draw
 
 if TYPE_CHECKING:
     from rack.tools.faults.campaigns.campaign import Campaign
@@ -165,8 +166,8 @@ def campaign(
 
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
-    """Write campaign.json, campaign.md and, unless interrupted, campaign.png; return the first
-    two."""
+    """Write campaign.json, campaign.md and, unless interrupted or without matplotlib, campaign.png;
+    return the first two."""
     from rack.tools.faults.campaigns.report import document, markdown
 
     work.folder.mkdir(parents=True, exist_ok=True)
@@ -175,7 +176,7 @@ def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, o
     (work.folder / "campaign.json").write_text(json.dumps(report, indent=2) + "\n")
     (work.folder / "campaign.md").write_text(text)
     # An interrupted campaign has no time for it.
-    if not results.is_interrupted:
+    if not results.is_interrupted and can_draw():
         from rack.tools.faults.campaigns.plot import plot
 
         plot(report, work.folder / "campaign.png")

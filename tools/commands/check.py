@@ -121,12 +121,18 @@ def check(
     arm = _abilities(found)
     if as_json:
         timing = forecast.document() | {"repair": fitting.document()}
-        print_json(stock | {"arm": None if arm is None else asdict(arm), "timing": timing})
+        arm_document = None if arm is None else asdict(arm)
+        print_json(stock | {"changed": found.changed, "arm": arm_document, "timing": timing})
     else:
         width = terminal_width()
         joints = () if found.robot is None else found.robot.joints
         head, *rest = inventory_lines(stock, width)
-        lines = [head, *lacking, *summary_lines(forecast, fitting, arm, joints, width)]
+        lines = [
+            head,
+            *found.changed,
+            *lacking,
+            *summary_lines(forecast, fitting, arm, joints, width),
+        ]
         if verbose:
             lines += [
                 *rest[len(lacking) :],

@@ -10,6 +10,7 @@ import typer
 
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, Settings
+from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
 from rack.tools.timing.charts import figure5
 from rack.tools.timing.charts.gantt import Subject, gantt_of, subject_of
@@ -97,7 +98,8 @@ def gantt(
     chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
     if chart.spans > MANY_SPANS and not as_json:
         print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)
-    _answer(chart.text(), chart.document(), chart.save(_made(found.folder)), as_json)
+    pictures = chart.save(_made(found.folder)) if can_draw() else []
+    _answer(chart.text(), chart.document(), pictures, as_json)
 
 
 def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
@@ -105,8 +107,9 @@ def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
         raise Failure(
             f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2
         )
-    paths = figure5.save(found.config, _made(found.folder) / "figure5")
-    _answer("\n".join(figure5.lines(found.config)), figure5.document(found.config), paths, as_json)
+    pictures = figure5.save(found.config, _made(found.folder) / "figure5") if can_draw() else []
+    text = "\n".join(figure5.lines(found.config))
+    _answer(text, figure5.document(found.config), pictures, as_json)
 
 
 def _made(folder: Path) -> Path:
@@ -120,6 +123,5 @@ def _made(folder: Path) -> Path:
 
 def _answer(text: str, document: dict[str, Any], pictures: list[Path], as_json: bool) -> None:
     paths = [str(path) for path in pictures]
-    print_answer(
-        {**document, "pictures": paths}, f"{text}\n\npictures: {', '.join(paths)}", as_json
-    )
+    files = f"pictures: {', '.join(paths)}" if paths else NO_PICTURES
+    print_answer({**document, "pictures": paths}, f"{text}\n\n{files}", as_json)

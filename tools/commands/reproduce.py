@@ -12,6 +12,7 @@ import typer
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json
+from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.live.folder import RUNS
 
 PAGE = RUNS / "paper"
@@ -80,6 +81,8 @@ def reproduce(
     wanted = reproduction.chapters_named(only)
     if out.exists() and not out.is_dir():
         raise Failure(f"--out {out}: exists, and is not a folder", 2)
+    if not can_draw():
+        raise Failure(NO_PICTURES, 2)
     if again:
         reproduction.forget(wanted, out)
     with (

@@ -1,10 +1,11 @@
-"""Pictures by matplotlib, as PNG and SVG. It takes a second to import: only what draws may import
-it."""
+"""Pictures by matplotlib, as PNG and SVG. It is an extra, and takes a second to import: only what
+draws may import it, after `can_draw`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,12 @@ if TYPE_CHECKING:
 
 KINDS = ("png", "svg")
 DPI = 150
+NO_PICTURES = "no pictures: they need matplotlib: pip install 'nasrem-rack[charts]'"
+
+
+def can_draw() -> bool:
+    """Say whether matplotlib is there; `NO_PICTURES` says what to do otherwise."""
+    return find_spec("matplotlib") is not None
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
 from rack.tools.recording.recording import Recording
 
@@ -282,11 +282,14 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     folder.mkdir(parents=True, exist_ok=True)
     document = response.document()
     (folder / "response.json").write_text(json.dumps(document, indent=2) + "\n")
-    paths = plot(response, folder)
+    files = f"{folder}/response.json"
+    if can_draw():
+        files += "".join(f", {path.name}" for path in plot(response, folder))
+    else:
+        files += f"; {NO_PICTURES}"
     if as_json:
         print_json(document)
     else:
-        files = f"{folder}/response.json, {', '.join(path.name for path in paths)}"
         print_wrapped(f"{response.text(terminal_width())}\n\n{files}")
     return response.held
 

@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from rack.tools.console.answer import print_json
+from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
 from rack.tools.lab.benches.chart import BASELINE, PALE, PALETTE, Diagram, Series, draw
 
@@ -73,9 +74,13 @@ Found = TypeVar("Found", bound=BenchResult)
 
 def show(measure: Callable[[Progress], Found], plot: Path | None, as_json: bool) -> Found:
     """Measure, with the progress on the terminal; print what was found and, if asked for, plot it.
-    Return it."""
+
+    Return it. Raises `Failure` at once if it cannot be plotted.
+    """
     from rack.tools.console.progress import progress_for
 
+    if plot is not None and not can_draw():
+        raise Failure(f"--plot {plot}: {NO_PICTURES}", 2)
     with progress_for(as_json) as progress:
         found = measure(progress)
     if as_json:
