@@ -7,7 +7,7 @@ STAMP := $(VENV)/installed
 FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
 .DEFAULT_GOAL := help
-.PHONY: help run test quick mutants golden reference lint lock clean
+.PHONY: help run test quick mutants golden reference lint dist lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
@@ -35,13 +35,18 @@ lint: $(STAMP) ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+dist: $(STAMP) ## build wheel and sdist of the version in pyproject.toml into dist/
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation --outdir dist .
+	rm -rf *.egg-info
+
 lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header \
 		--extra charts --extra dev --extra lab --extra lan pyproject.toml --output-file requirements.lock
 
 clean: ## remove the environment and what tools have left; runs/ stays
-	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 $(STAMP): requirements.lock pyproject.toml

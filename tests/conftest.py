@@ -17,6 +17,7 @@ from tests import warm
 from tests.machine import turn
 
 SMALL = f"""
+format = 2
 name = "small"
 python_path = ["{Path(__file__).parent}"]
 

@@ -21,6 +21,7 @@ from tests.tools.command_line import rack
 
 SECONDS, KILLED_S = 0.5, 0.2
 RACK = f"""
+format = 2
 name = "test-hand-{os.getpid()}"
 extends = ["{ROBOTS / "utah_mit.toml"}"]
 

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 from pathlib import Path
 from zipfile import ZipFile
@@ -41,6 +42,7 @@ class Counter(Executor):
         write.status.count += THREE
 """
 CONFIG = """
+format = 2
 name = "NAME"
 python_path = ["."]
 
@@ -85,16 +87,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(ROOT / name, folder / "source" / name)
     pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
     offline = ("--no-deps", "--no-index")
-    run(
-        folder,
-        *pip,
-        "wheel",
-        *offline,
-        "--no-build-isolation",
-        "--wheel-dir",
-        folder,
-        folder / "source",
-    )
+    # As `make dist` does: a source archive, and the wheel from it.
+    build = (sys.executable, "-m", "build", "--no-isolation", "--outdir", folder)
+    run(folder, *build, folder / "source")
     venv.create(folder / "clean")
     programs = folder / "clean" / "bin"
     purelib = run(
@@ -144,6 +139,17 @@ def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_p
     (tmp_path / "own.toml").write_text(CONFIG.replace("NAME", f"own-{os.getpid()}"))
     words = ("run", "own.toml", "--lockstep", "--seconds", "0.5", "--json")
     assert json.loads(run(tmp_path, installed / "rack", *words))["worked"]
+
+
+@pytest.mark.slow
+def test_wheel_and_source_archive_are_of_one_version(installed: Path, tmp_path: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version = project["version"]
+    names = sorted(path.name for path in installed.parents[1].glob("nasrem_rack-*"))
+    assert names == [f"nasrem_rack-{version}-py3-none-any.whl", f"nasrem_rack-{version}.tar.gz"]
+    assert run(tmp_path, installed / "rack", "--version") == f"rack {version}\n"
+    assert f"## {version} (" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ def arm_rack(servos: Mapping[str, Mapping[str, Any]]) -> str:
     boards = [_board(name, 4 + at, params) for at, (name, params) in enumerate(servos.items())]
     return f"""
 extends = ["{ROBOTS / "puma560.toml"}"]
+format = 2
 name = "arm"
 python_path = ["{Path(__file__).parent}"]
 

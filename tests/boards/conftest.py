@@ -13,6 +13,7 @@ from rack.boards.config.schema import RackConfig
 from tests.processes import named, wait_until
 
 CLOCK = f"""
+format = 2
 name = "waves"
 python_path = ["{Path(__file__).parent}"]
 

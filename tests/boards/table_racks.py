@@ -9,6 +9,7 @@ from tests.boards.conftest import CLOCK
 
 RESET = """
 [[row]]
+format = 2
 name = "reset"
 state = ["up", "down"]
 when = { new = "yes", command = "reset" }
@@ -17,6 +18,7 @@ do = ["take", "set"]
 status = "done"
 
 [[row]]
+format = 2
 name = "no such command"
 state = ["up", "down"]
 when = { new = "yes", command = ["none", "unknown"] }
@@ -28,6 +30,7 @@ SAW = f"""
 start = "up"
 {RESET}
 [[row]]
+format = 2
 name = "count up"
 state = "up"
 when = {{ new = "no", count = ["low", "between"] }}
@@ -36,6 +39,7 @@ do = ["count up"]
 status = "executing"
 
 [[row]]
+format = 2
 name = "turn"
 state = "up"
 when = {{ new = "no", count = "high" }}
@@ -44,6 +48,7 @@ do = ["count down"]
 status = "executing"
 
 [[row]]
+format = 2
 name = "count down"
 state = "down"
 when = {{ new = "no", count = ["high", "between"] }}
@@ -52,6 +57,7 @@ do = ["count down"]
 status = "executing"
 
 [[row]]
+format = 2
 name = "turn up"
 state = "down"
 when = {{ new = "no", count = "low" }}
@@ -63,6 +69,7 @@ SLOW = f"""
 start = "settling"
 {RESET.replace('["up", "down"]', '["settling", "resting"]').replace('next = "up"', 'next = "same"')}
 [[row]]
+format = 2
 name = "settle"
 state = "settling"
 else = true
@@ -71,6 +78,7 @@ do = []
 status = "idle"
 
 [[row]]
+format = 2
 name = "rest"
 state = "resting"
 else = true

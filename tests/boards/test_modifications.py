@@ -19,6 +19,7 @@ from rack.boards.events import Event
 from tests.boards.commanded_racks import commands
 
 TEXT = f"""
+format = 2
 name = "modified"
 extends = ["robots/puma560.toml"]
 python_path = ["{Path(__file__).parent}"]

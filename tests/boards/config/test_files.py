@@ -85,6 +85,31 @@ def test_a_file_overrides_what_it_extends_key_by_key(small: Path, write: Write) 
     )
 
 
+def test_a_file_says_its_own_format_whatever_it_extends(small: Path, write: Write) -> None:
+    older = load(write("older.toml", 'name = "mine"\nextends = ["small.toml"]\n'))
+    newer = load(write("newer.toml", 'format = 2\nname = "mine"\nextends = ["older.toml"]\n'))
+    assert (load(small).format, older.format, newer.format) == (2, 1, 2)
+    assert loads(older.text()).format == 1
+    assert newer.changed == []
+    (line,) = older.changed
+    assert line.startswith("config format 1, from before rack 0.2: since then ")
+    assert line.endswith("write format = 2 when that suits you")
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize("given", ["0", "3", "2.0", "'2'", "true"])
+def test_no_other_format_is_read(small: Path, given: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load(small, [f"format={given}"])
+    (line,) = lines(error)
+    assert line.startswith("format = ")
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_shipped_racks_are_of_the_newest_format(name: str) -> None:
+    assert load(name).changed == []
+
+
 def test_bases_are_merged_in_order(small: Path, write: Write) -> None:
     write("first.toml", "seed = 1\n[clock]\nspeed = 3\n")
     write("second.toml", 'seed = 2\n[clock]\nmode = "realtime"\n')

@@ -82,9 +82,8 @@ connect = {json.dumps(list(connect))}
 peers = {json.dumps(list(peers))}
 {lan}
 """
-    return (
-        f'name = "{name}"\n{BASE}{ECHO if other else ""}{table}{EXPORT}{imported if other else ""}'
-    )
+    head = f'format = 2\nname = "{name}"\n'
+    return f"{head}{BASE}{ECHO if other else ''}{table}{EXPORT}{imported if other else ''}"
 
 
 def endpoints(count: int) -> list[str]:

@@ -80,6 +80,7 @@ class Sender(NamedTuple):
         # The plain one last: it is sent until all have ended.
         rows = [[cycles, message.hex()] for cycles, (_, message, _) in (*self.rows, self.rows[0])]
         return f"""
+format = 2
 name = "{self.rack}"
 python_path = ["{Path(__file__).parents[3]}"]
 

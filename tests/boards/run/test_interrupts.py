@@ -20,6 +20,7 @@ pytestmark = pytest.mark.slow
 
 TICKS, SECONDS = 100, 0.25
 RACK = f"""
+format = 2
 name = "interrupted"
 python_path = ["{Path(__file__).parents[1]}"]
 protocol.default = "interrupt"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,20 @@ def test_a_rack_that_is_predicted_to_fail_is_seen_to_fail(rack_name: str, tmp_pa
     assert "more: --json has them all" in done.stdout
 
 
+def test_without_matplotlib_there_are_figures_and_no_pictures(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    config = load(small, ["clock.mode=realtime", *BUDGET])
+    traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(40)] for name in ("lower", "upper")}
+    folder = recorded(tmp_path / "run", config, traces, []).folder
+    done = rack("analyze", folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "pip install 'nasrem-rack[charts]'" in done.stdout.splitlines()[-1]
+    assert (folder / "analysis.json").is_file()
+    assert not [*folder.glob("residuals.*")]
+
+
 @pytest.mark.parametrize(
     ("missed", "said"), [(0, "no cycle missed or skipped"), (3, "3 cycles missed, 2 skipped")]
 )
@@ -117,6 +132,7 @@ def test_what_matters_comes_first_and_the_tables_on_demand(
     assert tightest.endswith("% left")
     assert "to do: nothing" in found
     assert "--verbose shows every level, task and equation" in found
+    assert found[-1] == f"{folder}/analysis.json, residuals.png, residuals.svg"
     more = rack("analyze", folder, "--verbose").stdout.splitlines()
     assert more[:4] == found[:4]
     assert any(line.startswith("Equations: ") for line in more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -147,6 +148,22 @@ def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
     assert [line.split() for line in text.splitlines() if line.startswith("frame")] == [
         ["frame", "|1", "|2", "|3"]
     ]
+
+
+def test_without_matplotlib_a_chart_is_printed_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for arguments in (("fig2",), ("fig2", "--figure", "5")):
+        done = rack("gantt", *arguments, "--out", tmp_path / "out")
+        assert done.returncode == 0
+        missing = "no pictures: they need matplotlib: pip install 'nasrem-rack[charts]'"
+        assert done.stdout.splitlines()[-1] == missing
+        assert len(done.stdout.splitlines()) > 5
+    assert not (tmp_path / "out").exists()
+    asked = rack("bench", "mailbox", "--plot", tmp_path / "out")
+    assert (asked.returncode, asked.stdout) == (2, "")
+    assert asked.stderr.splitlines() == [f"--plot {tmp_path / 'out'}: {missing}"]
 
 
 def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:

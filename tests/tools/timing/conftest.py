@@ -11,6 +11,7 @@ from rack.boards.config import load
 from rack.tools.timing.judged_config import JudgedConfig
 
 BUDGETED = f"""
+format = 2
 name = "budgeted"
 python_path = ["{Path(__file__).resolve().parents[2]}"]
 

@@ -10,6 +10,7 @@ from rack.boards.config import load, resolve
 from rack.boards.errors import ConfigError
 
 RACK = """
+format = 2
 name = "cell"
 [clock]
 period_ms = 2.5

@@ -14,6 +14,7 @@ DOOR = """
 start = "shut"
 
 [[row]]
+format = 2
 name = "open it"
 state = "shut"
 when = { command = "open", new = "yes", lock = "free" }
@@ -22,6 +23,7 @@ do = ["take", "drive slowly"]
 status = "executing"
 
 [[row]]
+format = 2
 name = "locked"
 state = "shut"
 when = { command = "open", new = "yes", lock = ["stuck", "locked"] }
@@ -31,6 +33,7 @@ status = "holding"
 reason = "locked"
 
 [[row]]
+format = 2
 name = "stay shut"
 state = "shut"
 else = true
@@ -39,6 +42,7 @@ do = []
 status = "idle"
 
 [[row]]
+format = 2
 name = "moves"
 state = "moving"
 when = { place = "between", late = "no" }
@@ -47,6 +51,7 @@ do = []
 status = "executing"
 
 [[row]]
+format = 2
 name = "arrived"
 state = "moving"
 when = { place = ["open", "shut"] }
@@ -55,6 +60,7 @@ do = ["drive stop"]
 status = "done"
 
 [[row]]
+format = 2
 name = "jams"
 state = "moving"
 when = { place = "between", late = "yes" }
