@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,9 +13,9 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.levels.goals import ObjectEnd, ends
 
 if TYPE_CHECKING:
+    from rack.levels.algebra import Array
     from rack.levels.tables import GoalConfig
 
 OfRun = Literal[
@@ -303,3 +304,28 @@ class Ending:
             self._observer.newest if reading.is_there else 0
         )
         return ticks if ticks > self._silent else 0
+
+
+@dataclass(frozen=True)
+class ObjectEnd:
+    """The goal of an object, and where it ended, m."""
+
+    object: str
+    goal: Sequence[float]
+    ended: Sequence[float]
+    off_mm: float
+    tolerance_mm: float
+
+    def __str__(self) -> str:
+        return (
+            f"object '{self.object}' ended {self.off_mm:.0f} mm from its goal (tolerance"
+            f" {self.tolerance_mm:g} mm)"
+        )
+
+
+def ends(goals: Mapping[int, GoalConfig], position: Array) -> Iterator[ObjectEnd]:
+    """Yield the end of every object that has a goal, by its row in `position`, (bodies, 3), m."""
+    for row, goal in goals.items():
+        ended = position[row].tolist()
+        off_mm = round(1e3 * math.dist(ended, goal.position), 3)
+        yield ObjectEnd(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)

@@ -3,7 +3,7 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,18 +11,20 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
+from rack.levels.algebra import Array
 from rack.levels.arm import poses, substeps
+from rack.levels.arm.above import CommandsAbove
 from rack.levels.errors import LevelError
 from rack.levels.faults import TendonStep
-from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Verdict
+from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Reading, Verdict
 from rack.levels.messages import ARM_STATE, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.cell import build_cell
+from rack.levels.robot.hand import Hand
+from rack.levels.robot.limits import MotorPatience
 from rack.levels.servo.driver import SCENES
-from rack.levels.systems.hand.messages import HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.messages import EXTENSOR, HAND_STATUS, TENSION_COMMAND
 from rack.levels.systems.hand.simulated import HandSample, SimulatedHand
-from rack.levels.systems.hand.slack_monitor import SlackMonitor
-from rack.levels.systems.hand.tensions import Tensions
 from rack.levels.tables import Table
 
 HELD = "held by the operator: valves closed; `resume` opens them"
@@ -210,3 +212,90 @@ class HandExecutor(Executor):
         status.reason = (
             self._waiting or hand.first_violation or hand.first_touch or self._slack.note
         )
+
+
+SLACK_CYCLES = 5
+"""Cycles in a row in which a tendon must be slack: a valve that opens takes up to four to tighten
+one."""
+SLACK_PART = 0.5
+"""Part of the least tension below which a tendon is slack: a sound one never gets there, wherever
+its tension came from."""
+
+
+class SlackMonitor:
+    """Judges the tensions sensed in every cycle."""
+
+    def __init__(self, hand: Hand, joints: Sequence[str]) -> None:
+        self._joints = joints
+        self._least = hand.least
+        self._slack = SLACK_PART * hand.least
+        self._cycles = np.zeros((2, len(joints)), dtype=int)  # for which each tendon has been slack
+        self._any = False  # one was, in the last cycle
+        self.note = ""  # which tendons are slack, readable; empty: none
+
+    def look(self, tension: Array, wanted: Array) -> list[Finding]:
+        """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2,
+        joints), N."""
+        if tension.min() >= self._slack and not self._any:
+            return []
+        slack = (tension < self._slack) & (wanted >= self._least)
+        self._cycles = np.where(slack, self._cycles + 1, 0)
+        self._any = bool(slack.any())
+        torn = np.argwhere(self._cycles >= SLACK_CYCLES).tolist()
+        named = (
+            f"{'extensor' if row == EXTENSOR else 'flexor'} of '{self._joints[joint]}'"
+            for row, joint in torn
+        )
+        self.note = f"slack: {', '.join(named)}" if torn else ""
+        found = np.argwhere(self._cycles == SLACK_CYCLES).tolist()
+        return [Finding(Alarm.TENDON, joint, float(tension[row, joint])) for row, joint in found]
+
+
+MARGIN = 1e-3
+"""Part of its largest tension by which one may miss its limits without count: rounding of whoever
+kept them."""
+
+
+class Tensions(CommandsAbove):
+    """Joins the `TENSION_COMMAND`s of the boards above, each for the joints that it drives."""
+
+    def __init__(self, context: LevelContext, hand: Hand, patience: MotorPatience) -> None:
+        # A tension takes a cycle of its board, and one of the board that gave that the torque.
+        super().__init__(context, patience, 2, "tensions", "valves closed")
+        self._joints = context.robot.joints
+        self._low = hand.least
+        self._high = hand.most
+        self._margin = MARGIN * hand.most
+        self.tension = np.zeros((2, len(hand.most)))  # N
+        self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
+
+    def join(self, tensions: Mapping[str, Reading]) -> None:
+        """Set `tension` and `rests_on`, while nothing is `missing`."""
+        self.rests_on = 0
+        for board in self.oldest:
+            value = tensions[board].value
+            self.rests_on = max(self.rests_on, value.operator)
+            np.copyto(self.tension, value.tension, where=value.driven != 0)
+
+    def check(self) -> tuple[Finding | None, str]:
+        """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused;
+        empty: it is not."""
+        tension = self.tension
+        low = self._low
+        high = self._high
+        within = (tension >= low - self._margin) & (tension <= high + self._margin)  # NaN is not
+        if within.all():
+            np.clip(tension, low, high, out=tension)
+            return None, ""
+        if not np.isfinite(tension).all():
+            row, joint = np.argwhere(~np.isfinite(tension))[0].tolist()
+            return Finding(
+                Alarm.TENSION_INVALID, joint
+            ), f"rejected: tension of {self._named(row, joint)} is NaN"
+        row, joint = np.argwhere(~within)[0].tolist()
+        found = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
+        np.clip(tension, low, high, out=tension)
+        return found, ""
+
+    def _named(self, row: int, joint: int) -> str:
+        return f"'{self._joints[joint]}', {'extensor' if row == EXTENSOR else 'flexor'}"

@@ -3,10 +3,15 @@ every cycle."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Mapping
 from typing import ClassVar
 
+import numpy as np
+
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports
+from rack.levels.algebra import Array
+from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import WORLD_MODEL
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.planning.ik import InverseKinematics
@@ -16,7 +21,6 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
 from rack.levels.systems.trajectory.goal import WorldSight
-from rack.levels.systems.trajectory.guard import TouchGuard
 from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATE, MOTION_STATUS
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import Agenda
@@ -219,3 +223,39 @@ class TrajectoryExecutor(Executor):
         if newest != self._saved:
             self._saved = newest
             agenda.save(state)
+
+
+LASTS_S = 0.04
+"""Parts of the window, at its begin and end, whose medians are compared: what a late cycle or a
+short braking leaves behind decays within half of it. The window is five times as long: over more,
+slow motion changes torques by itself."""
+
+
+class TouchGuard:
+    """A lasting change of a joint's torque, as where the arm meets something, ends a motion.
+
+    It compares torques, N m, at the end of its window with those at its begin; one sample a cycle.
+    They also change when the arm brakes, holds, or goes on after missed cycles: across one of these
+    a change is no touch, and the window begins anew.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._lasting = max(round(LASTS_S / period_s), 3)
+        self._past: deque[Array] = deque(maxlen=5 * self._lasting)
+
+    def begin_anew(self) -> None:
+        """Forget the torques so far."""
+        self._past.clear()
+
+    def is_struck(self, boards: Mapping[str, Reading], most: float) -> bool:
+        """Return whether the torque of a joint has changed by more than `most`, N m."""
+        if all(board.is_new and not board.value.holding for board in boards.values()):
+            self._past.append(sum(board.value.torque for board in boards.values()))
+        else:
+            self.begin_anew()
+        past = np.array(self._past)
+        count = self._lasting
+        if len(past) < 2 * count:
+            return False
+        change = np.median(past[-count:], axis=0) - np.median(past[:count], axis=0)
+        return bool(np.abs(change).max() > most)

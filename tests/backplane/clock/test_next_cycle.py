@@ -181,10 +181,10 @@ def busy() -> None:
 def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
     bus: Segment, monkeypatch: pytest.MonkeyPatch, clock: Callable[[], None], rung: list[Alarm]
 ) -> None:
-    monkeypatch.setattr("rack.backplane.clock.silence.CLOCK_SILENT_S", 0.05)
+    monkeypatch.setattr("rack.backplane.clock.wake.CLOCK_SILENT_S", 0.05)
     looks: list[int] = []
     monkeypatch.setattr(
-        "rack.backplane.clock.silence.state_of", lambda pid: looks.append(pid) or state_of(pid)
+        "rack.backplane.clock.wake.state_of", lambda pid: looks.append(pid) or state_of(pid)
     )
     start_grid(bus)
     cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))

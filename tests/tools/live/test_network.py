@@ -20,7 +20,7 @@ from rack.tools.commands.check import inventory, inventory_lines
 from rack.tools.live.display import RackView
 from rack.tools.live.network import ExportRow, ImportRow, Network, PeerRow, exchanged
 from rack.tools.live.snapshot import RackMonitor
-from rack.tools.timing.analysis.network import network
+from rack.tools.timing.analysis.report import network
 from rack.tools.timing.analysis.report_markdown import _network
 from tests.boards.lan.racks import rack_text
 

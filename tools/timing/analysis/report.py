@@ -15,6 +15,7 @@ from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
 from rack.levels.messages import SCENE, TASK_STATUS
+from rack.levels.peer import Presence, peer_port
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
     communication_ns,
@@ -28,6 +29,7 @@ from rack.levels.timing.trace_times import (
 from rack.tools.faults.judge import faults
 from rack.tools.live.host_side import entries_of
 from rack.tools.live.interrupts import interrupts
+from rack.tools.live.network import BOARD, COUNTS, STATUS, exchanged
 from rack.tools.live.queues import queues
 from rack.tools.recording.history import (
     counted,
@@ -40,7 +42,6 @@ from rack.tools.recording.history import (
 )
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
-from rack.tools.timing.analysis.network import network
 from rack.tools.timing.analysis.report_markdown import markdown
 from rack.tools.timing.measured_response import system_response
 
@@ -379,3 +380,45 @@ def _mailbox_of(recording: Recording, *messages: str) -> str | None:
     is none."""
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return name if name in recording.mailboxes else None
+
+
+def network(recording: Recording) -> Report | None:
+    """Return counts and ages, ms, of what passed, and losses of other racks; None: no adapter, or
+    nothing recorded."""
+    entries = exchanged(recording.config)
+    if entries is None or STATUS not in recording.mailboxes:
+        return None
+
+    def last(field: str) -> int:
+        return int(recording.signal(STATUS, field)[-1])
+
+    imports = []
+    for port, source in entries.imports.items():
+        ages_s = recording.signal(STATUS, f"import_{port}.age_s")
+        counts = {name: last(f"import_{port}.{name}") for name in COUNTS}
+        # In every cycle of the adapter, not of each message: between two it grows.
+        ages = distribution(ages_s[ages_s >= 0.0] * 1e3)
+        imports.append({"entry": f"{BOARD}.{port}", "source": source, **counts, "age_ms": ages})
+    exports = [
+        {"entry": f"{BOARD}.{port}", "source": source, "sent": last(f"export_{port}.sent")}
+        for port, source in entries.exports.items()
+    ]
+    return {
+        "imports": imports,
+        "exports": exports,
+        "peers": [_peer(recording, rack) for rack in entries.peers],
+    }
+
+
+def _peer(recording: Recording, rack: str) -> Report:
+    mailbox = f"{BOARD}.{peer_port(rack)}"
+    presence = recording.signal(mailbox, "presence")
+    cycle_s = recording.layout.task(BOARD).every * recording.layout.clock_ns * 1e-9
+    launches = int(recording.signal(mailbox, "launches")[-1])
+    return {
+        "peer": rack,
+        "state": Presence(int(presence[-1])).name.lower(),
+        "losses": int(recording.signal(mailbox, "losses")[-1]),
+        "restarts": max(0, launches - 1),
+        "lost_s": round(float((presence == Presence.LOST).sum() * cycle_s), 6),
+    }

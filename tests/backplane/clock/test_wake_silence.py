@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from rack.backplane.clock import silence
-from rack.backplane.clock.silence import CLOCK_TICKS, SilentClock
+from rack.backplane.clock import wake
+from rack.backplane.clock.wake import CLOCK_TICKS, SilentClock
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Run, System
@@ -34,9 +34,9 @@ class Silence:
         self.state = "R"
         self.while_asked: Callable[[], object] = lambda: None
         """What happens while the state of the clock's process is looked up."""
-        for module in ("silence", "system_clock"):
+        for module in ("wake", "system_clock"):
             monkeypatch.setattr(f"rack.backplane.clock.{module}.monotonic_ns", lambda: self.now_ns)
-        monkeypatch.setattr(silence, "state_of", self._state_of)
+        monkeypatch.setattr(wake, "state_of", self._state_of)
         self.clock = SilentClock(segment, AlarmWriter(segment, "reader"))
         self._ring = alarm_ring(segment, "reader")
 
