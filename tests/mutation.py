@@ -342,6 +342,8 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
     if status == 4 and "while loading conftest" in text:
         # It cannot be imported.
         return Verdict("killed")
+    if status == 4 and "ERROR: not found" in text:
+        return Verdict("not found")
     if status is not None and not failed:
         # No test has failed: nothing was tested.
         raise SystemExit(f"pytest ended with status {status}:\n{text[-2000:]}")
@@ -392,13 +394,19 @@ class Bench:
             unknown = sorted(broken - self.sound.keys())
             if unknown:
                 self._copy([])
-                self.sound |= {
-                    test: tested(self.folder, [test]).word == "survived" for test in unknown
-                }
+                self.sound |= {test: self._is_sound(test) for test in unknown}
                 self._copy([mutation.patch()])
             if any(self.sound[test] for test in broken):
                 return verdict.word
             left_out |= broken
+
+    def _is_sound(self, test: str) -> bool:
+        """Say whether a test passes on the copy. A mutant may have changed a parameter in its
+        name: then all parameters count."""
+        verdict = tested(self.folder, [test])
+        if verdict.word == "not found":
+            verdict = tested(self.folder, [test.partition("[")[0]])
+        return verdict.word == "survived"
 
     def _copy(self, patches: Sequence[tuple[str, str, str]]) -> None:
         shutil.rmtree(self.folder / "rack", ignore_errors=True)

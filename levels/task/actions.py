@@ -51,7 +51,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
         if isinstance(action, Transfer):
             rehearsal = transfer(rehearsal, k, action, scene)
             continue
-        with _naming(f"action {k}, {action}"):
+        with _naming(k, str(action)):
             if isinstance(action, Goto):
                 rehearsal = goto(rehearsal, k, action)
             elif isinstance(action, Home):
@@ -60,12 +60,12 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 
 @contextmanager
-def _naming(step: str) -> Iterator[None]:
-    """Prefix the reason of a refusal with the refused step."""
+def _naming(k: int, step: str) -> Iterator[None]:
+    """Give a refusal the number of its action, and its reason the refused step."""
     try:
         yield
     except Refused as refused:
-        raise Refused(refused.code, f"{step}: {refused}") from refused
+        raise Refused(refused.code, f"{step}: {refused}", k) from refused
 
 
 def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
@@ -97,24 +97,24 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
     """Return the rehearsal after a transfer. Raises `Refused` that names the step, pick or
     place."""
     handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
-    pick = f"action {k}, pick {action.object}"
-    place = f"action {k}, place {action.object} at {list(action.to)}"
-    with _naming(place):
+    pick = f"pick {action.object}"
+    place = f"place {action.object} at {list(action.to)}"
+    with _naming(k, place):
         situation = rehearsal.situation
         row = handling.row
         standing_goals = [
             standing(rehearsal.motion.cell, situation, row, goal)
             for goal in goals(action, situation.object_pose(row))
         ]
-    with _naming(pick):
+    with _naming(k, pick):
         takes = handling.takes()
-    with _naming(place):
+    with _naming(k, place):
         ways = handling.ways(takes, standing_goals)
 
     def transferred(way: Way) -> Rehearsal:
-        with _naming(pick):
+        with _naming(k, pick):
             taken = handling.moved(rehearsal, k, way.take, Verb.GRASP)
-        with _naming(place):
+        with _naming(k, place):
             return handling.moved(taken, k, way.put, Verb.RELEASE)
 
     return _first(ways[:MAX_WAYS], transferred)

@@ -115,7 +115,11 @@ class TaskExecutor(Executor):
         if failed and not self._detour.move and self._done < plan.count:
             action = int(plan.moves["action"][self._done])
             self._error = Error(below.error)
-            self._reason = f"action {action}: {below.reason}"
+            self._reason = self._about(action, f": {below.reason}")
+
+    def _about(self, action: int, why: str) -> str:
+        """Return a reason with the number of its action; `why` begins with what separates them."""
+        return f"action {action}{why}"
 
     def _step_aside(self, plan: Message, below: Message) -> int:
         """Interrupt the program for an operator; return how many moves of the plan are done."""
@@ -128,9 +132,9 @@ class TaskExecutor(Executor):
         for k in range(done, len(self._actions)):
             by_s = self._actions[k].by
             if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
-                reason = f"action {k}, {self._actions[k]}, was not done by {by_s:g} s"
+                why = f", {self._actions[k]}, was not done by {by_s:g} s"
                 self._error = Error.TOO_LATE
-                self._reason = reason
+                self._reason = self._about(k, why)
 
     def _reason_to_wait(self, below: Reading) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it

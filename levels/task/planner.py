@@ -95,10 +95,14 @@ class TaskPlanner(Planner):
             self._decompose(read, write, tick)
         except Refused as refused:
             write.error = refused.code
-            write.reason = str(refused)
+            write.reason = self._reason(refused)
             write.count = 0
         self._plan = Message(write.record.dtype)
         self._plan.copy_from(write)
+
+    def _reason(self, refused: Refused) -> str:
+        """Return why the program is refused, with the number of the action."""
+        return str(refused) if refused.action is None else f"action {refused.action}, {refused}"
 
     @property
     def _slice(self) -> int:
@@ -160,8 +164,5 @@ class TaskPlanner(Planner):
             earliest_s = finished_s + self._ahead_s
             if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
                 write.earliest = earliest_s
-                text = (
-                    f"action {move.action}, {action}, by {action.by:g} s: the earliest is"
-                    f" {earliest_s:.2f} s"
-                )
-                raise Refused(Error.TOO_LATE, text)
+                text = f"{action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
+                raise Refused(Error.TOO_LATE, text, move.action)

@@ -85,15 +85,13 @@ class Home(Action):
         return "home"
 
 
-AnyAction = Transfer | Goto | Home
+AnyAction = Annotated[Transfer | Goto | Home, Field(discriminator="do")]
 
 
 class TaskConfig(Program):
     """A program: actions in their order."""
 
-    action: tuple[Annotated[AnyAction, Field(discriminator="do")], ...] = Field(
-        (), description="actions, done in their order"
-    )
+    action: tuple[AnyAction, ...] = Field((), description="actions, done in their order")
 
     def goals(self) -> Iterator[GoalConfig]:
         """Yield where transfers take objects."""
@@ -106,7 +104,7 @@ class TaskConfig(Program):
     ) -> Iterator[tuple[str, Any, str]]:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
         for k, action in enumerate(self.action if robot is not None else ()):
-            for key, value, why in _misfits(action, cast(RobotConfig, robot), scene):
+            for key, value, why in misfits(action, cast(RobotConfig, robot), scene):
                 yield f"action[{k}].{key}", value, why
 
 
@@ -138,9 +136,10 @@ class TaskParams(Table):
 read_program = TaskConfig.read
 
 
-def _misfits(
+def misfits(
     action: Action, robot: RobotConfig, scene: SceneConfig
 ) -> Iterator[tuple[str, Any, str]]:
+    """Yield key, value and reason of everything that the arm or the scene lacks for an action."""
     if isinstance(action, Transfer):
         if action.object not in scene.objects:
             yield (

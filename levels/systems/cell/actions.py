@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from rack.backplane.message import Message
 from rack.levels.errors import ProgramError
 from rack.levels.operator import Goal
 from rack.levels.systems.cell.messages import ACTION_FIELDS, OrderAction
-from rack.levels.tables import RobotConfig, SceneConfig
-from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, read_program
+from rack.levels.tables import RobotConfig, SceneConfig, frozen
+from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misfits
+
+_ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
 def write_action(action: AnyAction, message: Message) -> None:
@@ -57,7 +60,13 @@ def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> Any
     """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not
     suit arm or scene."""
     table = _table(message) | ({"by": message.by} if message.by else {})
-    (action,) = read_program({"action": [table]}, robot, scene).action
+    try:
+        action: AnyAction = _ACTION.validate_python(frozen(table))
+    except ValidationError as error:
+        lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
+        raise ProgramError("\n".join(lines)) from error
+    if found := [f"{key} = {value!r}: {why}" for key, value, why in misfits(action, robot, scene)]:
+        raise ProgramError("\n".join(found))
     return action
 
 

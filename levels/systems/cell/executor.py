@@ -3,7 +3,6 @@ time."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,8 +25,6 @@ from rack.levels.task.program import AnyAction
 
 MAX_STRAY_RAD = 0.005
 """A plan holds if no joint has moved farther since it was requested."""
-NUMBERED = re.compile(r"^(task\.)?action( 0|\[0\]|\.0)[:,.]? ?")
-"""The action's number in a reason: an order has only one."""
 
 
 class OrderedTaskExecutor(TaskExecutor):
@@ -145,7 +142,7 @@ class OrderedTaskExecutor(TaskExecutor):
             if plan.id == request.id and not plan.error:
                 taken.promise()
             elif plan.id == request.id:
-                taken.fail(Error(plan.error), bare(plan.reason))
+                taken.fail(Error(plan.error), plan.reason)
             return
         order = read.order.value
         ahead_s = self._ahead(read)
@@ -156,7 +153,7 @@ class OrderedTaskExecutor(TaskExecutor):
         try:
             action = read_action(order, self.context.robot, self.context.scene)
         except ProgramError as error:
-            taken.fail(Error.UNREACHABLE, bare(str(error)))
+            taken.fail(Error.UNREACHABLE, str(error))
             return
         if action.by is not None and action.by - ahead_s <= now_s:
             taken.fail(
@@ -279,13 +276,17 @@ class OrderedTaskExecutor(TaskExecutor):
             self._actions = ()
         self._is_end_reported = taken.response is Response.ENDED
 
+    def _about(self, action: int, why: str) -> str:
+        """Return a reason without the number: an order is one action."""
+        return why.lstrip(",: ")
+
     def _settle(self, plan: Message) -> None:
         """End the order that is done or has failed; what ends the run as well stays an error."""
         taken = self._taken
         if self._error and (taken.is_asked or taken.is_under_way):
             if self._absent and self._error is Error.STALLED:
                 return
-            taken.fail(self._error, bare(self._reason))
+            taken.fail(self._error, self._reason)
             self._halted = self._halted or self._begun > 0
             self._error = Error.NONE
             self._reason = ""
@@ -318,8 +319,3 @@ class OrderedTaskExecutor(TaskExecutor):
             return State.DONE if self._is_end_reported else State.EXECUTING
         waits = self._taken.is_asked or self._taken.is_under_way or self._absent
         return State.EXECUTING if waits else State.IDLE
-
-
-def bare(reason: str) -> str:
-    """Return a reason without the number of the action."""
-    return NUMBERED.sub("", reason)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rack.backplane.message import Message
+from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Ports
 from rack.levels.systems.cell.actions import read_action
 from rack.levels.systems.cell.messages import CELL_REQUEST
@@ -42,6 +43,10 @@ class OrderedTaskPlanner(TaskPlanner):
             self._begin_s = request.begin
             self._ahead_s = request.ahead
         return super().wanted(read, tick)
+
+    def _reason(self, refused: Refused) -> str:
+        """Return why the order is refused; it is one action, without a number."""
+        return str(refused)
 
     def _visible_s(self, tick: int) -> float:
         return max(super()._visible_s(tick), self._begin_s + self.context.period_s)

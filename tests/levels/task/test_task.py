@@ -46,8 +46,8 @@ def rehearsed(start: Rehearsal, *actions: Mapping[str, Any]) -> Rehearsal:
 def refusal(start: Rehearsal, action: Mapping[str, Any]) -> Refused:
     with pytest.raises(Refused) as caught:
         rehearsed(start, action)
-    assert str(caught.value).startswith("action 0, ")
-    assert len(str(caught.value)) <= REASON_BYTES
+    assert caught.value.action == 0
+    assert len(f"action 0, {caught.value}") <= REASON_BYTES
     return caught.value
 
 
@@ -123,12 +123,12 @@ def test_what_cannot_be_done_is_refused_with_what_can(
 def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Rehearsal) -> None:
     on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
     buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
-    assert "action 0, pick block1: '" in str(refusal(buried, TRANSFER))
+    assert "pick block1: '" in str(refusal(buried, TRANSFER))
     taken = replace(
         start,
         situation=start.situation.with_body(BLOCK2, Pose(np.array(TRANSFER["to"]), on_block1[1])),
     )
-    assert "action 0, place block1 at [0.5, -0.2, 0.475]: '" in str(refusal(taken, TRANSFER))
+    assert "place block1 at [0.5, -0.2, 0.475]: '" in str(refusal(taken, TRANSFER))
 
 
 @pytest.mark.slow
