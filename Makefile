@@ -7,7 +7,7 @@ STAMP := $(VENV)/installed
 FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
 .DEFAULT_GOAL := help
-.PHONY: help run test quick mutants golden reference lint dist lock clean
+.PHONY: help run test thorough quick mutants golden reference lint dist lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
@@ -15,11 +15,14 @@ help: ## show this
 run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and the like are passed on
 	$(BIN)/rack run $(CONFIG) $(ARGS)
 
-test: $(STAMP) ## run the tests; ARGS="-k segment" and the like are passed on
+test: $(STAMP) ## run the tests, about five minutes; ARGS="-k segment" and the like are passed on
+	$(BIN)/python -m pytest -m "not thorough" $(ARGS)
+
+thorough: $(STAMP) ## run all tests, as CI does: also whole tasks, all examples, the lab; ARGS as above
 	$(BIN)/python -m pytest $(ARGS)
 
-quick: $(STAMP) ## run the quick tests, under a minute: those not marked slow or alone, of every room; ARGS as above
-	$(BIN)/python -m pytest -m "not slow and not alone" $(ARGS)
+quick: $(STAMP) ## run the quick tests, under a minute: those not marked slow, alone or thorough, of every room; ARGS as above
+	$(BIN)/python -m pytest -m "not slow and not alone and not thorough" $(ARGS)
 
 mutants: $(STAMP) ## check that a campaign notices when a detector is switched off
 	$(BIN)/python -m tests.mutants

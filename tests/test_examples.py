@@ -13,6 +13,8 @@ import pytest
 
 from tests.processes import RACK
 
+pytestmark = pytest.mark.thorough
+
 EXAMPLES = Path(__file__).parent.parent / "configs" / "examples"
 FOLDERS = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)

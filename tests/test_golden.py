@@ -24,7 +24,13 @@ def here() -> dict[str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("run", golden.RUNS)
+@pytest.mark.parametrize(
+    "run",
+    [
+        pytest.param(run, marks=() if run in golden.OFTEN else pytest.mark.thorough)
+        for run in golden.RUNS
+    ],
+)
 def test_a_shipped_rack_has_its_golden_digest(
     run: str, rack_name: str, known: dict[str, dict[str, str]], here: dict[str, str]
 ) -> None:

@@ -16,6 +16,8 @@ from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.report import write_report
 
+pytestmark = pytest.mark.thorough
+
 GUARDED = (7, 16)
 """Numbers of the requests that lower the blocks."""
 TOUCHES = (0.4735, 0.5236)

@@ -16,6 +16,8 @@ from rack.levels.systems.trajectory.messages import RequestEnd
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 
+pytestmark = pytest.mark.thorough
+
 PRESS, EDGE, STEP = 15.0, 0.02, 0.012  # N, m, m
 SCRIPT = """
 import os, signal

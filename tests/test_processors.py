@@ -14,7 +14,7 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.crate.line import TUNABLES
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 SECONDS = 9.0
 """Of `nasrem`: the plans, the way to the first object, the grasp, the way up with it."""

@@ -16,7 +16,7 @@ from rack.boards.config import load
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 SECONDS = 6.0
 STALL = """

@@ -16,6 +16,8 @@ from rack.tools.cli import GROUPS
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
 
+pytestmark = pytest.mark.thorough
+
 OWN_NAME = f"readme-{os.getpid()}"
 TO_ITS_END = "k1607"
 """The rack of which the whole run is made and recorded."""

@@ -17,6 +17,8 @@ from tests.boards.arm_racks import TOGETHER, arm_rack
 from tests.boards.conftest import MakeConfig
 from tests.tools.command_line import rack as rack_command
 
+pytestmark = pytest.mark.thorough
+
 RELEASED = "rack.levels.systems.joint_boards:ArmExecutor"
 
 

@@ -24,7 +24,7 @@ from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import FOLLOWED, LOCKED, PATIENCE_TICKS, TARGETS
 from tests.processes import BOUND_S
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 FIRST = 104
 LENGTHS: dict[str, dict[str, Any]] = {

@@ -28,6 +28,8 @@ from rack.tools.viewer.window import free_port
 from tests.boards.lan.extreme_levels import Case, cases
 from tests.boards.lan.racks import Ended, run_together
 
+pytestmark = pytest.mark.thorough
+
 FOLDER = CONFIGS / "cell"
 ORDER = "rack.levels.systems.cell.messages:CELL_ORDER"
 REPORT = "rack.levels.systems.cell.messages:CELL_REPORT"

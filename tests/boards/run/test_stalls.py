@@ -17,7 +17,7 @@ from tests.backplane.bus import CLOCK_NS, NAME
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
 from tests.processes import FORKS, exit_status, fork
 
-pytestmark = pytest.mark.filterwarnings(FORKS)
+pytestmark = [pytest.mark.thorough, pytest.mark.filterwarnings(FORKS)]
 SECONDS = 2.0
 ROUND = 16
 """Slots that a writer fills in 40 ms, while its reader is stalled."""

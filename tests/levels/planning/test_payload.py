@@ -122,8 +122,6 @@ def test_task_refuses_what_is_too_heavy_as_it_is_to_pick_it() -> None:
         {"action": [{"do": "transfer", "object": "block1", "to": [0.5, -0.2, 0.475]}]}, ROBOT, SCENE
     )
     start = Rehearsal(MotionPlanner(made, SCENE, 1990), made.home, situation_of(made))
-    with pytest.raises(
-        Refused, match=r"^pick block1: payload 'block1' 6 kg needs"
-    ) as refused:
+    with pytest.raises(Refused, match=r"^pick block1: payload 'block1' 6 kg needs") as refused:
         rehearse(program, SCENE, start)
     assert refused.value.code == Error.OVERLOAD

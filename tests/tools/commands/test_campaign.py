@@ -17,6 +17,8 @@ from rack.backplane.segment import SHM_FOLDER
 from tests.processes import RACK, children_of, named, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
+pytestmark = pytest.mark.thorough
+
 COMMAND = [*RACK, "campaign"]
 PROMPT_S = 15.0
 """A tenth of it is usual; a campaign that waited for its trials took 30 s and more."""

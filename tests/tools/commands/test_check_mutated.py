@@ -27,6 +27,8 @@ from rack.boards.config.toml import to_toml
 from rack.tools.cli import run_commands
 from rack.tools.console.answer import MAX_LINE
 
+pytestmark = pytest.mark.thorough
+
 EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
 BOUND_S = 20
 """Processor time of one check, at most: the machine's load does not count."""

@@ -16,6 +16,8 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from tests.processes import BOUND_S, RACK, children_of, named, wait_until
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).resolve().parents[3]
 INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 BEGUN = ("cycle", "close", "report")

@@ -41,6 +41,8 @@ from tests.processes import children_of
 from tests.shared_runs import small_run
 from tests.warm import programs
 
+pytestmark = pytest.mark.thorough
+
 WATCHDOG_S = 30.0
 FIRST_BLOCK = 400
 """Ticks after which there is something on disk."""

@@ -18,6 +18,8 @@ from rack.tools.lab.benches.observed import Runs
 from tests.test_architecture import ROOT
 from tests.tools.command_line import rack
 
+pytestmark = pytest.mark.thorough
+
 SHORT = ChainFigures(2, 800, 150.0, 0.0, 0.0, {2: 400}, {2: 400}, {"this tree": 120.0})
 
 

@@ -22,6 +22,8 @@ from rack.tools.lab.benches.observed import Runs
 from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.mark.slow
 @needs_fifo

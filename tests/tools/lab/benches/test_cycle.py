@@ -20,6 +20,8 @@ from rack.tools.lab.benches.physics import Replay, ReplayPace, replay
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
+pytestmark = pytest.mark.thorough
+
 
 def trace(processor_us: int, cycles: int = 5) -> Trace:
     """Return cycles with 1 us of exchange, 2 of reading, 30 of processing and 4 of writing."""

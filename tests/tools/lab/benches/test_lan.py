@@ -25,6 +25,8 @@ from rack.tools.lab.benches.network import NAMESPACES, Lab
 from tests.machine import needs_lab
 from tests.tools.command_line import rack
 
+pytestmark = pytest.mark.thorough
+
 UDP_BYTES = ORDER_BYTES + STATUS_BYTES + 2 * 42
 """An order and a status with their UDP, IP and Ethernet headers."""
 RATE_HZ, CYCLES = 50.0, 15

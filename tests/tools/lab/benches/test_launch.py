@@ -15,6 +15,8 @@ from rack.tools.lab.benches.checkout import rack_commands
 from rack.tools.lab.benches.kill import DETECTED, SAFE, Killing
 from rack.tools.lab.benches.launch import BOUND_S, ShortRuns, fastest, first_cycle_ns
 
+pytestmark = pytest.mark.thorough
+
 
 def recorded(folder: Path, tasks: list[str], started_ns: list[int]) -> Path:
     """A run's folder, of which another version of the program has recorded the trace."""

@@ -18,6 +18,8 @@ from rack.tools.lab.benches.lockstep import BARE, differences, measure, run_bare
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.mark.slow
 def test_levels_without_a_rack_write_what_they_write_in_one(

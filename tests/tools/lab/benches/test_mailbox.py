@@ -29,6 +29,8 @@ from tests.processes import BOUND_S, RACK
 from tests.tools.command_line import ROOT
 from tests.tools.lab.benches.test_harness import Hidden
 
+pytestmark = pytest.mark.thorough
+
 NET = ("tcp", "tcp6", "udp", "udp6")
 
 

@@ -14,6 +14,8 @@ from rack.tools.lab.benches.partition import PARTITIONS, Partition, measure
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
 
+pytestmark = pytest.mark.thorough
+
 
 def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
     config = load("nasrem")

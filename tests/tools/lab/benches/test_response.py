@@ -27,6 +27,8 @@ from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import response_of
 from tests.shared_runs import nasrem_run
 
+pytestmark = pytest.mark.thorough
+
 
 def test_commands_are_drawn_with_room_for_each_response_and_a_seed_draws_the_same() -> None:
     config = load("nasrem")

@@ -17,7 +17,7 @@ from rack.tools.lab.reproduction.experiments.experiment import KEPT, kept
 from tests.processes import wait_until
 from tests.tools.command_line import BOUND_S, rack
 
-pytestmark = pytest.mark.timeout(200)
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(200)]
 SECTION = "3"
 
 

@@ -20,7 +20,13 @@ from rack.tools.timing.charts.scheduled import Schedule
 from tests.machine import needs_fifo, needs_two_cores
 from tests.tools.figure_runs import SLOWER, run, slowed, undisturbed, usual, whole
 
-pytestmark = [needs_fifo, needs_two_cores, pytest.mark.alone, pytest.mark.timeout(300)]
+pytestmark = [
+    needs_fifo,
+    needs_two_cores,
+    pytest.mark.alone,
+    pytest.mark.thorough,
+    pytest.mark.timeout(300),
+]
 FIGURES = ("fig2", "fig3", "fig4", "fig4-overload")
 MOSTLY = 0.7
 ENOUGH = 5
