@@ -84,13 +84,16 @@ def reproduce(wanted: Sequence[Chapter], workshop: Workshop, progress: Progress)
     return write(workshop, {**results, **reasons})
 
 
-def experiments(chapters: Sequence[Chapter]) -> list[Experiment]:
+def experiments(chapters: Sequence[Chapter]) -> list[Experiment[Any]]:
     """Return the experiments of these chapters, each once."""
     return list({one.name: one for chapter in chapters for one in chapter.experiments}.values())
 
 
 def _make(
-    needed: Sequence[Experiment], workshop: Workshop, progress: Progress, results: dict[str, Kept]
+    needed: Sequence[Experiment[Any]],
+    workshop: Workshop,
+    progress: Progress,
+    results: dict[str, Kept],
 ) -> dict[str, str]:
     """Make experiments, add their results, and return why others could not be made, by name."""
     reasons = {}

@@ -4,8 +4,8 @@ has its reason."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,11 +17,25 @@ from rack.tools.lab.benches.partition import (
     TaskFigures,
 )
 from rack.tools.lab.benches.switch import SwitchCost
-from rack.tools.lab.reproduction.experiments.experiment import KEPT, Workshop
+from rack.tools.lab.reproduction.experiments.deadline import DEADLINE, GotoRun, GotoRuns
+from rack.tools.lab.reproduction.experiments.determinism import (
+    DETERMINISM,
+    ComparedRun,
+    ComparedRuns,
+)
+from rack.tools.lab.reproduction.experiments.experiment import KEPT, Experiment, Found, Workshop
+from rack.tools.lab.reproduction.experiments.measured import (
+    PARTITION,
+    PIPELINE,
+    SWITCH,
+    PipelineRun,
+)
+from rack.tools.lab.reproduction.experiments.tables import TABLES, FiredRow, TableRun, TableRuns
 from rack.tools.lab.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
 from rack.tools.lab.reproduction.sections import application, model, opening, time
 from rack.tools.lab.reproduction.sections.page import Assessment, Ruling
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings
+from rack.tools.recording.history import Difference
 
 SECTIONS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
 NOWHERE = Workshop(Path("nowhere"), share=True)
@@ -48,19 +62,18 @@ def test_a_section_that_the_paper_lacks_is_refused() -> None:
         chapters_named(["6"])
 
 
-def judged(chapter: Chapter, name: str, found: dict[str, Any]) -> Assessment:
-    """Return the judgement of one statement of a chapter."""
+def judged(chapter: Chapter, name: str, experiment: Experiment[Found], found: Found) -> Assessment:
+    """Return the judgement of one statement of a chapter, by a result as it is read from its
+    file."""
     (statement,) = [one for one in chapter.statements if one.name == name]
-    return statement.tested(Findings(found, NOWHERE))
+    kept = json.loads(json.dumps(experiment.document(found)))
+    return statement.tested(Findings({experiment.name: kept}, NOWHERE))
 
 
-def run(
-    mode: str, digest: str, miss: int | None = None, differs: int | None = None
-) -> dict[str, Any]:
+def run(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> ComparedRun:
     """Return what a run leaves of which the digest counts."""
-    difference = None if differs is None else {"tick": differs, "mailbox": "servo.status"}
-    head = {"run": mode, "mode": mode, "digest": digest, "ticks": 10, "wall_s": 1.0, "messages": 5}
-    return {**head, "missed": int(miss is not None), "first_miss": miss, "difference": difference}
+    difference = None if differs is None else Difference(differs, "servo.status")
+    return ComparedRun(mode, mode, digest, 1.0, 5, int(miss is not None), miss, difference)
 
 
 LOCKSTEP = [run("lockstep", "a"), run("lockstep", "a")]
@@ -89,26 +102,27 @@ LOCKSTEP = [run("lockstep", "a"), run("lockstep", "a")]
     ],
 )
 def test_determinism_is_judged_by_digests_and_by_the_first_miss(
-    runs: list[dict[str, Any]], ruling: Ruling
+    runs: list[ComparedRun], ruling: Ruling
 ) -> None:
-    assert judged(opening.ABSTRACT, "determinism", {"determinism": {"runs": runs}}).ruling is ruling
+    found = ComparedRuns(tuple(runs))
+    assert judged(opening.ABSTRACT, "determinism", DETERMINISM, found).ruling is ruling
 
 
 @pytest.mark.parametrize(
     ("lockstep", "realtime", "ruling"),
     [
-        ({"5": 9}, {"5": 9}, Ruling.HOLDS),
-        ({"5": 9}, {"5": 8, "6": 1}, Ruling.BOUNDED),
-        ({"5": 8, "6": 1}, {"5": 9}, Ruling.FAILS),
-        ({"5": 9}, {"4": 1, "5": 8}, Ruling.FAILS),
+        ({5: 9}, {5: 9}, Ruling.HOLDS),
+        ({5: 9}, {5: 8, 6: 1}, Ruling.BOUNDED),
+        ({5: 8, 6: 1}, {5: 9}, Ruling.FAILS),
+        ({5: 9}, {4: 1, 5: 8}, Ruling.FAILS),
     ],
     ids=["exact", "late in real time", "late in lockstep", "too early"],
 )
 def test_five_levels_take_five_cycles(
-    lockstep: dict[str, int], realtime: dict[str, int], ruling: Ruling
+    lockstep: dict[int, int], realtime: dict[int, int], ruling: Ruling
 ) -> None:
-    found = {"pipeline": {"predicted": 5, "cycles": {"lockstep": lockstep, "realtime": realtime}}}
-    assert judged(model.CHAPTER, "pipeline", found).ruling is ruling
+    found = PipelineRun(5, {"lockstep": lockstep, "realtime": realtime})
+    assert judged(model.CHAPTER, "pipeline", PIPELINE, found).ruling is ruling
 
 
 @pytest.mark.parametrize(
@@ -117,36 +131,34 @@ def test_five_levels_take_five_cycles(
     ids=["met", "too late", "not refused"],
 )
 def test_a_time_is_refused_or_met(refused: bool, done_s: float, ruling: Ruling) -> None:
-    end = {"cause": "task done", "reason": "", "moved": True}
-    early = {**end, "by_s": 4.0, "done_s": None if refused else 5.0, "moved": not refused}
-    runs = [{**end, "by_s": None, "done_s": 9.0}, early, {**end, "by_s": 10.0, "done_s": done_s}]
-    assert (
-        judged(
-            time.CHAPTER, "soft-and-real-time", {"goto": {"runs": runs, "place": [0, 0, 0]}}
-        ).ruling
-        is ruling
-    )
+    soft = GotoRun(None, 9.0, None, True, "task done", "")
+    early = replace(soft, by_s=4.0, done_s=None if refused else 5.0, moved=not refused)
+    met = replace(soft, by_s=10.0, done_s=done_s)
+    found = GotoRuns((0.0, 0.0, 0.0), soft, early, met)
+    assert judged(time.CHAPTER, "soft-and-real-time", DEADLINE, found).ruling is ruling
 
 
 def test_state_tables_must_answer_the_disturbance() -> None:
-    def task(*rows: str) -> dict[str, Any]:
-        fired = [{"name": name, "cycles": 1, "first_s": 1.0} for name in rows]
-        return {"rows": {"elemental_move": fired}, "outcome": {"worked": True}}
+    def task(*rows: str, worked: bool = True) -> TableRun:
+        fired = tuple(FiredRow(name, 1, 1.0) for name in rows)
+        return TableRun({"elemental_move": fired}, worked)
 
-    answered = {
-        "nist-state-table": {"disturbed": task("pick", "aim again"), "undisturbed": task("pick")}
-    }
-    ignored = {"nist-state-table": {"disturbed": task("pick"), "undisturbed": task("pick")}}
-    assert judged(application.CHAPTER, "state-tables", answered).ruling is Ruling.HOLDS
-    assert judged(application.CHAPTER, "state-tables", ignored).ruling is Ruling.FAILS
+    calm, answered = task("pick"), task("pick", "aim again")
+    for disturbed, ruling in (
+        (answered, Ruling.HOLDS),
+        (calm, Ruling.FAILS),
+        (replace(answered, worked=False), Ruling.FAILS),
+    ):
+        found = TableRuns(disturbed, calm)
+        assert judged(application.CHAPTER, "state-tables", TABLES, found).ruling is ruling
 
 
 TIMES = {"min": 4.0, "p50": 5.0, "p99": 9.0, "p99_9": 9.0, "max": 12.0}
 
 
 def test_the_context_switch_is_compared_with_the_papers() -> None:
-    found = {"switch": SwitchCost(1, 1000, TIMES, TIMES, TIMES).document()}
-    tested = judged(application.CHAPTER, "context-switch", json.loads(json.dumps(found)))
+    found = SwitchCost(1, 1000, TIMES, TIMES, TIMES)
+    tested = judged(application.CHAPTER, "context-switch", SWITCH, found)
     assert tested.ruling is Ruling.BOUNDED
     assert "takes 5 us, 20.0 times less" in tested.why
 
@@ -168,9 +180,8 @@ def test_partitions_are_judged_by_what_slow_and_fast_levels_miss(
 
     tight = figures("tight, 1 core", {"task": slow, "servo": fast})
     loose = figures("loose, 2 cores", {"task": slow, "servo": 0})
-    found = {"partition": Partitions("nasrem", 4.0, 1, (tight, loose)).document()}
-    plain = json.loads(json.dumps(found))
-    assert judged(application.CHAPTER, "figure-5", plain).ruling is ruling
+    found = Partitions("nasrem", 4.0, 1, (tight, loose))
+    assert judged(application.CHAPTER, "figure-5", PARTITION, found).ruling is ruling
 
 
 def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None:

@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    NASREM,
+    JudgedPair,
+    NasremRun,
+    SystemResponse,
+    WayResponse,
+)
 from rack.tools.lab.reproduction.sections import timing
 from rack.tools.lab.reproduction.sections.equations import PaperEquation, judged
 from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
 from rack.tools.lab.reproduction.sections.statement import Findings
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
-RUN = {"outcome": {"ticks": 800}, "breaches": {}, "steal": {}}
-
+WAY = WayResponse(4.0, {"max": 3.0}, ())
+RUN = NasremRun(
+    *(800, 0, 0, {}, (), {}, {}, {}, {}),
+    SystemResponse(("task", "servo"), 4.0, 4.0, WAY, WAY),
+    *((), {}, {}),
+)
 NOWHERE = Workshop(Path("nowhere"), share=True)
 
 
@@ -39,29 +52,11 @@ def test_each_fails_in_the_rack_that_is_to_show_it(equation: PaperEquation) -> N
         assert any("FAILS" in row for row in shown.rows)
 
 
-def verdict(holds: bool, mostly: bool) -> dict[str, object]:
+def verdict(holds: bool, mostly: bool) -> JudgedPair:
     """Return a pair as a run keeps it: one equation, measured for one level."""
-    sides = {
-        "left": 3e6 if not holds else 1e6,
-        "sign": "<=",
-        "right": 2.5e6,
-        "margin": 1.5e6 if holds else -0.5e6,
-    }
-    measured = {
-        "equation": "3.1",
-        "subject": "servo",
-        **sides,
-        "holds": holds,
-        "meaning": "",
-        "unit": "ns",
-    }
-    return {
-        "equation": "3.1",
-        "subject": "servo",
-        "predicted": None,
-        "measured": measured,
-        "mostly": mostly,
-    }
+    left = 1e6 if holds else 3e6
+    measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, holds, "")
+    return JudgedPair("3.1", "servo", None, measured, mostly)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +67,6 @@ def verdict(holds: bool, mostly: bool) -> dict[str, object]:
 def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(
     holds: bool, mostly: bool, ruling: Ruling
 ) -> None:
-    found = judged(
-        timing.FITS, Findings({"nasrem": {**RUN, "pairs": [verdict(holds, mostly)]}}, NOWHERE)
-    )
+    run = NASREM.document(replace(RUN, pairs=(verdict(holds, mostly),)))
+    found = judged(timing.FITS, Findings({"nasrem": run}, NOWHERE))
     assert found.ruling is ruling

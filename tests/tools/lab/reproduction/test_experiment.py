@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,20 +21,28 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 )
 
 
+@dataclass(frozen=True)
+class Times:
+    """How often an experiment was made, and its pictures."""
+
+    times: int
+    pictures: dict[str, str] = field(default_factory=dict)
+
+
 class Counted:
     """An experiment that counts how often it is made; `inputs` is what it depends on."""
 
     def __init__(self) -> None:
         self.times, self.inputs = 0, {"config": "a"}
 
-    def make(self, workshop: Workshop) -> dict[str, Any]:
+    def make(self, workshop: Workshop) -> Times:
         self.times += 1
         path = workshop.picture("one").with_suffix(".svg")
         path.write_text("<svg/>")
-        return {"times": self.times, "pictures": {"one": workshop.shown([path])}}
+        return Times(self.times, {"one": workshop.shown([path])})
 
-    def experiment(self) -> Experiment:
-        return Experiment("counted", "counting", 1.0, lambda: self.inputs, self.make)
+    def experiment(self) -> Experiment[Times]:
+        return Experiment("counted", "counting", 1.0, Times, lambda: self.inputs, self.make)
 
 
 @pytest.fixture
@@ -73,13 +81,15 @@ def test_a_file_that_is_no_result_is_made_again(rest: str, workshop: Workshop) -
 def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(
     workshop: Workshop,
 ) -> None:
-    def lack(workshop: Workshop) -> dict[str, Any]:
+    def lack(workshop: Workshop) -> Times:
         raise Lacking("no second processor")
 
-    def fail(workshop: Workshop) -> dict[str, Any]:
+    def fail(workshop: Workshop) -> Times:
         raise Failure("the rack did not run")
 
-    lacking, failing = (Experiment(make.__name__, "", 1.0, dict, make) for make in (lack, fail))
+    lacking, failing = (
+        Experiment(make.__name__, "", 1.0, Times, dict, make) for make in (lack, fail)
+    )
     made(lacking, workshop)
     found = kept(lacking, workshop.folder)
     assert found is not None

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.figures import FigureRack, planning, sweep
+from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.figures import FigureRack, FigureRun, planning, sweep
 from rack.tools.lab.reproduction.sections import gantt
 from rack.tools.lab.reproduction.sections.page import Listing, Plate, Ruling
 from rack.tools.lab.reproduction.sections.statement import Findings
+from rack.tools.timing.charts.panel import Count
 
 NOWHERE = Workshop(Path("nowhere"), share=True)
 
@@ -49,19 +50,12 @@ def test_figure_4_has_no_idle_time_with_the_longest_x() -> None:
     assert {"3.1", "3.6"} <= set(newer.failing)
 
 
-def document(late: int, jobs: int = 100) -> dict[str, object]:
+def document(late: int, jobs: int = 100) -> Document:
     """Return what a run of a figure leaves, with so many late plans."""
-    counts = {
-        "level": {"jobs": jobs, "late": 0, "skipped": 0},
-        "level.planner": {"jobs": jobs, "late": late, "skipped": 0},
-    }
-    patterns = {"level": [[["R X W P | R X W P U -", jobs]], []]}
-    return {
-        "tasks": counts,
-        "patterns": patterns,
-        "steal": {},
-        "pictures": {"measured": "pictures/x.svg"},
-    }
+    counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
+    patterns = {"level": ((("R X W P | R X W P U -", jobs),), ())}
+    run = FigureRun(counts, patterns, {}, {"measured": "pictures/x.svg"})
+    return gantt.FIG2.experiment().document(run)
 
 
 @pytest.mark.parametrize(

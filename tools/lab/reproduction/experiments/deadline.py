@@ -3,11 +3,12 @@ that can be met."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import ceil
 
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.recording.recording import Recording
 
 NAME = "nasrem"
@@ -18,23 +19,49 @@ TOO_EARLY = 0.5
 LASTS_S = 12.0
 
 
-def _run(workshop: Workshop) -> Document:
+@dataclass(frozen=True)
+class GotoRun:
+    """A run of GOTO A, GOTO B, s: by when A was demanded, when it was reported done, and the
+    earliest time that a refusal named."""
+
+    by_s: float | None
+    done_s: float | None
+    earliest_s: float | None
+    moved: bool
+    cause: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class GotoRuns:
+    """A, m, in soft time, by a time that is too early, and by one that can be met."""
+
+    place: tuple[float, ...]
+    soft: GotoRun
+    early: GotoRun
+    met: GotoRun
+
+
+def _run(workshop: Workshop) -> GotoRuns:
     place = _place(load(NAME))
     soft = _outcome(workshop, "goto", place, None)
-    early = _outcome(workshop, "goto-too-early", place, round(TOO_EARLY * soft["done_s"], 2))
-    if early["earliest_s"] is None:
+    if soft.done_s is None:
+        raise Failure(f"goto without a time was not done: {soft.cause}")
+    early = _outcome(workshop, "goto-too-early", place, round(TOO_EARLY * soft.done_s, 2))
+    if early.earliest_s is None:
         raise Failure(
-            f"goto by {early['by_s']:g} s was not refused; without a time it is done at"
-            f" {soft['done_s']:g} s"
+            f"goto by {early.by_s:g} s was not refused; without a time it is done at"
+            f" {soft.done_s:g} s"
         )
-    met = _outcome(workshop, "goto-by", place, ceil(early["earliest_s"] * 10) / 10)
-    return {"place": place, "runs": [soft, early, met]}
+    met = _outcome(workshop, "goto-by", place, ceil(early.earliest_s * 10) / 10)
+    return GotoRuns(tuple(place), soft, early, met)
 
 
 DEADLINE = Experiment(
     "goto",
     "goto in soft time, and by a time",
     LASTS_S,
+    GotoRuns,
     lambda: {"config": load(NAME).text(), "above": ABOVE_M, "too_early": TOO_EARLY},
     _run,
 )
@@ -46,22 +73,20 @@ def _place(config: RackConfig) -> list[float]:
     return [x, y, round(z + ABOVE_M, 6)]
 
 
-def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | None) -> Document:
+def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | None) -> GotoRun:
     """Run GOTO A, then GOTO B, the start; return when A was reported done, or the refusal."""
     by = "" if by_s is None else f", by = {by_s!r}"
     program = f'task.action=[{{ do = "goto", position = {place}{by} }}, {{ do = "home" }}]'
     recording = workshop.run(label, workshop.config(NAME, ["clock.mode=lockstep", program]), None)
     outcome = recording.ended["outcome"]
-    return {
-        "run": label,
-        "by_s": by_s,
-        "done_s": _done_s(recording),
-        "earliest_s": _earliest_s(recording),
-        "moved": _has_moved(recording),
-        "cause": outcome["cause"],
-        "reason": outcome["reason"] or str(recording.signal("task.status", "reason")[-1]),
-        "ticks": outcome["ticks"],
-    }
+    return GotoRun(
+        by_s=by_s,
+        done_s=_done_s(recording),
+        earliest_s=_earliest_s(recording),
+        moved=_has_moved(recording),
+        cause=outcome["cause"],
+        reason=outcome["reason"] or str(recording.signal("task.status", "reason")[-1]),
+    )
 
 
 def _done_s(recording: Recording) -> float | None:

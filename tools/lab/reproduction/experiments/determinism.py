@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import dataclass
 
 from rack.boards.config import load
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
-from rack.tools.recording.history import first_difference, misses
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
+from rack.tools.recording.history import Difference, first_difference, misses
 from rack.tools.recording.recording import Recording
 
 NAME = "nasrem"
@@ -17,21 +17,44 @@ ATTEMPTS = 3
 LASTS_S = 2 * 3.0 + 2 * (SECONDS + 3.0)
 
 
-def _run(workshop: Workshop) -> Document:
+@dataclass(frozen=True)
+class ComparedRun:
+    """How a run ended, the tick of its first missed deadline, and where it diverges from the
+    first run."""
+
+    run: str
+    mode: str
+    digest: str
+    wall_s: float
+    messages: int
+    missed: int
+    first_miss: int | None
+    difference: Difference | None
+
+
+@dataclass(frozen=True)
+class ComparedRuns:
+    """Runs in lockstep, then in real time."""
+
+    runs: tuple[ComparedRun, ...]
+
+
+def _run(workshop: Workshop) -> ComparedRuns:
     first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
     runs = [_outcome(first, None), _outcome(second, first)]
     for attempt in range(1, ATTEMPTS + 1):
         found = _outcome(_recorded(workshop, f"{NAME}-realtime-{attempt}", "realtime"), first)
         runs.append(found)
-        if found["first_miss"] is None:
+        if found.first_miss is None:
             break
-    return {"seconds": SECONDS, "runs": runs}
+    return ComparedRuns(tuple(runs))
 
 
 DETERMINISM = Experiment(
     "determinism",
     "nasrem twice in lockstep, then in real time",
     LASTS_S,
+    ComparedRuns,
     lambda: {"config": load(NAME).text(), "seconds": SECONDS, "attempts": ATTEMPTS},
     _run,
 )
@@ -41,21 +64,18 @@ def _recorded(workshop: Workshop, label: str, mode: str) -> Recording:
     return workshop.run(label, workshop.config(NAME, [f"clock.mode={mode}"]), SECONDS)
 
 
-def _outcome(recording: Recording, reference: Recording | None) -> Document:
-    """Return how a run ended, its first missed deadline, and where it diverges from the
-    reference."""
+def _outcome(recording: Recording, reference: Recording | None) -> ComparedRun:
     ended = recording.ended
     config = recording.rack_config
     found = misses(recording)
     difference = None if reference is None else first_difference(recording, reference)
-    return {
-        "run": recording.folder.name,
-        "mode": config.clock.mode,
-        "digest": ended["outcome"]["digest"],
-        "ticks": ended["outcome"]["ticks"],
-        "wall_s": ended["wall_s"],
-        "messages": sum(len(recording.signal(name, "serial")) for name in recording.mailboxes),
-        "missed": len(found),
-        "first_miss": min((miss["tick"] for miss in found), default=None),
-        "difference": None if difference is None else asdict(difference),
-    }
+    return ComparedRun(
+        run=recording.folder.name,
+        mode=config.clock.mode,
+        digest=ended["outcome"]["digest"],
+        wall_s=ended["wall_s"],
+        messages=sum(len(recording.signal(name, "serial")) for name in recording.mailboxes),
+        missed=len(found),
+        first_miss=min((miss["tick"] for miss in found), default=None),
+        difference=difference,
+    )

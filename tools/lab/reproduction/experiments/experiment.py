@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import xxhash
+from pydantic import TypeAdapter
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.segment import racks
@@ -45,6 +46,7 @@ RACK = "reproduce"
 LIBRARIES = ("mujoco", "numpy", "numba", "ompl", "ruckig")
 
 Document = dict[str, Any]
+Found = TypeVar("Found")
 
 
 class Lacking(Failure):
@@ -102,18 +104,27 @@ class Workshop:
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """A measurement: `make` returns what it found as plain data, after about `seconds`.
+class Experiment(Generic[Found]):
+    """A measurement: `make` returns what it found as a record of `kind`, after about `seconds`.
 
     `inputs` returns what it rests on besides program and machine. The names of its pictures, within
-    the folder, are in the result under "pictures". `make` raises `Lacking` and `Failure`.
+    the folder, are the record's `pictures`. `make` raises `Lacking` and `Failure`.
     """
 
     name: str
     about: str
     seconds: float
+    kind: type[Found]
     inputs: Callable[[], Any]
-    make: Callable[[Workshop], Document]
+    make: Callable[[Workshop], Found]
+
+    def record(self, document: Document) -> Found:
+        """Return what was found, from plain data."""
+        return TypeAdapter(self.kind).validate_python(document)
+
+    def document(self, found: Found) -> Document:
+        """Return what was found as plain data."""
+        return dict(TypeAdapter(self.kind).dump_python(found, mode="json"))
 
     def depends(self) -> Document:
         """Return all that the result depends on, as it is now."""
@@ -131,7 +142,7 @@ class Kept:
     lacking: str = ""
 
 
-def kept(experiment: Experiment, folder: Path) -> Kept | None:
+def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
     """Return the result of an experiment if it is still right; None if it must be made."""
     try:
         document = json.loads(
@@ -148,13 +159,13 @@ def kept(experiment: Experiment, folder: Path) -> Kept | None:
     return found if all((folder / path).is_file() for path in pictures.values()) else None
 
 
-def made(experiment: Experiment, workshop: Workshop) -> Kept:
+def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
     """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
     started = time.monotonic()
     depends = experiment.depends()
     lacking = ""
     try:
-        found = experiment.make(workshop)
+        found = experiment.document(experiment.make(workshop))
     except Lacking as reason:
         found = {}
         lacking = str(reason)

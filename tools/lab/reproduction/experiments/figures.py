@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.levels.timing.forecast import Forecast
 from rack.tools.lab.reproduction.experiments.experiment import (
-    Document,
     Experiment,
     Workshop,
     need_real_time,
 )
 from rack.tools.recording.history import steal
-from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.timing.charts.letters import column_for
 from rack.tools.timing.charts.measured import TracedRun
-from rack.tools.timing.charts.panel import Panel
+from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.scheduled import Schedule
 
 SECONDS = 3.0
@@ -62,10 +61,11 @@ class FigureRack:
         """Return the config."""
         return load(self.config, self.settings)
 
-    def experiment(self) -> Experiment:
+    def experiment(self) -> Experiment[FigureRun]:
         """Return its run by real processes."""
+        lasts_s = SECONDS + LAUNCH_S
         about = f"{self.label} by real processes"
-        return Experiment(self.label, about, SECONDS + LAUNCH_S, self._inputs, partial(_run, self))
+        return Experiment(self.label, about, lasts_s, FigureRun, self._inputs, partial(_run, self))
 
     def _inputs(self) -> Any:
         return {
@@ -90,7 +90,23 @@ def column_ns(config: RackConfig, window_ns: int) -> int:
     return column_for(window_ns, Schedule(config, wire(config), {}).shortest_ns)
 
 
-def _run(figure: FigureRack, workshop: Workshop) -> Document:
+@dataclass(frozen=True)
+class FigureRun:
+    """A run of a figure: jobs of its tasks, the most frequent patterns of each lane and how often
+    they came, for plans and for cycles, and the hypervisor's part of each core, percent."""
+
+    tasks: dict[str, Count]
+    patterns: dict[str, tuple[tuple[tuple[str, int], ...], ...]]
+    steal: dict[int, float]
+    pictures: dict[str, str]
+
+    def late(self, task: str) -> float:
+        """Return the part of a task's jobs that were late."""
+        count = self.tasks[task]
+        return count.late / count.jobs if count.jobs else 1.0
+
+
+def _run(figure: FigureRack, workshop: Workshop) -> FigureRun:
     from rack.tools.timing.charts.picture import save
 
     config = figure.loaded()
@@ -100,16 +116,15 @@ def _run(figure: FigureRack, workshop: Workshop) -> Document:
     window_ns = figure.window_ns(config)
     panel = run.panel(start, start + window_ns, lambda part: None)
     drawn = save([panel], f"{figure.label}: a run", workshop.picture(f"{figure.label}-run"))
-    return {
-        "tasks": {name: asdict(count) for name, count in panel.counts.items()},
-        "patterns": {
-            lane: [one.most_common(COMMON) for one in counts]
+    return FigureRun(
+        tasks=dict(panel.counts),
+        patterns={
+            lane: tuple(tuple(one.most_common(COMMON)) for one in counts)
             for lane, counts in panel.patterns.items()
         },
-        "letters": list(lines(panel, column_ns(config, window_ns))),
-        "steal": steal(run.recording)["percent"],
-        "pictures": {"measured": workshop.shown(drawn)},
-    }
+        steal=steal(run.recording)["percent"],
+        pictures={"measured": workshop.shown(drawn)},
+    )
 
 
 def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:

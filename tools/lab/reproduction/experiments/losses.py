@@ -3,40 +3,74 @@ detected, and what then."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
+
+from pydantic import TypeAdapter
 
 from rack.boards.config import load
 from rack.tools.faults.judge import faults
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
-from rack.tools.recording.history import holds
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 NAME = "nasrem"
 LASTS_S = 13.0
 
 
-def losses_of(script: str, about: str) -> Experiment:
+@dataclass(frozen=True)
+class JudgedLoss:
+    """A fault of a run, as its report lists it: ticks, and ms until it was recovered from."""
+
+    kind: str
+    struck: int
+    board: str
+    joint: str
+    found_by: str
+    found_as: str
+    delay: int | None
+    bound: int | None
+    reactions: tuple[str, ...]
+    recovery_ms: float | None
+    is_within: bool
+    is_recovered: bool
+
+
+@dataclass(frozen=True)
+class LossesRun:
+    """A run with a script of faults: each fault, detections that none explains, and how it
+    ended."""
+
+    faults: tuple[JudgedLoss, ...]
+    unexplained: int
+    cause: str
+    ticks: int
+    worked: bool
+    clock_ms: float
+
+
+def losses_of(script: str, about: str) -> Experiment[LossesRun]:
     """Return a run of the rack's whole task in lockstep with a script of faults."""
     return Experiment(
         script,
         about,
         LASTS_S,
+        LossesRun,
         lambda: {"config": load(NAME, ["clock.mode=lockstep"], script).text()},
         partial(_run, script),
     )
 
 
-def _run(script: str, workshop: Workshop) -> Document:
+def _run(script: str, workshop: Workshop) -> LossesRun:
     recording = workshop.run(script, workshop.config(NAME, ["clock.mode=lockstep"], script), None)
     found = faults(recording.events, recording.layout)
     ended = recording.ended
-    return {
-        "faults": found["faults"],
-        "unexplained": found["unexplained"],
-        "restarts": found["restarts"],
-        "outcome": {**ended["outcome"], "worked": ended["worked"]},
-        "holds": holds(recording),
-        "clock_ms": recording.rack_config.clock.period_ms,
-    }
+    return LossesRun(
+        faults=TypeAdapter(tuple[JudgedLoss, ...]).validate_python(found["faults"]),
+        unexplained=len(found["unexplained"]),
+        cause=ended["outcome"]["cause"],
+        ticks=ended["outcome"]["ticks"],
+        worked=ended["worked"],
+        clock_ms=recording.rack_config.clock.period_ms,
+    )
 
 
 KILLS = losses_of("kill-each-board", "every board of nasrem killed once")

@@ -3,7 +3,9 @@ partitions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter
 
 from rack.boards.config import load, loads
 from rack.levels.timing.equations import response_ticks
@@ -12,10 +14,9 @@ from rack.tools.lab.benches import partition, switch
 from rack.tools.lab.benches.boards import responses_of
 from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.observed import observe
-from rack.tools.lab.benches.response import ResponseRuns
+from rack.tools.lab.benches.response import ResponseRuns, Twin
 from rack.tools.lab.reproduction.experiments.experiment import (
     PICTURES,
-    Document,
     Experiment,
     Workshop,
     need_real_time,
@@ -33,69 +34,106 @@ LAUNCH_S = 3.0
 NAME = "nasrem"
 
 
-def _switch(workshop: Workshop) -> Document:
+def _switch(workshop: Workshop) -> switch.SwitchCost:
     need_real_time(cores=2)
-    return switch.measure().document()
+    return switch.measure()
 
 
 SWITCH = Experiment(
     "switch",
     "the context switch",
     switch.WAKES * switch.PERIOD_S + LAUNCH_S,
+    switch.SwitchCost,
     lambda: {"wakes": switch.WAKES},
     _switch,
 )
 
 
-def _pipeline(workshop: Workshop) -> Document:
+@dataclass(frozen=True)
+class PipelineRun:
+    """How many messages took how many cycles down the levels, in lockstep and in real time."""
+
+    predicted: int
+    cycles: dict[str, dict[int, int]]
+
+
+def _pipeline(workshop: Workshop) -> PipelineRun:
     chains = {mode: Chain(LEVELS, RATE_HZ, mode) for mode in ("lockstep", "realtime")}
     last = f"{chains['lockstep'].names[-1]}.status"
-    found: dict[str, Mapping[int, int]] = {}
+    found: dict[str, dict[int, int]] = {}
     for mode, chain in chains.items():
         config = loads(chain.text()).model_copy(update={"name": workshop.rack})
         run = observe(config, PIPELINE_S, workshop.share, [last])
         found[mode] = responses_of([run.messages[last]])
-    return {
-        "levels": LEVELS,
-        "rate_hz": RATE_HZ,
-        "predicted": response_ticks([1] * LEVELS),
-        "cycles": found,
-    }
+    return PipelineRun(response_ticks([1] * LEVELS), found)
 
 
 PIPELINE = Experiment(
     "pipeline",
     "a message down five levels",
     2 * (PIPELINE_S + LAUNCH_S),
+    PipelineRun,
     lambda: {"levels": LEVELS, "rate": RATE_HZ, "seconds": PIPELINE_S},
     _pipeline,
 )
 
 
-def _response(workshop: Workshop) -> Document:
+@dataclass(frozen=True)
+class LevelResponse:
+    """Responses to the commands that one level was given, ms."""
+
+    level: str
+    commands: int
+    min_ms: float
+    median_ms: float
+    max_ms: float
+    longest_ms: float
+    sum_eq_3_3_ms: float
+    bound_eq_3_2_ms: float
+    max_from_reading_ms: float
+    off_prediction: int
+
+
+@dataclass(frozen=True)
+class OperatorRun:
+    """Responses to an operator, and runs without one of the commands: `twins`."""
+
+    held: bool
+    measured: int
+    beyond: int
+    off_prediction: int
+    levels: tuple[LevelResponse, ...]
+    twins: tuple[Twin, ...]
+    pictures: dict[str, str]
+
+
+def _response(workshop: Workshop) -> OperatorRun:
     found = ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
     paths = found.plot(workshop.folder / PICTURES)
-    return {**found.document(), "pictures": {"response": workshop.shown(paths)}}
+    document = found.document() | {"pictures": {"response": workshop.shown(paths)}}
+    return TypeAdapter(OperatorRun).validate_python(document)
 
 
 RESPONSE = Experiment(
     "response",
     "holds and resumes by an operator",
     30.0,
+    OperatorRun,
     lambda: {"config": load(NAME).text(), "commands": COMMANDS, "twins": TWINS, "seed": SEED},
     _response,
 )
 
 
-def _partition(workshop: Workshop) -> Document:
+def _partition(workshop: Workshop) -> partition.Partitions:
     need_real_time(cores=2)
-    return partition.measure(NAME, PARTITION_S, 1, Progress()).document()
+    return partition.measure(NAME, PARTITION_S, 1, Progress())
 
 
 PARTITION = Experiment(
     "partition",
     "nasrem with its planners on one core and on two",
     len(partition.PARTITIONS) * (PARTITION_S + LAUNCH_S),
+    partition.Partitions,
     lambda: {"config": load(NAME).text(), "seconds": PARTITION_S},
     _partition,
 )

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter
 
 from rack.boards.config import load
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.recording.history import fired_rows
 
 NAME = "nist-state-table"
@@ -14,27 +17,46 @@ UNDISTURBED = ("scene.motion=[]",)
 LASTS_S = 20.0
 
 
-def _run(workshop: Workshop) -> Document:
-    return {
-        "disturbed": _task(workshop, NAME, ()),
-        "undisturbed": _task(workshop, f"{NAME}-undisturbed", UNDISTURBED),
-    }
+@dataclass(frozen=True)
+class FiredRow:
+    """A row of a state table that fired: in how many cycles, and when first, s."""
+
+    name: str
+    cycles: int
+    first_s: float
+
+
+@dataclass(frozen=True)
+class TableRun:
+    """A run of the task: the rows that fired, by level, and whether the task was done."""
+
+    rows: dict[str, tuple[FiredRow, ...]]
+    worked: bool
+
+
+@dataclass(frozen=True)
+class TableRuns:
+    """The task with what moves in the cell, and without."""
+
+    disturbed: TableRun
+    undisturbed: TableRun
+
+
+def _run(workshop: Workshop) -> TableRuns:
+    return TableRuns(_task(workshop, NAME, ()), _task(workshop, f"{NAME}-undisturbed", UNDISTURBED))
 
 
 TABLES = Experiment(
     NAME,
     "state tables, with a disturbance and without",
     LASTS_S,
+    TableRuns,
     lambda: {"config": load(NAME).text(), "without": UNDISTURBED},
     _run,
 )
 
 
-def _task(workshop: Workshop, label: str, settings: Sequence[str]) -> Document:
+def _task(workshop: Workshop, label: str, settings: Sequence[str]) -> TableRun:
     recording = workshop.run(label, workshop.config(NAME, ["clock.mode=lockstep", *settings]), None)
-    ended = recording.ended
-    return {
-        "rows": fired_rows(recording),
-        "outcome": {**ended["outcome"], "worked": ended["worked"]},
-        "clock_ms": recording.rack_config.clock.period_ms,
-    }
+    found = {"rows": fired_rows(recording), "worked": recording.ended["worked"]}
+    return TypeAdapter(TableRun).validate_python(found)

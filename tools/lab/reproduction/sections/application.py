@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from rack.boards.config import RackConfig, load
-from rack.tools.lab.benches.partition import LevelFigures, Partitions
-from rack.tools.lab.benches.switch import PAPER_US, SwitchCost
+from rack.tools.lab.benches.partition import LevelFigures
+from rack.tools.lab.benches.switch import PAPER_US
 from rack.tools.lab.reproduction.experiments import tables
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.measured import PARTITION, SWITCH
@@ -61,21 +61,20 @@ def _table_of(config: RackConfig, board: str) -> str:
 
 
 def _earlier_tested(findings: Findings) -> Assessment:
-    disturbed, calm = (findings[TABLES.name][key] for key in ("disturbed", "undisturbed"))
-    usual = {(level, row["name"]) for level, rows in calm["rows"].items() for row in rows}
+    found = findings.of(TABLES)
+    disturbed = found.disturbed
+    calm = found.undisturbed
+    usual = {(level, row.name) for level, rows in calm.rows.items() for row in rows}
     extra = [
         (level, row)
-        for level, rows in disturbed["rows"].items()
+        for level, rows in disturbed.rows.items()
         for row in rows
-        if (level, row["name"]) not in usual
+        if (level, row.name) not in usual
     ]
-    fired = [
-        (level, text(row["name"]), str(row["cycles"]), f"{row['first_s']:g}")
-        for level, row in extra
-    ]
+    fired = [(level, text(row.name), str(row.cycles), f"{row.first_s:g}") for level, row in extra]
     counts = [
-        (level, str(len(rows)), str(sum(row["cycles"] for row in rows)))
-        for level, rows in disturbed["rows"].items()
+        (level, str(len(rows)), str(sum(row.cycles for row in rows)))
+        for level, rows in disturbed.rows.items()
     ]
     side = Side.of(
         Columns(("level", "rows that fired", "cycles"), counts),
@@ -85,7 +84,7 @@ def _earlier_tested(findings: Findings) -> Assessment:
             "Rows that fired only in the run with the disturbance.",
         ),
     )
-    if not (disturbed["outcome"]["worked"] and calm["outcome"]["worked"]):
+    if not (disturbed.worked and calm.worked):
         return Assessment(side, Ruling.FAILS, "A task was not done.")
     if not extra:
         return Assessment(side, Ruling.FAILS, "No state transition answered the disturbance.")
@@ -122,29 +121,28 @@ def _levels(workshop: Workshop) -> Side:
 
 
 def _levels_tested(findings: Findings) -> Assessment:
-    found = findings[NASREM.name]
+    found = findings.of(NASREM)
     config = load(NAME)
-    lasted_s = found["outcome"]["ticks"] * config.clock_ns * 1e-9
+    lasted_s = found.ticks * config.clock_ns * 1e-9
     rows = []
     off = []
-    for name, task in found["tasks"].items():
-        if task["role"] != "executor":
+    for name, task in found.tasks.items():
+        if task.role != "executor":
             continue
         nominal = 1e9 / (config.every(name) * config.clock_ns)
-        done = task["cycles"] + task["start_up"] + task["stalled"]
-        due = -(-found["outcome"]["ticks"] // config.every(name))
+        done = task.cycles + task.start_up + task.stalled
+        due = -(-found.ticks // config.every(name))
         measured = nominal * done / due
         off += [name] if done < (1 - NOMINAL) * due else []
-        lateness = task["lateness_ms"]
-        late = [f"{1e3 * lateness[key]:.0f}" for key in ("p50", "p99")]
+        late = [f"{1e3 * task.lateness_ms[key]:.0f}" for key in ("p50", "p99")]
         rows.append(
             (
                 name,
                 f"{nominal:g}",
                 f"{measured:.2f}",
                 *late,
-                f"{task['largest_gap_ms']:.2f}",
-                str(task["core"]),
+                f"{task.largest_gap_ms:.2f}",
+                str(task.core),
             )
         )
     head = (
@@ -156,8 +154,8 @@ def _levels_tested(findings: Findings) -> Assessment:
         "longest gap, ms",
         "processor",
     )
-    accesses = sum(bus["reads"] + bus["writes"] for bus in found["bus"].values()) / lasted_s
-    size = sum(bus["read_bytes"] + bus["write_bytes"] for bus in found["bus"].values()) / lasted_s
+    accesses = sum(bus.reads + bus.writes for bus in found.bus.values()) / lasted_s
+    size = sum(bus.read_bytes + bus.write_bytes for bus in found.bus.values()) / lasted_s
     words = f"Over the backplane go {accesses:.0f} reads and writes a second, {size / 1e6:.2f} MB."
     side = Side.of(Columns(head, rows), words)
     if not off:
@@ -196,7 +194,7 @@ def _switch(workshop: Workshop) -> Side:
 
 
 def _switch_tested(findings: Findings) -> Assessment:
-    found = findings.record(SWITCH.name, SwitchCost)
+    found = findings.of(SWITCH)
     names = {
         "planner to executor": found.in_us,
         "executor to planner": found.out_us,
@@ -239,7 +237,7 @@ def _figure5(workshop: Workshop) -> Side:
 
 def _figure5_tested(findings: Findings) -> Assessment:
     """Compare partitions: do slow levels do with multitasking, and do fast ones need more?"""
-    found = findings.record(PARTITION.name, Partitions)
+    found = findings.of(PARTITION)
     slow = {
         one.level
         for one in figure5.placed(load(NAME))

@@ -11,7 +11,7 @@ from rack.tools.lab.benches.systems.bench import systems
 from rack.tools.lab.benches.systems.figures import SystemFigures
 from rack.tools.lab.benches.systems.prediction import SystemPrediction, prediction
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
-from rack.tools.lab.reproduction.experiments.systems import SYSTEMS, systems_of
+from rack.tools.lab.reproduction.experiments.systems import SYSTEMS, compared
 from rack.tools.lab.reproduction.sections.gantt import DISTURBED
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
@@ -73,7 +73,7 @@ def _promise_row(name: str, said: SystemPrediction) -> tuple[str, ...]:
 
 def _compared(findings: Findings) -> Assessment:
     """Judge whether all systems run, with their responses within the bounds."""
-    found = systems_of(findings[one.name] for one in SYSTEMS)
+    found = compared([findings.of(one) for one in SYSTEMS])
     head = (
         "rack",
         "command down",
@@ -216,7 +216,7 @@ def _rccl(workshop: Workshop) -> Side:
 
 
 def _rccl_tested(findings: Findings) -> Assessment:
-    found = systems_of([findings[RCCL_RUN.name]]).systems[0]
+    found = findings.of(RCCL_RUN).systems[0]
     rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
     layout = wire(load(RCCL))
     fastest = [

@@ -24,16 +24,16 @@ def _predictable(workshop: Workshop) -> Side:
 
 
 def _predictable_tested(findings: Findings) -> Assessment:
-    found = findings[RESPONSE.name]
+    found = findings.of(RESPONSE)
     names = ("min", "median", "max", "longest", "sum_eq_3_3", "bound_eq_3_2", "max_from_reading")
     rows = [
         (
-            row["level"],
-            str(row["commands"]),
-            *(f"{row[f'{name}_ms']:g}" for name in names),
-            str(row["off_prediction"]),
+            row.level,
+            str(row.commands),
+            *(f"{getattr(row, f'{name}_ms'):g}" for name in names),
+            str(row.off_prediction),
         )
-        for row in found["levels"]
+        for row in found.levels
     ]
     head = [
         "given to",
@@ -46,7 +46,7 @@ def _predictable_tested(findings: Findings) -> Assessment:
         "bound, 3.2",
     ]
     head += ["longest from its reading", "not at the predicted tick"]
-    twins = [twin for twin in found["twins"] if not twin["agrees"]]
+    twins = [twin for twin in found.twins if not twin.agrees]
     side = Side.of(
         Columns(
             head,
@@ -55,19 +55,19 @@ def _predictable_tested(findings: Findings) -> Assessment:
             " the cycle that acts.",
         ),
         Plate(
-            Path(found["pictures"]["response"]),
+            Path(found.pictures["response"]),
             "Responses to commands at each level, with their bounds.",
         ),
     )
-    if found["held"] and not twins:
+    if found.held and not twins:
         why = (
-            f"All {found['measured']} commands took effect at the predicted tick and within the"
+            f"All {found.measured} commands took effect at the predicted tick and within the"
             " bounds of equations 3.2 and 3.3. In a run without one of them, the torque is the"
             " same until that tick, bit for bit."
         )
         return Assessment(side, Ruling.HOLDS, why)
     why = (
-        f"{found['beyond']} responses beyond a bound, {found['off_prediction']} not at the"
+        f"{found.beyond} responses beyond a bound, {found.off_prediction} not at the"
         " predicted tick."
     )
     return Assessment(side, Ruling.FAILS, why)

@@ -6,14 +6,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import isfinite
+from typing import NamedTuple
 
 from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.errors import ConfigError
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.tables import ms
-from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, NasremRun
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     Columns,
@@ -48,7 +50,7 @@ class Biting:
             found = verdicts_of(load(self.config, self.settings), equation)
         except ConfigError as error:
             return words, Listing(str(error))
-        return words, Columns(HEAD, rows_of(equation, [verdict.document() for verdict in found]))
+        return words, Columns(HEAD, [_row(verdict) for verdict in found])
 
 
 def forecast_of(config: RackConfig) -> Forecast:
@@ -93,74 +95,75 @@ class PaperEquation:
         fails."""
         found = verdicts_of(load(NAME), self.number)
         meanings = dict.fromkeys(code(verdict.meaning) for verdict in found)
-        table = Columns(HEAD, rows_of(self.number, [verdict.document() for verdict in found]))
+        table = Columns(HEAD, [_row(verdict) for verdict in found])
         words = (
             f"{self.reading} For {code(NAME)}, by the budgets of its config: {'; '.join(meanings)}."
         )
         return Side.of(words, table, *self.biting.side(self.number))
 
 
-def rows_of(equation: str, verdicts: list[Document]) -> list[tuple[str, ...]]:
-    """Return rows of a table: subject, both sides, margin, and whether it holds."""
-    return [_row(verdict) for verdict in verdicts if verdict["equation"] == equation]
-
-
-def _row(verdict: Document) -> tuple[str, ...]:
-    left, right, margin = (
-        _shown(verdict[side], verdict["unit"]) for side in ("left", "right", "margin")
-    )
+def _row(verdict: EquationVerdict) -> tuple[str, ...]:
+    """Return a row of a table: subject, both sides, margin, and whether it holds."""
+    sides = (verdict.left, verdict.right, verdict.margin)
+    left, right, margin = (_shown(side, verdict.unit) for side in sides)
     return (
-        text(verdict["subject"]),
+        text(verdict.subject),
         left,
-        SIGNS[verdict["sign"]],
+        SIGNS[verdict.sign],
         right,
         margin,
-        "ok" if verdict["holds"] else "FAILS",
+        "ok" if verdict.holds else "FAILS",
     )
 
 
-def _shown(side: float | None, unit: str) -> str:
-    if side is None:
+def _shown(side: float, unit: str) -> str:
+    if not isfinite(side):
         return "∞"
     return ms(side) if unit == "ns" else f"{side:.3g}"
 
 
-def measured_of(equation: str, found: Document) -> list[Document]:
-    """Return the measured verdicts on one equation, each with whether it holds in most cycles."""
-    pairs = [
-        pair
-        for pair in found["pairs"]
-        if pair["equation"] == equation and pair["measured"] is not None
+class MeasuredVerdict(NamedTuple):
+    """A verdict on the worst cycle of a run, and whether the equation holds in most cycles."""
+
+    measured: EquationVerdict
+    mostly: bool
+
+
+def measured_of(equation: str, found: NasremRun) -> list[MeasuredVerdict]:
+    """Return the measured verdicts on one equation."""
+    return [
+        MeasuredVerdict(pair.measured, pair.mostly)
+        for pair in found.pairs
+        if pair.equation == equation and pair.measured is not None
     ]
-    return [{**pair["measured"], "mostly": pair["mostly"]} for pair in pairs]
 
 
-def table_of(verdicts: list[Document]) -> Columns:
+def table_of(verdicts: list[MeasuredVerdict]) -> Columns:
     """Return the measured verdicts as a table: the worst cycle of the run, and whether most cycles
     are better."""
-    rows = [(*_row(verdict), "yes" if verdict["mostly"] else "NO") for verdict in verdicts]
+    rows = [(*_row(measured), "yes" if mostly else "NO") for measured, mostly in verdicts]
     return Columns((*HEAD[:-1], "worst cycle", "in 99 of 100"), rows)
 
 
 def judged(equation: PaperEquation, findings: Findings) -> Assessment:
     """Judge an equation by the worst cycle of every subject, and by 99 of 100 cycles."""
-    found = findings[NASREM.name]
+    found = findings.of(NASREM)
     verdicts = measured_of(equation.number, found)
-    counts = found["breaches"].get(equation.number, 0)
-    lasted = found["outcome"]["ticks"] * load(NAME).clock_ns * 1e-9
+    counts = found.breaches.get(equation.number, 0)
+    lasted = found.ticks * load(NAME).clock_ns * 1e-9
     words = (
         f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without"
         " those of the start-up."
     )
     side = Side.of(words, table_of(verdicts))
-    broken = [verdict["subject"] for verdict in verdicts if not verdict["holds"]]
+    broken = [measured.subject for measured, _ in verdicts if not measured.holds]
     if not broken:
         return Assessment(
             side,
             Ruling.HOLDS,
             "It holds as predicted for every level, in the worst cycle of the run too.",
         )
-    if all(verdict["mostly"] for verdict in verdicts):
+    if all(mostly for _, mostly in verdicts):
         why = (
             "It holds as predicted in 99 of 100 cycles; in the worst it fails for"
             f" {text(', '.join(broken))}. "
@@ -175,9 +178,9 @@ def judged(equation: PaperEquation, findings: Findings) -> Assessment:
     )
 
 
-def stolen(found: Document) -> str:
+def stolen(found: NasremRun) -> str:
     """Return how much of its cores the hypervisor took from a run."""
-    taken = ", ".join(f"{percent:g} % of core {core}" for core, percent in found["steal"].items())
+    taken = ", ".join(f"{percent:g} % of core {core}" for core, percent in found.steal.items())
     return (
         f"Meanwhile the hypervisor took {taken}."
         if taken

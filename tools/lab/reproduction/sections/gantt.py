@@ -8,12 +8,13 @@ from pathlib import Path
 
 from rack.boards.config import RackConfig
 from rack.boards.config.schema import BudgetConfig
-from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
     LEVEL,
     MS,
     PLANNER,
     FigureRack,
+    FigureRun,
     Planning,
     column_ns,
     sweep,
@@ -72,18 +73,18 @@ def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:
     return Plate(Path(workshop.shown(paths)), caption), Listing(letters)
 
 
-def ran(figure: FigureRack, found: Document) -> Side:
+def ran(figure: FigureRack, found: FigureRun) -> Side:
     """Return the run of a figure: its chart, how many cycles and plans were late, and its
     patterns."""
-    steal = ", ".join(f"core {core} {percent:g} %" for core, percent in found["steal"].items())
+    steal = ", ".join(f"core {core} {percent:g} %" for core, percent in found.steal.items())
     rows = [
         (
             {LEVEL: "executor: cycles", PLANNER: "planner: plans"}[task],
-            str(count["jobs"]),
-            str(count["late"]),
-            str(count["skipped"]),
+            str(count.jobs),
+            str(count.late),
+            str(count.skipped),
         )
-        for task, count in found["tasks"].items()
+        for task, count in found.tasks.items()
     ]
     caption = (
         "Late: past its deadline; skipped: of the late ones, those that never began. Taken by the"
@@ -91,7 +92,7 @@ def ran(figure: FigureRack, found: Document) -> Side:
     )
     return Side.of(
         Plate(
-            Path(found["pictures"]["measured"]),
+            Path(found.pictures["measured"]),
             f"A run of {code(figure.label)} by real processes, from its middle.",
         ),
         Columns(("", "all", "late", "skipped"), rows, caption),
@@ -99,10 +100,10 @@ def ran(figure: FigureRack, found: Document) -> Side:
     )
 
 
-def _patterns(found: Document) -> Columns:
+def _patterns(found: FigureRun) -> Columns:
     rows = [
         (lane, code(pattern), str(count))
-        for lane, both in found["patterns"].items()
+        for lane, both in found.patterns.items()
         for pattern, count in chain(*both)
     ]
     return Columns(
@@ -112,34 +113,28 @@ def _patterns(found: Document) -> Columns:
     )
 
 
-def late(found: Document, task: str) -> float:
-    """Return the part of a task's jobs that were late."""
-    count = found["tasks"][task]
-    return count["late"] / count["jobs"] if count["jobs"] else 1.0
-
-
-def fails(found: Document) -> bool:
+def fails(found: FigureRun) -> bool:
     """Return whether a run fails: whether cycles or plans are mostly late."""
-    return max(late(found, LEVEL), late(found, PLANNER)) > MOSTLY
+    return max(found.late(LEVEL), found.late(PLANNER)) > MOSTLY
 
 
 def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
     """Judge a figure of which the paper says that it works, or that it fails."""
-    found = findings[figure.label]
-    counts = [found["tasks"][task] for task in (LEVEL, PLANNER)]
+    found = findings.of(figure.experiment())
+    counts = [found.tasks[task] for task in (LEVEL, PLANNER)]
     said = (
-        f"{counts[0]['late']} of {counts[0]['jobs']} cycles and {counts[1]['late']} of"
-        f" {counts[1]['jobs']} plans late"
+        f"{counts[0].late} of {counts[0].jobs} cycles and {counts[1].late} of {counts[1].jobs}"
+        " plans late"
     )
     measured = ran(figure, found)
-    if fails(found) == works and DISTURBED < late(found, LEVEL) < MOSTLY:
+    if fails(found) == works and DISTURBED < found.late(LEVEL) < MOSTLY:
         why = f"Other programs had the processors too often: {said}. On a quiet machine: {AGAIN}."
         return Assessment(measured, Ruling.UNTESTABLE, why)
     if fails(found) == works:
         return Assessment(
             measured, Ruling.FAILS, f"The paper says that it {_verb(works)}; the run had {said}."
         )
-    stray = [count for count in counts if count["late"] and count["late"] <= MOSTLY * count["jobs"]]
+    stray = [count for count in counts if count.late and count.late <= MOSTLY * count.jobs]
     if stray:
         why = (
             f"It {_verb(works)}, as the paper says: {said}. The stray ones are this machine's: see"
@@ -270,10 +265,10 @@ def _values(rows: list[Planning]) -> str:
 def _sweep_tested(findings: Findings) -> Assessment:
     rows = sweep(FIG2.config, PAPER_X)
     odd = contradicting(rows)
-    short, long = (findings[figure.label] for figure in (SHORT_2, LONG_2))
+    short, long = (findings.of(figure.experiment()) for figure in (SHORT_2, LONG_2))
     measured = Side.of(*ran(SHORT_2, short).items, *ran(LONG_2, long).items)
     said = ", ".join(
-        f"X = {x:g}: {100 * late(found, PLANNER):.0f} % of the plans late"
+        f"X = {x:g}: {100 * found.late(PLANNER):.0f} % of the plans late"
         for x, found in ((LEAST_X, short), (MOST_X, long))
     )
     if not odd:
@@ -306,12 +301,12 @@ def _fig3_side(workshop: Workshop) -> Side:
 
 def _fig3_tested(findings: Findings) -> Assessment:
     own = _judged(FIG3, False, findings)
-    short = findings[SHORT_3.label]
+    short = findings.of(SHORT_3.experiment())
     works = [one for one in sweep(FIG3.config, PAPER_X) if not _is_slow(one)]
     measured = Side.of(*own.measured.items, *ran(SHORT_3, short).items)
     if own.ruling is Ruling.FAILS or not works:
         return Assessment(measured, own.ruling, own.why)
-    in_time = 100 * (1 - late(short, PLANNER))
+    in_time = 100 * (1 - short.late(PLANNER))
     why = (
         f"{own.why} With X = {LEAST_X:g}, which the paper permits too, {in_time:.0f} % of the plans"
         " were in time: the figure fails only from a certain X on."

@@ -11,11 +11,11 @@ from textwrap import dedent
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.faults.kind import KINDS
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER
-from rack.tools.lab.reproduction.experiments.losses import KILLS, SENSORS
+from rack.tools.lab.reproduction.experiments.losses import KILLS, SENSORS, LossesRun
 from rack.tools.lab.reproduction.experiments.measured import LEVELS, PIPELINE, RATE_HZ
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, PHASES
+from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, PHASES, MailboxTraffic
 from rack.tools.lab.reproduction.sections.equations import stolen
 from rack.tools.lab.reproduction.sections.flow import between, flow_svg
 from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, MOSTLY, budget_of
@@ -74,10 +74,10 @@ def _flow(workshop: Workshop) -> Side:
 def _flow_tested(findings: Findings) -> Assessment:
     """Compare what passed through the mailboxes between levels with what the ticks of their writers
     demand."""
-    found = findings[NASREM.name]
+    found = findings.of(NASREM)
     config = load(NAME)
     levels = rack_timing(config, wire(config)).hierarchy.chains[0]
-    boxes = {box["mailbox"]: box for box in found["mailboxes"]}
+    boxes = {box.mailbox: box for box in found.mailboxes}
     rows = []
     short = []
     for upper, lower in pairwise(levels):
@@ -85,7 +85,7 @@ def _flow_tested(findings: Findings) -> Assessment:
         for way, found_boxes in (("down", flow.down), ("up", flow.up)):
             for box in (boxes[one.name] for one in found_boxes if one.name in boxes):
                 rows.append(_flow_row(way, upper, lower, box))
-                short += [box] if box["messages"] < box["due"] - 1 else []
+                short += [box] if box.messages < box.due - 1 else []
     ways = Counter(row[0] for row in rows)
     table = Columns(("way", "mailbox", "from", "to", "every, ms", "messages due", "messages"), rows)
     side = Side.of(
@@ -98,24 +98,24 @@ def _flow_tested(findings: Findings) -> Assessment:
         return Assessment(
             side, Ruling.HOLDS, "Commands went down and statuses up in every cycle of every level."
         )
-    lacking = sum(box["due"] - box["messages"] for box in short)
+    lacking = sum(box.due - box.messages for box in short)
     why = (
         f"Commands went down and statuses up; {lacking} of"
-        f" {sum(box['due'] for box in boxes.values())} messages were not written, because their"
+        f" {sum(box.due for box in boxes.values())} messages were not written, because their"
         f" cycles were skipped. {stolen(found)}"
     )
     return Assessment(side, Ruling.BOUNDED, why)
 
 
-def _flow_row(way: str, upper: str, lower: str, box: Document) -> tuple[str, ...]:
+def _flow_row(way: str, upper: str, lower: str, box: MailboxTraffic) -> tuple[str, ...]:
     ends = (upper, lower) if way == "down" else (lower, upper)
     return (
         way,
-        code(box["mailbox"]),
+        code(box.mailbox),
         *ends,
-        f"{box['every_ms']:g}",
-        str(box["due"]),
-        str(box["messages"]),
+        f"{box.every_ms:g}",
+        str(box.due),
+        str(box.messages),
     )
 
 
@@ -138,7 +138,7 @@ def _loop(workshop: Workshop) -> Side:
 
 
 def _loop_tested(findings: Findings) -> Assessment:
-    found = findings[NASREM.name]
+    found = findings.of(NASREM)
     head = [
         "level",
         *(f"{words}: median" for words in LETTERS.values()),
@@ -148,8 +148,8 @@ def _loop_tested(findings: Findings) -> Assessment:
         "skipped",
     ]
     rows = []
-    for level, parts in found["phases"].items():
-        task = found["tasks"][level]
+    for level, parts in found.phases.items():
+        task = found.tasks[level]
         longest = max(part["max"] for part in parts.values())
         medians = [f"{parts[name]['p50']:.1f}" for name in LETTERS]
         rows.append(
@@ -157,20 +157,18 @@ def _loop_tested(findings: Findings) -> Assessment:
                 level,
                 *medians,
                 f"{longest:.0f}",
-                str(task["cycles"]),
-                str(task["missed"]),
-                str(task["skipped"]),
+                str(task.cycles),
+                str(task.missed),
+                str(task.skipped),
             )
         )
     side = Side.of(
         "Phases of the loop in every executor, us of processor time, and its cycles.",
         Columns(head, rows),
     )
-    bad = sum(
-        found["tasks"][level]["missed"] + found["tasks"][level]["skipped"]
-        for level in found["phases"]
-    )
-    due = sum(found["tasks"][level]["cycles"] for level in found["phases"])
+    executors = [found.tasks[level] for level in found.phases]
+    bad = sum(task.missed + task.skipped for task in executors)
+    due = sum(task.cycles for task in executors)
     if not bad:
         return Assessment(
             side, Ruling.HOLDS, f"All {due} cycles of all levels ended within their bound."
@@ -203,18 +201,18 @@ def _both_tested(findings: Findings) -> Assessment:
     late = 0
     due = 0
     for figure, coupling in ((FIG2, "tightly"), (FIG4, "loosely")):
-        tasks = findings[figure.label]["tasks"]
+        tasks = findings.of(figure.experiment()).tasks
         executor = tasks[LEVEL]
         planner = tasks[PLANNER]
         rows.append(
             (
                 code(figure.label),
                 coupling,
-                *(str(n) for n in (planner["jobs"], executor["jobs"], executor["late"])),
+                *(str(n) for n in (planner.jobs, executor.jobs, executor.late)),
             )
         )
-        late = late + executor["late"]
-        due = due + executor["jobs"]
+        late = late + executor.late
+        due = due + executor.jobs
     side = Side.of(
         Columns(("rack", "coupled", "plans", "executor's cycles", "of these late"), rows)
     )
@@ -248,16 +246,17 @@ def _bounds(workshop: Workshop) -> Side:
 
 def _bounds_tested(findings: Findings) -> Assessment:
     items = []
+    count = 0
     late = 0
     unexplained = 0
     undone = []
     for experiment in (KILLS, SENSORS):
-        found = findings[experiment.name]
-        items += [_losses(found, experiment)]
-        late += sum(not (one["is_within"] and one["is_recovered"]) for one in found["faults"])
-        unexplained += len(found["unexplained"])
-        undone += [] if found["outcome"]["worked"] else [experiment.name]
-    count = sum(len(findings[experiment.name]["faults"]) for experiment in (KILLS, SENSORS))
+        found = findings.of(experiment)
+        items.append(_losses(found, experiment.name))
+        count += len(found.faults)
+        late += sum(not (one.is_within and one.is_recovered) for one in found.faults)
+        unexplained += found.unexplained
+        undone += [] if found.worked else [experiment.name]
     side = Side.of(*items)
     if late or undone:
         why = (
@@ -274,7 +273,7 @@ def _bounds_tested(findings: Findings) -> Assessment:
     return Assessment(side, Ruling.HOLDS, why)
 
 
-def _losses(found: Document, experiment: Experiment) -> Columns:
+def _losses(found: LossesRun, script: str) -> Columns:
     head = (
         "tick",
         "fault",
@@ -288,26 +287,23 @@ def _losses(found: Document, experiment: Experiment) -> Columns:
     )
     rows = [
         (
-            str(one["struck"]),
-            one["kind"],
-            text(" ".join(filter(None, (one["board"], one["joint"])))),
-            text(one["found_by"]),
-            text(one["found_as"]),
-            str(one["delay"]),
-            "-" if one["bound"] is None else str(one["bound"]),
-            text(", ".join(one["reactions"])) or "none needed",
-            "-" if one["recovery_ms"] is None else f"{one['recovery_ms']:g}",
+            str(one.struck),
+            one.kind,
+            text(" ".join(filter(None, (one.board, one.joint)))),
+            text(one.found_by),
+            text(one.found_as),
+            str(one.delay),
+            "-" if one.bound is None else str(one.bound),
+            text(", ".join(one.reactions)) or "none needed",
+            "-" if one.recovery_ms is None else f"{one.recovery_ms:g}",
         )
-        for one in found["faults"]
+        for one in found.faults
     ]
-    ended = (
-        f"{found['outcome']['cause']} after {found['outcome']['ticks']} ticks of"
-        f" {found['clock_ms']:g} ms"
-    )
+    ended = f"{found.cause} after {found.ticks} ticks of {found.clock_ms:g} ms"
     return Columns(
         head,
         rows,
-        f"{code(f'rack run {NAME} --lockstep --faults {experiment.name}')}: {text(ended)}.",
+        f"{code(f'rack run {NAME} --lockstep --faults {script}')}: {text(ended)}.",
     )
 
 
@@ -320,24 +316,24 @@ def _pipeline(workshop: Workshop) -> Side:
 
 
 def _pipeline_tested(findings: Findings) -> Assessment:
-    found = findings[PIPELINE.name]
+    found = findings.of(PIPELINE)
     rows = [
-        (mode, str(took), str(found["predicted"]), str(count))
-        for mode, cycles in found["cycles"].items()
+        (mode, str(took), str(found.predicted), str(count))
+        for mode, cycles in found.cycles.items()
         for took, count in cycles.items()
     ]
     side = Side.of(Columns(("run", "cycles taken", "predicted", "messages"), rows))
     others = {
-        mode: sum(n for took, n in c.items() if int(took) != found["predicted"])
-        for mode, c in found["cycles"].items()
+        mode: sum(n for took, n in c.items() if took != found.predicted)
+        for mode, c in found.cycles.items()
     }
     if not any(others.values()):
-        return Assessment(side, Ruling.HOLDS, f"Every message took {found['predicted']} cycles.")
+        return Assessment(side, Ruling.HOLDS, f"Every message took {found.predicted} cycles.")
     if not others["lockstep"] and all(
-        int(took) >= found["predicted"] for c in found["cycles"].values() for took in c
+        took >= found.predicted for c in found.cycles.values() for took in c
     ):
         why = (
-            f"In lockstep every message took {found['predicted']} cycles; in real time"
+            f"In lockstep every message took {found.predicted} cycles; in real time"
             f" {others['realtime']} took longer, after missed cycles."
         )
         return Assessment(side, Ruling.BOUNDED, why)

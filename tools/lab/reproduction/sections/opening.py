@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from rack.boards.config import load, rack_timing, wire
-from rack.tools.lab.reproduction.experiments.determinism import ATTEMPTS, DETERMINISM, NAME, SECONDS
-from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.determinism import (
+    ATTEMPTS,
+    DETERMINISM,
+    NAME,
+    SECONDS,
+    ComparedRun,
+)
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM
 from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Ruling, Side, code, text
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
@@ -28,7 +34,7 @@ def _determined(workshop: Workshop) -> Side:
 
 
 def _determined_tested(findings: Findings) -> Assessment:
-    runs = findings[DETERMINISM.name]["runs"]
+    runs = findings.of(DETERMINISM).runs
     head = (
         "run",
         "mode",
@@ -41,15 +47,15 @@ def _determined_tested(findings: Findings) -> Assessment:
         "digest",
     )
     side = Side.of(Columns(head, [_run_row(run) for run in runs]))
-    reference = next(run["digest"] for run in runs if run["mode"] == LOCKSTEP)
-    if any(run["digest"] != reference for run in runs if run["mode"] == LOCKSTEP):
+    reference = next(run.digest for run in runs if run.mode == LOCKSTEP)
+    if any(run.digest != reference for run in runs if run.mode == LOCKSTEP):
         return Assessment(side, Ruling.FAILS, "Two runs in lockstep differ.")
-    real = [run for run in runs if run["mode"] == REAL]
+    real = [run for run in runs if run.mode == REAL]
     if any(not _is_explained(run) for run in real):
         return Assessment(
             side, Ruling.FAILS, "A run in real time diverged before it had missed a deadline."
         )
-    if any(run["first_miss"] is None and run["digest"] == reference for run in real):
+    if any(run.first_miss is None and run.digest == reference for run in real):
         why = (
             "Lockstep twice and a run in real time without a miss wrote the same messages, bit"
             " for bit"
@@ -67,25 +73,25 @@ def _determined_tested(findings: Findings) -> Assessment:
     return Assessment(side, Ruling.BOUNDED, why)
 
 
-def _is_explained(run: Document) -> bool:
+def _is_explained(run: ComparedRun) -> bool:
     """Return whether a run diverges from the reference only after it has missed a deadline."""
-    if run["difference"] is None:
+    if run.difference is None:
         return True
-    return run["first_miss"] is not None and run["first_miss"] <= run["difference"]["tick"]
+    return run.first_miss is not None and run.first_miss <= run.difference.tick
 
 
-def _run_row(run: Document) -> tuple[str, ...]:
-    difference = run["difference"]
+def _run_row(run: ComparedRun) -> tuple[str, ...]:
+    difference = run.difference
     return (
-        text(run["run"]),
-        run["mode"],
-        f"{run['wall_s']:.2f}",
-        str(run["messages"]),
-        str(run["missed"]),
-        "-" if run["first_miss"] is None else str(run["first_miss"]),
-        "-" if difference is None else str(difference["tick"]),
-        "-" if difference is None else code(difference["mailbox"]),
-        code(run["digest"][:12]),
+        text(run.run),
+        run.mode,
+        f"{run.wall_s:.2f}",
+        str(run.messages),
+        str(run.missed),
+        "-" if run.first_miss is None else str(run.first_miss),
+        "-" if difference is None else str(difference.tick),
+        "-" if difference is None else code(difference.mailbox),
+        code(run.digest[:12]),
     )
 
 
@@ -117,12 +123,12 @@ def _costs(workshop: Workshop) -> Side:
 def _costs_tested(findings: Findings) -> Assessment:
     """Compare the processor time of communication with what the less loaded processor takes off the
     other one."""
-    found = findings[NASREM.name]
+    found = findings.of(NASREM)
     rows = []
     communicates = 0.0
-    for level, parts in found["phases"].items():
+    for level, parts in found.phases.items():
         comm_us = sum(parts[name]["p50"] for name in ("exchange", "read", "write"))
-        rate_hz = 1e3 / found["tasks"][level]["slice_ms"]
+        rate_hz = 1e3 / found.tasks[level].slice_ms
         communicates += comm_us * rate_hz * 1e-6
         both = comm_us + parts["process"]["p50"]
         rows.append(
@@ -134,7 +140,7 @@ def _costs_tested(findings: Findings) -> Assessment:
                 f"{comm_us * rate_hz * 1e-3:.1f}",
             )
         )
-    saved = min(found["loads"].values()) if len(found["loads"]) > 1 else 0.0
+    saved = min(found.loads.values()) if len(found.loads) > 1 else 0.0
     head = (
         "level",
         "t<sub>exec</sub>, us",
@@ -142,7 +148,7 @@ def _costs_tested(findings: Findings) -> Assessment:
         "communication, % of both",
         "communication, ms a second",
     )
-    loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found["loads"].items())
+    loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found.loads.items())
     side = Side.of(
         Columns(head, rows, f"Medians of a run. Processor time of all tasks, ms a second: {loads}.")
     )

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
-from pydantic import TypeAdapter
-
-from rack.tools.lab.reproduction.experiments.experiment import Document, Experiment, Kept, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import (
+    Document,
+    Experiment,
+    Found,
+    Kept,
+    Workshop,
+)
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     PageClaim,
@@ -18,8 +22,6 @@ from rack.tools.lab.reproduction.sections.page import (
     text,
 )
 
-_Record = TypeVar("_Record")
-
 
 @dataclass(frozen=True)
 class Findings:
@@ -28,12 +30,9 @@ class Findings:
     found: Mapping[str, Document]
     workshop: Workshop
 
-    def __getitem__(self, name: str) -> Document:
-        return self.found[name]
-
-    def record(self, name: str, kind: type[_Record]) -> _Record:
-        """Return what an experiment has found as the record that it was written from."""
-        return TypeAdapter(kind).validate_python(self.found[name])
+    def of(self, experiment: Experiment[Found]) -> Found:
+        """Return what an experiment has found."""
+        return experiment.record(self.found[experiment.name])
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Statement:
     name: str
     title: str
     quote: str
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[Experiment[Any], ...]
     predicted: Callable[[Workshop], Side]
     tested: Callable[[Findings], Assessment]
     equation: str = ""
@@ -92,7 +91,7 @@ class Chapter:
     statements: tuple[Statement, ...]
 
     @property
-    def experiments(self) -> tuple[Experiment, ...]:
+    def experiments(self) -> tuple[Experiment[Any], ...]:
         """All experiments that it needs, each once."""
         return tuple(
             {

@@ -21,27 +21,27 @@ def _goto(workshop: Workshop) -> Side:
 
 
 def _goto_tested(findings: Findings) -> Assessment:
-    soft, early, met = findings[DEADLINE.name]["runs"]
+    found = findings.of(DEADLINE)
+    early = found.early
+    met = found.met
     rows = [
         (
-            {None: "GOTO A, GOTO B"}.get(one["by_s"], f"GOTO A BY {one['by_s']} s, GOTO B"),
-            "never" if one["done_s"] is None else f"{one['done_s']:g}",
-            "yes" if one["moved"] else "no",
-            text(one["cause"]),
-            text(one["reason"]) or "-",
+            "GOTO A, GOTO B" if one.by_s is None else f"GOTO A BY {one.by_s} s, GOTO B",
+            "never" if one.done_s is None else f"{one.done_s:g}",
+            "yes" if one.moved else "no",
+            text(one.cause),
+            text(one.reason) or "-",
         )
-        for one in (soft, early, met)
+        for one in (found.soft, early, met)
     ]
     head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
-    side = Side.of(
-        Columns(head, rows, f"At A: {findings[DEADLINE.name]['place']} m. Runs in lockstep.")
-    )
-    is_refused = early["done_s"] is None and not early["moved"]
-    is_met = met["done_s"] is not None and met["done_s"] <= met["by_s"]
+    side = Side.of(Columns(head, rows, f"At A: {list(found.place)} m. Runs in lockstep."))
+    is_refused = early.done_s is None and not early.moved
+    is_met = met.done_s is not None and met.by_s is not None and met.done_s <= met.by_s
     if is_refused and is_met:
         why = (
-            f"By {early['by_s']:g} s is refused before anything moves; by {met['by_s']:g} s is"
-            f" promised, and done at {met['done_s']:g} s. Without a time nothing is promised."
+            f"By {early.by_s:g} s is refused before anything moves; by {met.by_s:g} s is"
+            f" promised, and done at {met.done_s:g} s. Without a time nothing is promised."
         )
         return Assessment(side, Ruling.HOLDS, why)
     return Assessment(

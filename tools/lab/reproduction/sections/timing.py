@@ -160,20 +160,20 @@ SMALL = PaperEquation(
 
 def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
     """Judge eq. 3.3: the sum, and what waiting for the next read adds to it."""
-    found = findings[NASREM.name]
-    response = found["response"]
+    found = findings.of(NASREM)
+    response = found.response
     verdicts = measured_of(equation.number, found)
-    sum_ms = response["sum_eq_3_3_ms"]
+    sum_ms = response.sum_eq_3_3_ms
     rows = [
         (
-            {"command": "command, down", "status": "status, up"}[way],
+            name,
             f"{sum_ms:g}",
-            f"{response[way]['bound_ms']:g}",
-            f"{response[way]['measured_ms']['p50']:g}",
-            f"{response[way]['measured_ms']['max']:g}",
-            f"{response['bound_eq_3_2_ms']:g}",
+            f"{way.bound_ms:g}",
+            f"{way.measured_ms['p50']:g}",
+            f"{way.measured_ms['max']:g}",
+            f"{response.bound_eq_3_2_ms:g}",
         )
-        for way in ("command", "status")
+        for name, way in (("command, down", response.command), ("status, up", response.status))
     ]
     head = (
         "",
@@ -184,12 +184,12 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         "n R<sub>max</sub>",
     )
     side = Side.of(
-        f"Along {' → '.join(response['levels'])}, ms:", Columns(head, rows), table_of(verdicts)
+        f"Along {' → '.join(response.levels)}, ms:", Columns(head, rows), table_of(verdicts)
     )
-    longest = max(response[way]["measured_ms"]["max"] for way in ("command", "status"))
-    if not all(verdict["holds"] for verdict in verdicts):
-        late = sum(len(response[way]["beyond"]) for way in ("command", "status"))
-        if late and found["missed"] + found["skipped"]:
+    longest = max(way.measured_ms["max"] for way in (response.command, response.status))
+    if not all(pair.measured.holds for pair in verdicts):
+        late = len(response.command.beyond) + len(response.status.beyond)
+        if late and found.missed + found.skipped:
             why = (
                 f"{late} responses exceeded the sum with its waits, after missed cycles."
                 f" {stolen(found)}"
@@ -213,17 +213,17 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
 
 def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
     own = judged(equation, findings)
-    found = findings[NASREM.name]
+    found = findings.of(NASREM)
     rows = [
         (
             name,
-            f"{task['slice_ms']:g}",
-            f"{task['used_ms']['p50']:.3f}",
-            f"{task['used_ms']['max']:.3f}",
-            f"{task['deviation_ms']:.3f}",
+            f"{task.slice_ms:g}",
+            f"{task.used_ms['p50']:.3f}",
+            f"{task.used_ms['max']:.3f}",
+            f"{task.deviation_ms:.3f}",
         )
-        for name, task in found["tasks"].items()
-        if task["role"] == "executor"
+        for name, task in found.tasks.items()
+        if task.role == "executor"
     ]
     head = (
         "level",
@@ -233,7 +233,7 @@ def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         "standard deviation of the residual",
     )
     plate = Plate(
-        Path(found["pictures"]["residuals"]),
+        Path(found.pictures["residuals"]),
         "What the cycles of each level used of R<sub>i</sub>, and &alpha;.",
     )
     return Assessment(Side.of(*own.measured.items, Columns(head, rows), plate), own.ruling, own.why)
