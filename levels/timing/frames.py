@@ -121,7 +121,7 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
         groups, times, [*groups[1:], []], times[1:], strict=False
     ):
         begins = release
-        for task, after in zip(group, [*group[1:], *following[:1], None], strict=False):
+        for task, after in zip(group, [*group[1:], *following, None], strict=False):
             is_last = task is group[-1]
             end, done = _worked(work[task.name, release], task, limit)
             yield FramePlace(

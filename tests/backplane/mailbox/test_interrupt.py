@@ -228,3 +228,32 @@ def test_between_tasks_of_one_slot_nothing_is_interrupted(make_bus: MakeBus) -> 
     writer, reader = InterruptWriter(segment, "first.point"), open_reader(segment, "first.point")
     writer.write(0)
     assert [reader.read(tick).verdict for tick in (0, 1)] == [Verdict.NONE, Verdict.NEW]
+
+
+def test_a_message_lost_at_its_sender_is_noticed_before_the_next(make_bus: MakeBus) -> None:
+    board = Board(make_bus(*boxes(), *tasks()))
+    board.send(0, "first")
+    assert board.read(1) == {"first": 0}
+    board.writers["first"].lose()
+    assert board.read(2) == {}
+    assert board.readers["first"].found == 2
+    assert board.inbox.count == 1
+
+
+def test_a_message_that_is_overwritten_while_it_is_judged_raises_no_interrupt_yet(
+    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = Board(make_bus(*boxes(), *tasks()))
+    slots = board.inbox.lines["first.point"]._slots
+    copy = slots.copy
+    board.send(0, "first")
+    assert board.read(1) == {"first": 0}
+    board.writers["first"].close()
+    board.writers["first"] = InterruptWriter(board.segment, "first.point")
+    board.send(1, "first")
+    monkeypatch.setattr(slots, "copy", lambda serial: False)
+    board.read(2)
+    assert (board.inbox.count, board.readers["first"].found) == (1, 2)
+    monkeypatch.setattr(slots, "copy", copy)
+    board.read(3)
+    assert board.inbox.count == 2

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Demand
-from rack.boards.config.resolved import Resolved, resolve
+from rack.boards.config.resolved import Resolved, load, resolve
 from rack.boards.errors import ConfigError, LaunchError
 from tests.boards.conftest import MakeConfig
 
@@ -94,3 +95,20 @@ def test_a_board_beside_a_broken_one_is_checked_and_so_is_what_is_of_no_board(
         config("board.wave.slot=99", "board.watch.executor=wave_levels:Nobody")
     found = {mistake.place for mistake in caught.value.mistakes}
     assert found == {"board.wave.slot", "board.watch.executor"}
+
+
+@pytest.mark.parametrize(
+    ("priorities", "expected"), [((50, 60), 49), ((50, 0), 49), ((1, 1), 0), ((0, 0), 0)]
+)
+def test_the_crate_is_below_every_real_time_executor(
+    small: Path, priorities: tuple[int, int], expected: int
+) -> None:
+    upper, lower = priorities
+    settings = [
+        "clock.mode=realtime",
+        f"board.upper.priority={upper}",
+        f"board.lower.priority={lower}",
+        # Planners do not count.
+        "board.lower.planner_priority=20" if lower > 20 else "board.lower.planner_priority=0",
+    ]
+    assert resolve(load(small, settings)).crate_priority == expected

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from rack.backplane.fault_table import NEVER
 from rack.boards.events import Event
 from rack.tools.faults.ending import EXTERNAL, Strike
-from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge
+from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, faults, judge
 from tests.tools.fault_events import LAYOUT, TICK_NS, box, event, flows, found, strike
 
 END = event(10_000, "end", "")
@@ -487,3 +487,22 @@ def test_a_fault_of_the_arm_that_is_found_has_struck_however_slight_it_was() -> 
     after = strike("actuator-off", "lower", 156, 170, place=1, joint="elbow")
     first, second = verdict([slight, after], found(160, "actuator", "lower", "elbow")).faults
     assert (first.seen, second.seen, second.delay) == ("not struck", "detected", 4)
+
+
+def test_faults_are_listed_as_they_struck_and_those_that_never_did_last() -> None:
+    late, never, first = (
+        strike("hang", "upper", 100, 200),
+        strike("mute", "lower", NEVER, NEVER),
+        strike("hang", "lower", 0, 50),
+    )
+    outcome = {
+        "kind": "outcome",
+        "outcome": {},
+        "faults": [asdict(one) for one in (late, never, first)],
+    }
+    found = faults([outcome], LAYOUT)["faults"]
+    assert [(one["kind"], one["board"], one["struck"]) for one in found] == [
+        ("hang", "lower", 0),
+        ("hang", "upper", 100),
+        ("mute", "lower", never.tick),
+    ]

@@ -358,6 +358,11 @@ def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(
     assert str(mistake).startswith(f"{place}: {why}")
 
 
+def test_a_host_board_depends_on_timing() -> None:
+    (mistake,) = [m for m in mistakes("penn", "protocol.strict=true") if m.place.startswith("host")]
+    assert str(mistake).endswith("strict = true; permitted: boards with a rate")
+
+
 PARAMS = {
     "unknown": ("fig2", "level.params.proces_ms=1", "= 1: unknown key; did you mean 'process_ms'?"),
     "of nothing known": (

@@ -97,7 +97,7 @@ class FigureRun:
 
     tasks: dict[str, Count]
     patterns: dict[str, tuple[tuple[tuple[str, int], ...], ...]]
-    steal: dict[int, float]
+    steal: dict[str, float]
     pictures: dict[str, str]
 
     def late(self, task: str) -> float:

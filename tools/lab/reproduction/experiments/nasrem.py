@@ -110,7 +110,7 @@ class NasremRun:
     ticks: int
     missed: int
     skipped: int
-    steal: dict[int, float]
+    steal: dict[str, float]
     pairs: tuple[JudgedPair, ...]
     breaches: dict[str, int]
     tasks: dict[str, TaskCycles]
