@@ -116,7 +116,7 @@ class Import:
         self._is_away = bool(self._box[self._word] & 1)
         self._losses = peer.losses
         self._rate_hz = table.rate_hz
-        self.every = 1
+        self.every: int
         self._basis: int | None = None
         # What came before its time, with the tick at which it came.
         self._early: list[tuple[int, Arrived]] = []

@@ -288,3 +288,22 @@ def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:
     del tables["board"]
     with pytest.raises(ConfigError, match=r"^board: missing; boards by name"):
         loads(to_toml(tables))
+
+
+@pytest.mark.slow
+def test_what_an_operator_commands_stays_in_its_rack(tmp_path: Path) -> None:
+    path = tmp_path / "arm.toml"
+    table = '[adapter.lan]\nslot = 12\nlisten = ["tcp/127.0.0.1:7447"]\npeers = ["b"]\n'
+    entry = '[adapter.lan.export.out]\nrate_hz = 10\nfrom = "{}"\n'
+    for source, expected in (("servo.operator", True), ("elemental_move.status", False)):
+        path.write_text(
+            f'format = 2\nname = "arm"\nextends = ["nasrem"]\n{table}{entry.format(source)}'
+        )
+        found: list[str] = []
+        try:
+            resolve(load(path))
+        except ConfigError as error:
+            found = str(error).splitlines()
+        said = [line for line in found if line.startswith("adapter.lan.export.out.from = ")]
+        why = "what an operator commands stays in its rack; permitted: mailboxes that levels write"
+        assert [line.endswith(why) for line in said] == [True] * expected
