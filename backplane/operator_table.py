@@ -188,7 +188,8 @@ class OperatorTable:
         words[RequestWord.HAS_CLIENT] = has_client
         words[RequestWord.MAILBOX] = request.mailbox
         words[RequestWord.TICK] = request.tick
-        words[RequestWord.SERIAL], words[RequestWord.GIVEN_TICK] = 0, -1
+        words[RequestWord.SERIAL] = 0
+        words[RequestWord.GIVEN_TICK] = -1
         entry.message[: len(request.message)] = request.message
         # From here the clock may issue it.
         words[RequestWord.STAGE] = RequestStage.WAITING

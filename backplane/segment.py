@@ -127,7 +127,8 @@ class Segment:
     def _fill_head(self, texts: list[bytes]) -> None:
         address = self.map.size
         for at, text in zip((Head.LAYOUT_AT, Head.CONFIG_AT), texts, strict=True):
-            self.words[at], self.words[at + 1] = address, len(text)
+            self.words[at] = address
+            self.words[at + 1] = len(text)
             self.bytes[address : address + len(text)] = text
             address += len(text)
         for process in self.layout.processes:
@@ -139,10 +140,8 @@ class Segment:
         self.words[Head.SIZE] = len(self.bytes)
         self.words[Head.LAUNCHER_PID] = os.getpid()
         self.words[Head.LAUNCHER_START] = start_time(os.getpid())
-        self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS] = (
-            time.time_ns(),
-            time.monotonic_ns(),
-        )
+        self.words[Head.CREATED_NS] = time.time_ns()
+        self.words[Head.CREATED_MONOTONIC_NS] = time.monotonic_ns()
         # Last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
 

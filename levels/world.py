@@ -87,7 +87,8 @@ class WorldModel(Executor):
             return
         scene: Message = read.scene.value
         if self._seen_tick < 0:
-            self._last[:, :3], self._last[:, 3:] = scene.position, scene.quaternion
+            self._last[:, :3] = scene.position
+            self._last[:, 3:] = scene.quaternion
             self._rest[:] = self._last
             model.revision = tick + 1
         else:
@@ -131,14 +132,18 @@ def find_motion(
             or turn(quaternion[body], rest[body]) > turned
         )
         if moving[body] and slow_s[body] >= resting:
-            rest[body, :3], rest[body, 3:] = position[body], quaternion[body]
-            moving[body], changed = False, True
+            rest[body, :3] = position[body]
+            rest[body, 3:] = quaternion[body]
+            moving[body] = False
+            changed = True
         elif not moving[body] and away:
-            moving[body], changed = True, True
+            moving[body] = True
+            changed = True
         velocity[body] = 0.0
         if moving[body]:
             velocity[body] = (position[body] - last[body, :3]) / elapsed_s
-        last[body, :3], last[body, 3:] = position[body], quaternion[body]
+        last[body, :3] = position[body]
+        last[body, 3:] = quaternion[body]
     return changed
 
 

@@ -173,7 +173,8 @@ class RealtimeDriver(ClockDriver):
 
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         super().__init__(segment, ended, alarms)
-        self._epoch_ns, self._period_ns = self.words[System.EPOCH_NS], self.words[System.PERIOD_NS]
+        self._epoch_ns = self.words[System.EPOCH_NS]
+        self._period_ns = self.words[System.PERIOD_NS]
         leads = any(task.sleeps for task in self.tasks)
         self._woke_ns = 0
         self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_PART) if leads else 0

@@ -56,7 +56,8 @@ def ticks_of(
 
     `of`: the text's words for the grid and for one step of it.
     """
-    clock_hz, (grid, step) = 1e9 / clock_ns, of
+    clock_hz = 1e9 / clock_ns
+    grid, step = of
     if not rate_hz > 0:
         raise ClockError(
             f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole"

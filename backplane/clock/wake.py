@@ -57,7 +57,8 @@ class NextCycle:
         """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an
         alarm there."""
         self._spec = spec = segment.layout.task(task)
-        self._words, self._block = segment.words, segment.block(task)
+        self._words = segment.words
+        self._block = segment.block(task)
         self._semaphore = wake_semaphore(segment.rack, task)
         self._launcher = segment.words[Head.LAUNCHER_PID], segment.words[Head.LAUNCHER_START]
         is_lockstep = bool(segment.words[System.LOCKSTEP])

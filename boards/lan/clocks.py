@@ -238,7 +238,8 @@ class Clocks:
             clock.begin()
         for _ in range(len(self._arrived)):
             is_taken = self._is_taken(*self._arrived.popleft())
-            self.taken, self.refused = self.taken + is_taken, self.refused + (not is_taken)
+            self.taken = self.taken + is_taken
+            self.refused = self.refused + (not is_taken)
         self._now_ns = now = monotonic_ns()
         for rack, clock in self._clocks.items():
             if clock.peer.is_there and now >= clock.due_ns:

@@ -107,7 +107,8 @@ class Import:
         dtype = message_dtype(spec.fields, spec.size)
         self._kind = kind_of(spec.message, spec.version, dtype)
         self._is_proper = ProperContent(spec.fields)
-        self._buffer, self._key = Message(dtype), out_key(table.rack, table.mailbox)
+        self._buffer = Message(dtype)
+        self._key = out_key(table.rack, table.mailbox)
         self._max_age = spec.max_age
         self._delay = spec.delay
         self._peer = peer
@@ -149,7 +150,8 @@ class Import:
                 self._switch(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def _switch(self, is_away: bool, tick: int) -> None:
-        self._is_away, self._box[self._word] = is_away, switch(tick, is_away)
+        self._is_away = is_away
+        self._box[self._word] = switch(tick, is_away)
 
     def exchange(self, out: Message, tick: int) -> None:
         """Take what has come, and pass the newest good message on."""

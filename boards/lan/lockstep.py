@@ -99,7 +99,9 @@ class Barrier:
         self, segment: Segment, board: str, racks: Iterable[str], lost: Iterable[str]
     ) -> None:
         """Step with `racks`, except those that an adapter before this one has `lost`."""
-        self._segment, self._words, self._block = segment, segment.words, segment.block(board)
+        self._segment = segment
+        self._words = segment.words
+        self._block = segment.block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
         for rack in lost:
             self._partners[rack].is_out = True
@@ -127,7 +129,9 @@ class Barrier:
 
     def open(self, link: LanLink, launch: int) -> None:
         """Listen to the others. Call it before this launch shows that it is there."""
-        self._rack, self._launch, self._sealer = link.rack, launch, link.sealer.taking(MOST_STEP)
+        self._rack = link.rack
+        self._launch = launch
+        self._sealer = link.sealer.taking(MOST_STEP)
         self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
         # Called by a thread of the network: it wakes the cycle that waits, and does no more.

@@ -104,7 +104,8 @@ class VirtualControlLoop(Task):
         """Note a pause in reading, in the first cycle too; in one that begins late, check the
         clock."""
         if self.next_cycle.skipped or not self._has_cycled:
-            self.inputs.task.since, self._has_cycled = tick, True
+            self.inputs.task.since = tick
+            self._has_cycled = True
         if self._guard is not None:
             self._guard.check_release(tick)
 

@@ -30,7 +30,8 @@ class InterruptHandler:
     that are lost."""
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
-        self._inbox, self._block = inbox, segment.block(task)
+        self._inbox = inbox
+        self._block = segment.block(task)
         clock = SystemClock(segment)
         self._takes_time = not clock.is_lockstep
         self._lines = [

@@ -25,7 +25,8 @@ class LimitMonitor:
         self._names = [
             cell.model.joint(int(joint)).name for joint in cell.model.dof_jntid[cell.dof]
         ]
-        self._seen, (self._low, self._high) = steps.seen, steps.judged[:2]
+        self._seen = steps.seen
+        (self._low, self._high) = steps.judged[:2]
         self.count = 0  # steps in which the drives broke a limit
         # steps in which a blow broke a limit of position or velocity: no drive can prevent it
         self.pushed = 0

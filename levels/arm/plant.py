@@ -39,7 +39,8 @@ class Plant:
             None  # last message filled, with what seldom changes
         )
         self._data = cell.start()
-        self._poses, self._fill = poses(cell, self._data), show.load()
+        self._poses = poses(cell, self._data)
+        self._fill = show.load()
 
     def _show(self, scene: Message) -> None:
         """Fill a `SCENE` from `_data`."""

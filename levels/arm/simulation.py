@@ -60,7 +60,8 @@ class Simulation(Plant):
             for body, name in zip(cell.bodies, scene.objects, strict=False)
             if (pushes := tuple(push for push in scene.push if push.body == name))
         ]
-        self._advance, self._copy_state = advance.load(), copy_state.load()
+        self._advance = advance.load()
+        self._copy_state = copy_state.load()
         # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the
         # working directory.
         mujoco.set_mju_user_warning(lambda _: None)
@@ -69,7 +70,8 @@ class Simulation(Plant):
         """Take positions and velocities of the joints from MuJoCo's state, after it was set other
         than by a step."""
         position, velocity = self._state
-        position[:], velocity[:] = self._data.qpos[self.cell.qpos], self._data.qvel[self.cell.dof]
+        position[:] = self._data.qpos[self.cell.qpos]
+        velocity[:] = self._data.qvel[self.cell.dof]
 
     def named(self, contact: tuple[int, int]) -> str:
         """Return a `contact` in words: the names of the geoms."""
@@ -89,7 +91,8 @@ class Simulation(Plant):
         super().restore(state)
         mujoco.mj_setState(self._model, self._data, state.state, STATE)
         self._contacts.count = state.touches
-        self._limits.count, self._limits.pushed = state.violations, state.pushed
+        self._limits.count = state.violations
+        self._limits.pushed = state.pushed
         self._refresh()
 
     @property
@@ -115,7 +118,8 @@ class Simulation(Plant):
     def _look_closer(self, made: int) -> None:
         """Finish a tick in which step `made` failed a check; on a fault, restore the state before
         the tick."""
-        touches, self._contacts.struck = self._contacts.count, self.contact
+        touches = self._contacts.count
+        self._contacts.struck = self.contact
         self._contacts.look(self._data)
         while made < len(self._steps.seen):
             made = self._advance(made, self._after_s, *self._steps)

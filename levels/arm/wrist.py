@@ -40,8 +40,10 @@ class WristSensor:
     def __init__(self, wrist: Wrist, data: mujoco.MjData, seed: int) -> None:
         self._numbers = data.sensordata
         self._places = wrist.addresses
-        self._noise, self._range = np.repeat(wrist.noise, 3), np.repeat(wrist.range, 3)
-        self._seed, self._uniform = seed + STREAM, uniform.load()
+        self._noise = np.repeat(wrist.noise, 3)
+        self._range = np.repeat(wrist.range, 3)
+        self._seed = seed + STREAM
+        self._uniform = uniform.load()
 
     def sample(self, tick: int) -> Array:
         """Return force, N, and torque, N m, in the sensor's frame, (6,), of the last step before
@@ -62,7 +64,9 @@ class ContactWrench:
 
     def __init__(self, cell: Cell, wrist: Wrist, dynamics: Dynamics) -> None:
         """Use `dynamics` of the cell, the arm's: an evaluation at the same state costs nothing."""
-        self._dynamics, self._range, joints = dynamics, np.repeat(wrist.range, 3), len(cell.dof)
+        self._dynamics = dynamics
+        self._range = np.repeat(wrist.range, 3)
+        joints = len(cell.dof)
         self.raw = np.zeros(AXES)  # (6,), N, N m: as sensed, in the sensor's frame
         self.wrench = np.zeros(
             AXES

@@ -196,7 +196,8 @@ class SegmentWindow:
         """Hand down a motion of the gripper to `opening`, m or rad, with at most `force`, N or N
         m."""
         segment = self._add(move, SegmentKind.GRIPPER)
-        segment["opening"], segment["force"] = opening, force
+        segment["opening"] = opening
+        segment["force"] = force
 
     def end(self) -> Array | None:
         """Return the last waypoint (joints,) of the newest path in the window; None: there is
@@ -210,12 +211,15 @@ class SegmentWindow:
         segment = self._segments[self.count]
         self._command.count = self.count + 1
         self._command.id = segment["id"] = int(self._command.id) + 1
-        segment["move"], segment["kind"], segment["object"] = move["id"], kind, move["object"]
+        segment["move"] = move["id"]
+        segment["kind"] = kind
+        segment["object"] = move["object"]
         return segment
 
     def _lay(self, segment: Any, plan: Message) -> None:
         segment["count"] = plan.count
-        segment["waypoints"], segment["blend"] = plan.waypoints, plan.blend
+        segment["waypoints"] = plan.waypoints
+        segment["blend"] = plan.blend
 
     def _blank(self) -> None:
         """Clear the unused segments, so that equal windows have equal bytes."""

@@ -142,7 +142,8 @@ class BlendedPath:
             elif corner < last and norm(self._changes[corner]) > MAX_STRAIGHT_BEND:
                 self.stops.append(self._starts[corner])
         if not self._pieces:
-            self._pieces, self._breaks = [(-1, -1)], [0.0, self.length]
+            self._pieces = [(-1, -1)]
+            self._breaks = [0.0, self.length]
         self.breaks = np.array(
             self._breaks
         )  # (pieces + 1,), rad: s where each piece begins, and the end

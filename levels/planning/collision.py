@@ -105,7 +105,8 @@ class CollisionChecker:
     ) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
         self.held = row
-        self._offset[:3], self._offset[3:] = position, quaternion
+        self._offset[:3] = position
+        self._offset[3:] = quaternion
         self._model.geom_contype[:] = self._contype
         if row is not None:
             self._model.geom_contype[self._row_geoms[row]] = 1
@@ -120,7 +121,8 @@ class CollisionChecker:
     def free(self, q: Array, clearance: float | None = None) -> bool:
         """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may
         lower the scene's."""
-        self._q[:], self._least = q, np.inf if clearance is None else float(clearance)
+        self._q[:] = q
+        self._least = np.inf if clearance is None else float(clearance)
         return self._is_free(
             -1 if self.held is None else self.cell.object_qpos[self.held], self._least
         )

@@ -47,10 +47,14 @@ class Move(NamedTuple):
 
     def write_to(self, record: Any) -> None:
         """Fill one element of an array of `ELEMENTAL_MOVE`."""
-        record["id"], record["action"], record["verb"] = self.id, self.action, self.verb
+        record["id"] = self.id
+        record["action"] = self.action
+        record["verb"] = self.verb
         record["object"] = -1 if self.object is None else self.object
         record["position"], record["quaternion"] = self.tool
-        record["joints"], record["posture"], record["by"] = self.joints, self.posture, self.by_s
+        record["joints"] = self.joints
+        record["posture"] = self.posture
+        record["by"] = self.by_s
 
 
 def read_move(record: Any) -> Move:

@@ -185,7 +185,8 @@ class SampledSearch:
         points = [[state[j] for j in range(len(start))] for state in path.getStates()]
         polyline = np.array(points) / self._weights
         # Scaling there and back rounds: restore the exact ends.
-        polyline[0], polyline[-1] = start, goal
+        polyline[0] = start
+        polyline[-1] = goal
         return polyline, count
 
     def _space(

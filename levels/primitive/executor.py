@@ -109,7 +109,8 @@ class PrimitiveExecutor(Executor):
         """Read command, status, plan and world model; write the next set point and this level's
         status."""
         if self._tick is None:
-            self._tick, self._memory = tick - self.context.every, recall(read)
+            self._tick = tick - self.context.every
+            self._memory = recall(read)
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
         servo = read.status.value
@@ -202,7 +203,8 @@ class PrimitiveExecutor(Executor):
             return True
         if isinstance(self._work, PathWork) and self._memory is not None:
             # Messages may arrive out of order: a withdrawn segment may return, and then continues.
-            self._memory.interrupted, self._memory.progress = serial, self._work.progress
+            self._memory.interrupted = serial
+            self._memory.progress = self._work.progress
         self._work = None
         self._fault = None
         return False
@@ -273,7 +275,8 @@ class PrimitiveExecutor(Executor):
         command.due = self._due(tick) if in_step else 0
         set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
-        command.velocity[:], command.acceleration[:] = set_point.velocity, set_point.acceleration
+        command.velocity[:] = set_point.velocity
+        command.acceleration[:] = set_point.acceleration
         if memory is not None:
             command.opening = memory.opening
             command.force = memory.force

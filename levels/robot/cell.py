@@ -141,10 +141,8 @@ def index(
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
     wrist = find_wrist(model, robot.wrist, moved)
     data = mujoco.MjData(model)
-    data.qpos[model.jnt_qposadr[joints]], data.qvel[model.jnt_dofadr[joints]] = (
-        robot.home,
-        robot.velocity,
-    )
+    data.qpos[model.jnt_qposadr[joints]] = robot.home
+    data.qvel[model.jnt_dofadr[joints]] = robot.velocity
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_energyVel(model, data)
     return Cell(

@@ -91,13 +91,15 @@ class Dynamics:
         gravity = np.array(self._model.opt.gravity)
         jacobians = np.zeros((2, 3, cell.model.nv))
         self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, given
-        self._evaluate, self._carry = evaluate.load(), carry.load()
+        self._evaluate = evaluate.load()
+        self._carry = carry.load()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
         """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until
         the next call."""
-        self._position[:], self._velocity[:] = q, qd
+        self._position[:] = q
+        self._velocity[:] = qd
         self._evaluate(*self._evaluating)
         if payload is not None and payload.mass > 0.0:
             self._offset[:] = payload.offset

@@ -96,7 +96,8 @@ class _Solver:
         carried[motors] = carried[joint] = False
         self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
         follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
-        self._follow, self._loose = follow, np.ones(len(follow), dtype=bool)
+        self._follow = follow
+        self._loose = np.ones(len(follow), dtype=bool)
         self.driven = int(model.jnt_qposadr[joint])
         self.joints = model.jnt_qposadr[follow].astype(int)
         self._dof = model.jnt_dofadr[follow]

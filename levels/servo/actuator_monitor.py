@@ -218,14 +218,18 @@ def left_over(
         most = dry[j] * math.tanh(fastest / FRICTION_SPEED + TURNING)
         left -= min(max(left, least), most)
         # Set, N m: what is left over, what of it may be noise, least and most friction.
-        table[8, j], table[9, j], table[10, j], table[11, j] = left, unsure, least, most
+        table[8, j] = left
+        table[9, j] = unsure
+        table[10, j] = least
+        table[11, j] = most
         if abs(left) > unsure:
             verdict = max(verdict, LEFT_OVER)
         if abs(wanted[0, j] - position[j]) - off[j] > following:
             verdict = ASTRAY
     for j in range(len(velocity)):
         table[12, j] = velocity_before[j]
-        velocity_before[j], bias_before[j] = velocity[j], bias[j]
+        velocity_before[j] = velocity[j]
+        bias_before[j] = bias[j]
         for k in range(len(velocity)):
             inertia_before[j, k] = inertia[j, k]
     return verdict

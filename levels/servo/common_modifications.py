@@ -117,9 +117,12 @@ class Notch(Modification):
 
     def modify(self, sample: LawSample) -> None:
         """Filter the torque."""
-        (now, one, two), (back_one, back_two) = self._feed, self._back
+        now, one, two = self._feed
+        back_one, back_two = self._back
         made = now * sample.torque + one * self._given[0] + two * self._given[1]
         made -= back_one * self._made[0] + back_two * self._made[1]
-        self._given[1], self._made[1] = self._given[0], self._made[0]
-        self._given[0], self._made[0] = sample.torque, made
+        self._given[1] = self._given[0]
+        self._made[1] = self._made[0]
+        self._given[0] = sample.torque
+        self._made[0] = made
         sample.torque = made

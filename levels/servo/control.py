@@ -93,8 +93,10 @@ class ComputedTorque:
         """Use `dynamics` of the cell: the arm's, which saves its limit gate another evaluation."""
         self._dynamics = dynamics
         table = np.zeros((5, len(cell.dof)))  # in the rows of `set_torque`
-        table[0], table[1] = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
-        table[2], table[3] = dynamics.dry, cell.bounds.torque
+        table[0] = params.bandwidth**2
+        table[1] = 2.0 * params.damping * params.bandwidth
+        table[2] = dynamics.dry
+        table[3] = cell.bounds.torque
         self._torque: Array = table[4]
         self._set = partial(set_torque.load(), table)
         self.holds = False  # the gripper holds a part, says the plan

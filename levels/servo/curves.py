@@ -61,7 +61,9 @@ def set_motion(
     accelerates = time_s + ahead_s < ends_s
     for j in range(table.shape[1]):
         if not moves:
-            motion[0, j], motion[1, j], motion[2, j] = table[REST, j], 0.0, 0.0
+            motion[0, j] = table[REST, j]
+            motion[1, j] = 0.0
+            motion[2, j] = 0.0
             continue
         c0 = table[0, j]
         c1 = table[1, j]

@@ -248,7 +248,9 @@ class ArmDriver(Executor):
         refused = self._link.drive(*self.torques(wanted, sensed, terms))
         if refused is not None:
             return self._refuse(refused, tick)
-        self._wanted, self.abandoned, self.stopping.refused = wanted.table, False, None
+        self._wanted = wanted.table
+        self.abandoned = False
+        self.stopping.refused = None
         return self.motors.begin()
 
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
@@ -357,9 +359,9 @@ def show(
         for row in range(3):
             state[row * joints + j] = estimate[row, j]
         for row in range(2):
-            status[row * joints + j], status[(3 + row) * joints + j] = (
-                estimate[row, j],
-                wanted[row, j],
-            )
+            status[row * joints + j] = estimate[row, j]
+            status[(3 + row) * joints + j] = wanted[row, j]
         status[2 * joints + j] = begun[j] = torque[j]
-    status[-3], status[-2], status[-1] = opening, opening_velocity, grip_force
+    status[-3] = opening
+    status[-2] = opening_velocity
+    status[-1] = grip_force

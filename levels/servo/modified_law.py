@@ -155,7 +155,9 @@ class ModifiedLaw:
         sample.tick = given.tick
         sample.inertia = given.inertia
         sample.load = given.load
-        sample.seen[:3], sample.seen[3:], sample.torque[:] = given.motion.table, given.state, np.nan
+        sample.seen[:3] = given.motion.table
+        sample.seen[3:] = given.state
+        sample.torque[:] = np.nan
         seen, torque = self._kept
         for one in self._before:
             self._act(one, sample.seen, seen)

@@ -58,7 +58,8 @@ class Reference:
             (2, 3, joints)
         )  # the one wanted, and its difference from the curve
         self._wanted = Motion(self._motions[0])
-        self._interpolate, self._admit = set_motion.load(), admit.load()
+        self._interpolate = set_motion.load()
+        self._admit = admit.load()
         self._command: Message | None = None  # the newest `JOINT_SET_POINT`
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
@@ -156,7 +157,8 @@ class Reference:
 
     def _advance(self, to: SetPoint, tick: int) -> None:
         """Begin the curve to the set point that waited: its time has come."""
-        (due, position, velocity), self._next = to, None
+        due, position, velocity = to
+        self._next = None
         if due <= tick:
             return
         begin = tick if self.holding else self._due

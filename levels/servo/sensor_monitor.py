@@ -83,11 +83,10 @@ class SensorMonitor:
         self._still, self._still_way, self._claimed = self._table[10:13]
         self._way, self._allowed, self._braking, self._fastest = self._table[13:17]
         self._fits, self._unchanged = self._table[17:]
-        self._braking[:], self._fastest[:] = (
-            cell.limits.acceleration,
-            BEYOND_SPEED * bounds.velocity,
-        )
-        self._room[:], self._speed_room[:] = FIT_RAD + 2.0 * encoders.off, encoders.speed_off
+        self._braking[:] = cell.limits.acceleration
+        self._fastest[:] = BEYOND_SPEED * bounds.velocity
+        self._room[:] = FIT_RAD + 2.0 * encoders.off
+        self._speed_room[:] = encoders.speed_off
         self._unshown[:] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
         self.position[:] = self._raw[0][:] = home
         self.fresh = True  # there is a sample of this cycle
@@ -100,7 +99,8 @@ class SensorMonitor:
         )  # joint, its reading and error, rad; no sample: -1, age in ticks, 0
         self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
         self._unproven = np.zeros(joints, dtype=bool)  # stuck, and without a change since
-        self._suspect, self._everyone = np.zeros(joints, dtype=bool), np.ones(joints, dtype=bool)
+        self._suspect = np.zeros(joints, dtype=bool)
+        self._everyone = np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
         self._check = partial(check.load(), self._table, self._coarse)
         self._tick: int | None = None
@@ -109,11 +109,9 @@ class SensorMonitor:
 
     def recall(self, state: Message) -> None:
         """Continue from the estimate in an `ARM_STATE`."""
-        self.position[:], self.velocity[:], self.doubt[:] = (
-            state.position,
-            state.velocity,
-            state.doubt,
-        )
+        self.position[:] = state.position
+        self.velocity[:] = state.velocity
+        self.doubt[:] = state.doubt
         self._tick = state.tick
 
     def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
@@ -174,7 +172,11 @@ class SensorMonitor:
 
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
-        q, qd, (last_q, last_qd), way, room = self._q, self._qd, self._raw, self._way, self._allowed
+        q = self._q
+        qd = self._qd
+        last_q, last_qd = self._raw
+        way = self._way
+        room = self._allowed
         finite = np.isfinite(q) & np.isfinite(qd)
         inside = (q >= self._low) & (q <= self._high)
         unchanged = (q == last_q) & (qd == last_qd)
@@ -329,7 +331,8 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     in_doubt = False
     at_rest = False
     for j in range(len(q)):
-        q[j], qd[j] = sensed[j], sensed_velocity[j]
+        q[j] = sensed[j]
+        qd[j] = sensed_velocity[j]
         at_rest = at_rest or (driven and qd[j] == velocity[j])
     for j in range(len(q)):
         change = qd[j] - velocity[j]

@@ -9,7 +9,6 @@ from tests.boards.conftest import CLOCK
 
 RESET = """
 [[row]]
-format = 2
 name = "reset"
 state = ["up", "down"]
 when = { new = "yes", command = "reset" }
@@ -18,7 +17,6 @@ do = ["take", "set"]
 status = "done"
 
 [[row]]
-format = 2
 name = "no such command"
 state = ["up", "down"]
 when = { new = "yes", command = ["none", "unknown"] }
@@ -30,7 +28,6 @@ SAW = f"""
 start = "up"
 {RESET}
 [[row]]
-format = 2
 name = "count up"
 state = "up"
 when = {{ new = "no", count = ["low", "between"] }}
@@ -39,7 +36,6 @@ do = ["count up"]
 status = "executing"
 
 [[row]]
-format = 2
 name = "turn"
 state = "up"
 when = {{ new = "no", count = "high" }}
@@ -48,7 +44,6 @@ do = ["count down"]
 status = "executing"
 
 [[row]]
-format = 2
 name = "count down"
 state = "down"
 when = {{ new = "no", count = ["high", "between"] }}
@@ -57,7 +52,6 @@ do = ["count down"]
 status = "executing"
 
 [[row]]
-format = 2
 name = "turn up"
 state = "down"
 when = {{ new = "no", count = "low" }}
@@ -69,7 +63,6 @@ SLOW = f"""
 start = "settling"
 {RESET.replace('["up", "down"]', '["settling", "resting"]').replace('next = "up"', 'next = "same"')}
 [[row]]
-format = 2
 name = "settle"
 state = "settling"
 else = true
@@ -78,7 +71,6 @@ do = []
 status = "idle"
 
 [[row]]
-format = 2
 name = "rest"
 state = "resting"
 else = true

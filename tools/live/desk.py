@@ -256,7 +256,8 @@ class _Patience:
         self._rack = rack
         self._words = rack.segment.words
         self._what = what
-        self._tick, self._changed = self._words[System.TICK], time.monotonic()
+        self._tick = self._words[System.TICK]
+        self._changed = time.monotonic()
         self._note_at: float | None = self._changed + NOTE_S
 
     def look_again(self) -> bool:

@@ -35,7 +35,8 @@ class RemoteRack:
     """
 
     def __init__(self, address: RackAddress, asker: Asker | None = None) -> None:
-        self.address, self._asker = address, asker or Asker.default()
+        self.address = address
+        self._asker = asker or Asker.default()
         self._racks = Questioner(address.at, self._asker)
         try:
             self._launch = self._racks.launch(address.rack)

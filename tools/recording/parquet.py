@@ -144,7 +144,8 @@ class SignalsFile:
             self._flush(mailbox)
 
     def _flush(self, mailbox: str) -> None:
-        blocks, self._waiting[mailbox] = self._waiting[mailbox], []
+        blocks = self._waiting[mailbox]
+        self._waiting[mailbox] = []
         if not blocks:
             return
         rows = np.concatenate(blocks)

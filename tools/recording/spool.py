@@ -186,7 +186,8 @@ class Spool:
                     b"".join(block.tobytes() for block in blocks), codec="zstd", asbytes=True
                 )
                 yield _FRAME.pack(place, rows, lost, len(packed), zlib.crc32(packed)) + packed
-                self._waiting[ring], self._lost[ring] = [], 0
+                self._waiting[ring] = []
+                self._lost[ring] = 0
 
     def remove(self) -> None:
         """Remove the spool: the parquet files are complete."""

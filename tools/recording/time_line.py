@@ -37,7 +37,8 @@ class RackGrid:
         self.recording = recording
         self.rack = recording.layout.rack
         self.is_lockstep = config.clock.mode == "lockstep"
-        self.clock_ns, self.period_ns = recording.layout.clock_ns, tick_ns(config)
+        self.clock_ns = recording.layout.clock_ns
+        self.period_ns = tick_ns(config)
         self.launch = recording.launch
         cycles = [rows for rows in recording.cycles.values() if len(rows)]
         if not cycles:

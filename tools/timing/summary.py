@@ -40,7 +40,8 @@ def summary_lines(
     yield from tightest(forecast.verdicts)
     system = forecast.system
     if system.levels:
-        down, up = system.command_ms, system.status_ms
+        down = system.command_ms
+        up = system.status_ms
         yield f"response: a command down {down:g} ms, a status up {up:g} ms"
     if arm is not None:
         yield (

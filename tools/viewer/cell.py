@@ -87,8 +87,11 @@ class Poses:
     of the tool."""
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
-        self._stream, self._cell, self._data = stream, cell, cell.start()
-        self._bodies, self._contacts = moving_bodies(cell.model), contacts_of(cell)
+        self._stream = stream
+        self._cell = cell
+        self._data = cell.start()
+        self._bodies = moving_bodies(cell.model)
+        self._contacts = contacts_of(cell)
         self._world = stream.frame(WORLD)
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
@@ -116,10 +119,8 @@ class Poses:
         for row, state in enumerate(block.messages["state"][chosen]):
             mujoco.mj_setState(model, data, np.ascontiguousarray(state), STATE)
             mujoco.mj_kinematics(model, data)
-            positions[row, : len(bodies)], quaternions[row, : len(bodies)] = (
-                data.xpos[bodies],
-                data.xquat[bodies],
-            )
+            positions[row, : len(bodies)] = data.xpos[bodies]
+            quaternions[row, : len(bodies)] = data.xquat[bodies]
             for at, contact in enumerate(self._contacts, len(bodies)):
                 positions[row, at], quaternions[row, at] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
@@ -137,7 +138,9 @@ class Pushes:
     """Writes the forces that the scene exerts on its objects, as `ARM_STATE`s have them."""
 
     def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
-        self._stream, self._cell, self._data = stream, cell, cell.start()
+        self._stream = stream
+        self._cell = cell
+        self._data = cell.start()
         self._sampled = Sampled(clock_ns)
         self._is_empty = True
         stream.static(PUSHES, stream.within(WORLD))
@@ -171,7 +174,9 @@ class PlannedPath:
     they are visible."""
 
     def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream, self._cell, self._data = stream, cell, cell.start()
+        self._stream = stream
+        self._cell = cell
+        self._data = cell.start()
         for entity in (PATH, WAYPOINTS):
             stream.static(entity, stream.within(WORLD))
 

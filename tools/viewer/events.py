@@ -112,7 +112,8 @@ class RecorderLoad:
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
         style_curves(stream, (RECORDER, "load"), ["recorder, % of a core"])
-        self._cpu_s, self._wall_s = time.process_time(), time.monotonic()
+        self._cpu_s = time.process_time()
+        self._wall_s = time.monotonic()
 
     def advance(self, tick: int) -> None:
         """Write the load since the last call."""

@@ -66,7 +66,9 @@ class ContactArrows:
 
     def __init__(self, stream: Stream, cell: Cell, field: str, clock_ns: int) -> None:
         """Take the forces from `field`, whose numbers begin with three for each place."""
-        self._stream, self._field, self._places = stream, field, contacts_of(cell)
+        self._stream = stream
+        self._field = field
+        self._places = contacts_of(cell)
         self._scale = TIP_M
         shaft = TIP_SHAFT_M
         if cell.wrist is not None:
@@ -112,7 +114,8 @@ class ContactForces:
     """Writes `WRENCH`es as the size of force and torque, with the arm's limits."""
 
     def __init__(self, stream: Stream, most: tuple[float, float]) -> None:
-        self._stream, self._most = stream, dict(zip(("force", "torque"), most, strict=True))
+        self._stream = stream
+        self._most = dict(zip(("force", "torque"), most, strict=True))
         for what, unit in (("force", "N"), ("torque", "N m")):
             names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
             style_curves(stream, (FORCES, CONTACT, what), names, [LIMIT, of_joint(0)])

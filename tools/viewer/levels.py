@@ -85,7 +85,8 @@ class Activity:
     """Writes the state in a level's statuses, and each error once."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream, (self._board, _, port) = stream, mailbox.name.partition(".")
+        self._stream = stream
+        (self._board, _, port) = mailbox.name.partition(".")
         # An adapter also writes the statuses of other racks' levels.
         lane = "state" if port == "status" else port
         own = (self._board, lane)
@@ -108,7 +109,8 @@ class FiredRows:
     """Writes which row of a state table fires, as a lane, and every change to the log."""
 
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream, self._board = stream, mailbox.name.partition(".")[0]
+        self._stream = stream
+        self._board = mailbox.name.partition(".")[0]
         self._lane = ValueLane(
             stream,
             (self._board, "row"),

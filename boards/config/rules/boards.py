@@ -253,7 +253,8 @@ def _nearest(value: float, step: float) -> str:
 
 def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
     clock_ns = wiring.config.clock_ns
-    (minor, major), tick_ms = frames(table, clock_ns), clock_ns * 1e-6
+    minor, major = frames(table, clock_ns)
+    tick_ms = clock_ns * 1e-6
     fitting = [
         minor * number for number in range(1, major // minor + 1) if major % (minor * number) == 0
     ]

@@ -116,6 +116,9 @@ class SharedBody:
 
     def show(self, record: np.void, pose: Array) -> None:
         """Fill a `SHARED_BODY`; `pose` (7,) is that of the own simulation."""
-        record["name"], record["touched"] = self.name, self.is_touched
-        record["claim"], record["owner"] = self.claim.number, self.claim.owner
-        record["position"], record["quaternion"] = pose[:3], pose[3:]
+        record["name"] = self.name
+        record["touched"] = self.is_touched
+        record["claim"] = self.claim.number
+        record["owner"] = self.claim.owner
+        record["position"] = pose[:3]
+        record["quaternion"] = pose[3:]

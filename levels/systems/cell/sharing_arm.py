@@ -51,7 +51,8 @@ class SharingArm(SimulatedArm):
         model = self._model
         at = self.cell.object_qpos[row]
         dof = model.body_dofadr[self.cell.bodies[row]]
-        self._data.qpos[at : at + POSE], self._data.qvel[dof : dof + MOTION] = pose, 0.0
+        self._data.qpos[at : at + POSE] = pose
+        self._data.qvel[dof : dof + MOTION] = 0.0
         if row in self._kept:
             self._kept[row] = pose
 

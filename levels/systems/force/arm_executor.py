@@ -106,7 +106,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         )
         gained = velocity - self._before if known else np.zeros(len(velocity))
         self.contact.take(raw, self.sensors.state, gained / passed_s)
-        self._before[:], self._since = velocity, tick
+        self._before[:] = velocity
+        self._since = tick
         self._limit(tick)
 
     @property
@@ -139,7 +140,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def started(self) -> None:
         """Continue from the state that was restored."""
-        self._before[:], self._since = self._velocity, self.arm.tick
+        self._before[:] = self._velocity
+        self._since = self.arm.tick
 
     def terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with what the gripper holds, and with

@@ -108,7 +108,8 @@ class ComplianceWatch:
             np.abs(self.felt) > compliance.guard
         )
         if beyond.any() and self.struck != compliance.id:
-            self.struck, self.axis = compliance.id, int(beyond.argmax())
+            self.struck = compliance.id
+            self.axis = int(beyond.argmax())
         if self.struck == compliance.id:
             self._rest(
                 f"guard of axis {AXIS_NAMES[self.axis]} was struck: held until another command"

@@ -46,14 +46,17 @@ class Contact:
         if turned:
             self.guard[:] = 0.0
         self.id += 1
-        self.frame[:], self.selected[:], self.speed[:] = frame / norm(frame), selected, speed
+        self.frame[:] = frame / norm(frame)
+        self.selected[:] = selected
+        self.speed[:] = speed
         self.wrench[:] = np.where(selected, wrench, 0.0)
         return begins_anew
 
     def watch(self, frame: Array, guard: Array) -> None:
         """Replace the guards."""
         self.id += 1
-        self.frame[:], self.guard[:] = frame / norm(frame), guard
+        self.frame[:] = frame / norm(frame)
+        self.guard[:] = guard
 
     def unguard(self) -> None:
         """End the guards."""
@@ -67,7 +70,9 @@ class Contact:
     def release(self) -> None:
         """Make all axes ones of motion, unguarded."""
         self.id += 1
-        self.selected[:], self.wrench[:], self.guard[:] = False, 0.0, 0.0
+        self.selected[:] = False
+        self.wrench[:] = 0.0
+        self.guard[:] = 0.0
 
     def objection(self, frame: Array, guard: Array) -> str:
         """Return why guards in that frame are impossible now; empty: they are not."""
@@ -84,7 +89,8 @@ class Contact:
 
     def fill(self, compliance: Message) -> None:
         """Fill a `COMPLIANCE`."""
-        compliance.id, compliance.active = self.id, self.complies or bool(self.guard.any())
+        compliance.id = self.id
+        compliance.active = self.complies or bool(self.guard.any())
         compliance.frame = self.frame
         compliance.selected = self.selected
         compliance.wrench = self.wrench

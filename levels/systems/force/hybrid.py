@@ -94,7 +94,8 @@ class HybridExecutor(WristLevel):
         if self._boards.in_step:
             self._move(write.command, tick, passed_s)
         else:
-            write.command.due, self._moving[:] = 0, 0.0
+            write.command.due = 0
+            self._moving[:] = 0.0
         self._report(read, write.status)
         self._report_force(read.compliance.value, write.force)
 
@@ -115,7 +116,8 @@ class HybridExecutor(WristLevel):
         command.position, command.velocity, command.acceleration, command.inertia, command.load = (
             joints
         )
-        self._target, self._moving[:] = joints.position, motion.velocity
+        self._target = joints.position
+        self._moving[:] = motion.velocity
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)
 
@@ -123,10 +125,8 @@ class HybridExecutor(WristLevel):
         """Show the boards below as one, whose set points are those of this level."""
         values = [reading.value for reading in read.statuses.values()]
         status.position = values[0].position
-        status.torque, status.driven = (
-            sum(v.torque for v in values),
-            np.any([v.driven for v in values], axis=0),
-        )
+        status.torque = sum(v.torque for v in values)
+        status.driven = np.any([v.driven for v in values], axis=0)
         status.target = self._target
         status.target_velocity = self._moving
         status.echo = read.command.value.id

@@ -86,7 +86,8 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         if read.last_compliance.is_there and read.last_status.is_there:
             self._work.contact.recall(read.last_compliance.value)
             status = read.last_status.value
-            self._work.guarded, self._work.axis = status.guarded, status.axis
+            self._work.guarded = status.guarded
+            self._work.axis = status.axis
             self._without = Mode(status.mode)
             self._since = self._now
 
@@ -152,7 +153,8 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         """Fill what a server's status says beyond a trajectory level's."""
         work = self._work
         force = self._work.force
-        status.mode, (status.place, status.quaternion) = self.mode, self._ik.tool_at(self._sensed)
+        status.mode = self.mode
+        (status.place, status.quaternion) = self._ik.tool_at(self._sensed)
         status.frame = work.contact.frame
         status.selected = work.contact.selected
         status.wanted = work.contact.wrench

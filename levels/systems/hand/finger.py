@@ -91,7 +91,8 @@ class FingerExecutor(HandLoop):
         """Hold the joints where they are."""
         self._tip.start(hand.position)
         self._tendons.start(hand)
-        self._target.position, self._target.stiff = hand.position, 1.0
+        self._target.position = hand.position
+        self._target.stiff = 1.0
         self._servo.start(hand, self._target)
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
@@ -99,4 +100,5 @@ class FingerExecutor(HandLoop):
         follow_grasp(self, self._tip, hand, self._target, write.status, tick)
         self._servo.torques(self.age_s(hand, tick), 0.0, self._torque)
         self._tendons.tensions(self._torque, write.command.tension)
-        write.command.driven, write.command.sampled = self._joints, hand.tick
+        write.command.driven = self._joints
+        write.command.sampled = hand.tick

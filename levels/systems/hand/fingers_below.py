@@ -43,6 +43,8 @@ class FingersBelow:
             self.error = self.error or Error(status.error)
             for finger in np.flatnonzero(status.driven).tolist():
                 own = self._joints[finger]
-                self.position[own], self.target[own] = status.position[own], status.target[own]
-                self.tip[finger], self.force[finger] = status.tip[finger], status.force[finger]
+                self.position[own] = status.position[own]
+                self.target[own] = status.target[own]
+                self.tip[finger] = status.tip[finger]
+                self.force[finger] = status.force[finger]
         self.rests_on = min([reading.value.operator for reading in statuses.values()], default=0)

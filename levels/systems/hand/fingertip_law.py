@@ -85,7 +85,9 @@ class FingertipLaw:
         for finger in self._fingers:
             own = self.kinematics.joints[finger]
             mode = grasp.mode[finger]
-            out.stiff[own], out.torque[own], out.spring[own] = 1.0, 0.0, 0.0
+            out.stiff[own] = 1.0
+            out.torque[own] = 0.0
+            out.spring[own] = 0.0
             if mode == FingerMode.JOINTS:
                 self.wanted[own] = grasp.position[own] + ahead_s * grasp.velocity[own]
                 self._rest[own] = self.wanted[own]
@@ -101,7 +103,8 @@ class FingertipLaw:
         self.wanted[:] = before + moved
         for finger in self._fingers:
             own = self.kinematics.joints[finger]
-            out.position[own], out.velocity[own] = self.wanted[own], moved[own] / self._period_s
+            out.position[own] = self.wanted[own]
+            out.velocity[own] = moved[own] / self._period_s
 
     def _reach(self, fingers: Sequence[int], points: Array) -> None:
         """Bring the targets of `fingers` closer to where their tips are at `points`, (fingers, 3),

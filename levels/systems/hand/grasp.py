@@ -275,8 +275,10 @@ class GraspExecutor(Executor):
                 self._take_up(step)
             elif isinstance(step, SqueezeStep):
                 grasp.base = step.grip if index < self._done else status.grip
-        grasp.grip.force, grasp.grip.load[:] = status.grip, status.load
-        grasp.touching[:], grasp.anchor[:] = status.touching, status.anchor
+        grasp.grip.force = status.grip
+        grasp.grip.load[:] = status.load
+        grasp.touching[:] = status.touching
+        grasp.anchor[:] = status.anchor
         grasp.moved = status.moved
         grasp.farthest = status.farthest
         if status.state == State.ERROR:

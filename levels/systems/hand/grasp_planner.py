@@ -76,7 +76,8 @@ class GraspPlanner:
         self._cell = cell
         self._rules = rules
         self._kinematics = FingerKinematics(cell, cell.hand)
-        self._data, self._opposing = cell.start(), names.index(opposing)
+        self._data = cell.start()
+        self._opposing = names.index(opposing)
         self._palm = self._data.site_xmat[cell.tool].reshape(3, 3).copy()
         self._origin = self._data.site_xpos[cell.tool].copy()
         bases = [int(np.flatnonzero(row)[0]) for row in cell.hand.fingers]
@@ -110,7 +111,8 @@ class GraspPlanner:
             touched = self._touched(row, base, way)
             if touched is None:
                 return None
-            contact[finger], normal[finger] = touched, way
+            contact[finger] = touched
+            normal[finger] = way
         closed = self._reach(contact - self._rules.pad * normal)
         open_ = (
             None if closed is None else self._reach(contact - self._rules.clear * normal, closed)

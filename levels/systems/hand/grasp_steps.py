@@ -201,11 +201,10 @@ class CloseWork(StepWork):
         """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
         target = self.grasp.target
         grasp = self.grasp
-        target.mode[finger], target.stiffness[finger] = (
-            FingerMode.FORCE,
-            grasp.grip.stiffness[finger],
-        )
-        target.tip[finger], target.tip_velocity[finger] = grasp.fingers.tip[finger], 0.0
+        target.mode[finger] = FingerMode.FORCE
+        target.stiffness[finger] = grasp.grip.stiffness[finger]
+        target.tip[finger] = grasp.fingers.tip[finger]
+        target.tip_velocity[finger] = 0.0
         target.force[finger] = force
 
 
@@ -329,8 +328,10 @@ class ReleaseWork(StepWork):
 
     def __init__(self, grasp: Grasp, step: ReleaseStep, passed_s: float) -> None:
         super().__init__(grasp, step, passed_s)
-        self._force, self._load = grasp.grip.force, grasp.grip.load.copy()
-        self._start, self._out = grasp.fingers.tip.copy(), grasp.grip.outwards(grasp.fingers.tip)
+        self._force = grasp.grip.force
+        self._load = grasp.grip.load.copy()
+        self._start = grasp.fingers.tip.copy()
+        self._out = grasp.grip.outwards(grasp.fingers.tip)
 
     def do(self, passed_s: float) -> bool:
         """Let go."""
@@ -339,19 +340,21 @@ class ReleaseWork(StepWork):
         half = 0.5 * self.step.seconds
         if passed_s < half:
             left = 1.0 - passed_s / half
-            grasp.grip.force, grasp.grip.load[:] = left * self._force, left * self._load
+            grasp.grip.force = left * self._force
+            grasp.grip.load[:] = left * self._load
             target.force = grasp.grip.forces(grasp.fingers.tip)
             self._start[:] = target.tip
             return False
         part, rate = least_jerk(passed_s / half - 1.0)
-        grasp.grip.force, grasp.grip.load[:], grasp.touching[:] = 0.0, 0.0, False
+        grasp.grip.force = 0.0
+        grasp.grip.load[:] = 0.0
+        grasp.touching[:] = False
         for finger in np.flatnonzero(grasp.grip.fingers):
             way = self.step.way * self._out[finger]
-            target.mode[finger], target.force[finger] = FingerMode.POINT, 0.0
-            target.tip[finger], target.tip_velocity[finger] = (
-                self._start[finger] + part * way,
-                rate / half * way,
-            )
+            target.mode[finger] = FingerMode.POINT
+            target.force[finger] = 0.0
+            target.tip[finger] = self._start[finger] + part * way
+            target.tip_velocity[finger] = rate / half * way
         return part >= 1.0
 
 

@@ -106,5 +106,6 @@ class HandGrip:
         line = tips[self._opposing] - (self.shares[:, None] * tips)[self._others].sum(axis=0)
         span = norm(line)
         if span > LEAST_SPAN_M:
-            directions[self._others], directions[self._opposing] = -line / span, line / span
+            directions[self._others] = -line / span
+            directions[self._opposing] = line / span
         return directions

@@ -50,7 +50,8 @@ class JointLoop(HandLoop):
 
     def meet(self, read: Ports, hand: Message) -> None:
         """Hold the joints where they are, until there are targets."""
-        self.command.position, self.command.stiff = hand.position, 1.0
+        self.command.position = hand.position
+        self.command.stiff = 1.0
         self._law.start(hand, self.command)
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:

@@ -34,10 +34,8 @@ class FingerKinematics:
         self._data = d = mujoco.MjData(cell.model)
         mujoco.mj_resetDataKeyframe(cell.model, d, 0)
         self.limits = cell.limits
-        self._low, self._high = (
-            self.limits.position[:, 0] + MARGIN_RAD,
-            self.limits.position[:, 1] - MARGIN_RAD,
-        )
+        self._low = self.limits.position[:, 0] + MARGIN_RAD
+        self._high = self.limits.position[:, 1] - MARGIN_RAD
         self._whole = np.zeros((3, cell.model.nv))
         mujoco.mj_kinematics(cell.model, d)
         self.palm = site_pose(d, cell.tool)  # in the world

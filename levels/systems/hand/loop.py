@@ -48,10 +48,8 @@ class HandLoop(Executor):
         self.driven: NDArray[
             np.bool_
         ]  # (joints,) or (fingers,), as in the status: those of this board
-        self._above, self._period = (
-            ", ".join(context.above),
-            max(pace.every for pace in context.above.values()),
-        )
+        self._above = ", ".join(context.above)
+        self._period = max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
         self._oldest = slowest + self.cell.patience.ticks(
             slowest, context.tick_s

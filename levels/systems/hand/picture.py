@@ -57,7 +57,9 @@ class HandPicture:
 
     def __init__(self, cell: Cell) -> None:
         assert cell.hand is not None, "a cell with a hand"
-        self._cell, self._hand, self._data = cell, cell.hand, cell.start()
+        self._cell = cell
+        self._hand = cell.hand
+        self._data = cell.start()
         model = cell.model
         own = set(cell.gripper_geoms.tolist())
         self._palm = model.site_bodyid[cell.tool]
@@ -160,7 +162,8 @@ class HandPicture:
         length = float(np.sqrt((way**2).sum()))
         if length < LEAST_N * scale:
             return
-        (x, y), (u, v) = start, way / length
+        x, y = start
+        u, v = way / length
         end_x = x + way[0]
         end_y = y + way[1]
         head = min(9.0, length)
@@ -204,7 +207,8 @@ class HandPicture:
 def local_points(model: mujoco.MjModel, geom: int) -> Array:
     """Return points on the surface of a geom, (n, 3), m, in its own frame; of a box or mesh the
     corners of its box."""
-    kinds, (a, b, c) = mujoco.mjtGeom, model.geom_size[geom]
+    kinds = mujoco.mjtGeom
+    a, b, c = model.geom_size[geom]
     kind = kinds(int(model.geom_type[geom]))
     turns = [2.0 * math.pi * k / RIM for k in range(RIM)]
     ring = np.array([(math.cos(turn), math.sin(turn), 0.0) for turn in turns])

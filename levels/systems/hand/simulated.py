@@ -145,5 +145,6 @@ def _carrying(cell: Cell, data: mujoco.MjData) -> Array:
     assert hand is not None, "it is a hand"
     turn = (data.qfrc_bias - data.qfrc_passive)[cell.dof] / (2.0 * hand.arms)
     tension = np.zeros((2, len(turn)))
-    tension[FLEXOR], tension[EXTENSOR] = hand.rest + turn, hand.rest - turn
+    tension[FLEXOR] = hand.rest + turn
+    tension[EXTENSOR] = hand.rest - turn
     return np.clip(tension, hand.least, hand.most)

@@ -61,8 +61,10 @@ class TendonLaw:
         """Drive the joints `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         self._constants = np.zeros((4, joints))  # in the rows of `set_tensions`
-        self._constants[0], self._constants[1] = hand.arms, hand.least + gains.margin
-        self._constants[2], self._constants[3] = hand.most, driven
+        self._constants[0] = hand.arms
+        self._constants[1] = hand.least + gains.margin
+        self._constants[2] = hand.most
+        self._constants[3] = driven
         self._numbers = (
             hand.rest,
             gains.lead,
@@ -86,7 +88,9 @@ class TendonLaw:
     def start(self, status: Message) -> None:
         """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same
         place."""
-        self._valves[0], self._valves[1], self._valves[2] = status.wanted, status.tension, 0.0
+        self._valves[0] = status.wanted
+        self._valves[1] = status.tension
+        self._valves[2] = 0.0
         self._status = status
         self._sampled = status.tick
         self._sensed = numbers(status, "tension", "wanted")

@@ -51,10 +51,8 @@ class JointGateway(Executor):
             -(-round(params.delay / context.tick_s) // every) * every
         )  # ticks: whole cycles
         self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
-        self._missing, self._period = (
-            params.missing,
-            max(pace.every for pace in context.above.values()),
-        )
+        self._missing = params.missing
+        self._period = max(pace.every for pace in context.above.values())
         self._above = ", ".join(context.above)
         self._down: deque[tuple[int, bytes]] = (
             deque()
@@ -106,7 +104,8 @@ class JointGateway(Executor):
         command.due = self._due
         command.id = newest.id
         command.position[:] = newest.position + ahead_s * newest.velocity
-        command.velocity[:], command.acceleration[:] = newest.velocity, 0.0
+        command.velocity[:] = newest.velocity
+        command.acceleration[:] = 0.0
 
     def _report(self, statuses: Mapping[str, Reading], status: Message, tick: int) -> None:
         """Put the status of the boards below on the link; show the one that has passed it."""

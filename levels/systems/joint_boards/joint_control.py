@@ -107,12 +107,12 @@ def servo_joints(
         needed = inertia * (damped + stiffness[j] * (target - position)) + load
         needed += dry[j] * math.tanh(target_velocity / FRICTION_SPEED)
         needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
-        torque[j], torque[joints + j], torque[2 * joints + j] = needed, target, target_velocity
-        status[joints + j], status[2 * joints + j], status[3 * joints + j] = (
-            target,
-            target_velocity,
-            needed,
-        )
+        torque[j] = needed
+        torque[joints + j] = target
+        torque[2 * joints + j] = target_velocity
+        status[joints + j] = target
+        status[2 * joints + j] = target_velocity
+        status[3 * joints + j] = needed
 
 
 def preload() -> None:

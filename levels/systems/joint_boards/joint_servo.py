@@ -78,8 +78,10 @@ class JointServo(Executor):
         names = robot.joints if params.joints is None else params.joints
         self._driven = np.array([name in names for name in robot.joints])
         constants = np.zeros((5, len(robot.joints)))  # in the rows of `servo_joints`
-        constants[0], constants[1] = params.bandwidth**2, 2.0 * params.damping * params.bandwidth
-        constants[2], constants[3] = cell.model.dof_frictionloss[cell.dof], cell.bounds.torque
+        constants[0] = params.bandwidth**2
+        constants[1] = 2.0 * params.damping * params.bandwidth
+        constants[2] = cell.model.dof_frictionloss[cell.dof]
+        constants[3] = cell.bounds.torque
         constants[4] = self._driven
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self.loads = JointLoads(cell)
@@ -166,7 +168,8 @@ class JointServo(Executor):
         if self._modified.exists:
             self._modify(times, wanted, tick)
         torque = write.command
-        torque.sampled, torque.id = sampled, torque.id + 1
+        torque.sampled = sampled
+        torque.id = torque.id + 1
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
         torque.operator = operator.orders.rests_on(self._rests_on)
@@ -226,10 +229,8 @@ class JointServo(Executor):
             self._offered = command
             if self._grip is not None:
                 self._grip.take(command)
-                write.command.payload_mass, write.command.payload_offset = (
-                    command.payload_mass,
-                    command.payload_offset,
-                )
+                write.command.payload_mass = command.payload_mass
+                write.command.payload_offset = command.payload_offset
 
     def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
         """Take over inertia and load of the reference that is followed; compute them while none

@@ -87,7 +87,8 @@ def add_up(
         for board in range(len(begins)):
             total[number] += memory[begins[board] + number]
     for j in range(joints):
-        motion[0, j], motion[1, j] = total[joints + j], total[2 * joints + j]
+        motion[0, j] = total[joints + j]
+        motion[1, j] = total[2 * joints + j]
         moves = moves or motion[1, j] != 0.0
     return moves
 

@@ -152,7 +152,9 @@ class MoveTable(StateTableExecutor):
             self._what = last.words
             self._speed = last.speed
             self._row = last.object
-            self._joints[:], self._aim[:], self._yaw = last.joints, last.aim, last.yaw
+            self._joints[:] = last.joints
+            self._aim[:] = last.aim
+            self._yaw = last.yaw
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
         """Return where the level below, the object and the gripper are."""
@@ -218,13 +220,12 @@ class MoveTable(StateTableExecutor):
         now = self._ik.tool_at(self._joints)
         self._row = self.context.scene.objects.index(names[0]) if verb == "pick" else -1
         if self._row < 0:
-            self._aim[:], self._yaw = self.table.plan.place[names[0]], 0.0
+            self._aim[:] = self.table.plan.place[names[0]]
+            self._yaw = 0.0
         elif not self._holds:
             # In the gripper it moves with the arm: it is raised from where it was.
-            self._aim[:], self._yaw = (
-                self._positions[self._row],
-                yaw_of(self._quaternions[self._row]),
-            )
+            self._aim[:] = self._positions[self._row]
+            self._yaw = yaw_of(self._quaternions[self._row])
         above = self._aim + np.array([0.0, 0.0, height])
         # Across the object's faces, whichever quarter turn is nearest to the tool now.
         turns = [pointing(DOWN, -(self._yaw + quarter * 0.5 * math.pi)) for quarter in range(4)]
@@ -251,7 +252,8 @@ class MoveTable(StateTableExecutor):
         command.id = self._sent
         command.words = self._what
         command.hold = self.holds
-        command.joints[:], command.speed = self._joints, self._speed
+        command.joints[:] = self._joints
+        command.speed = self._speed
         command.object = self._row
         command.aim = self._aim
         command.yaw = self._yaw

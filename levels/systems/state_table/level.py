@@ -246,7 +246,8 @@ class StateTableExecutor(Executor):
     def use(self, name: str) -> None:
         """Put a table in force. It goes on in the state of the same name; without one, in the state
         it starts in."""
-        self.table_name, self.table = name, self.tables[name]
+        self.table_name = name
+        self.table = self.tables[name]
         if self.state not in self.table.rows:
             self.state = self.table.start
             self._since = None
@@ -263,7 +264,8 @@ class StateTableExecutor(Executor):
         if self.vocabulary.commands:
             is_new = self._newest[:2] != self._taken and self._newest[1] > 0
             words = self._newest[2] if is_new else self._words
-            values["command"], values["new"] = words.partition(" ")[0] or "none", YES_NO[is_new]
+            values["command"] = words.partition(" ")[0] or "none"
+            values["new"] = YES_NO[is_new]
         row = self.table.decide(self.state, values)
         if row is not None:
             for verb, *parameters in row.do:

@@ -162,7 +162,8 @@ class PrimitiveTable(StateTableExecutor):
             self._closed = bool(last.closed)
             self._held = bool(last.held)
             self._object = last.object
-            self._point[0], self._end[:] = last.position, last.end
+            self._point[0] = last.position
+            self._end[:] = last.end
             write.command.copy_from(read.last_command.value)
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
@@ -177,7 +178,9 @@ class PrimitiveTable(StateTableExecutor):
             self._curve is not None
             and (due - self._from) * self.context.tick_s >= self._curve.ends_s
         ):
-            self._point[0], self._point[1:], self._curve = self._curve.table[curves.REST], 0.0, None
+            self._point[0] = self._curve.table[curves.REST]
+            self._point[1:] = 0.0
+            self._curve = None
         away = np.abs(position - self._point[0]).max() > self.table.plan.settled
         self.resting = self._curve is None and not away
         there = np.abs(self._end - self._point[0]).max() <= self.table.plan.settled
@@ -204,7 +207,9 @@ class PrimitiveTable(StateTableExecutor):
         if not stopped:
             if not self._follows:
                 # From where the arm is, at rest.
-                self._point[0], self._point[1:], self._curve = position, 0.0, None
+                self._point[0] = position
+                self._point[1:] = 0.0
+                self._curve = None
             self._follows += 1
         return position
 

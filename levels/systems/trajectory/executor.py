@@ -156,13 +156,12 @@ class TrajectoryExecutor(Executor):
         command.id = tick // self.context.every + 1
         # Out of step the arm's position is not certain: no set point is better than a wrong one.
         command.due = self._due(tick) if self._boards.in_step else 0
-        command.position[:], command.velocity[:], command.acceleration[:] = (
-            position,
-            velocity,
-            acceleration,
-        )
+        command.position[:] = position
+        command.velocity[:] = velocity
+        command.acceleration[:] = acceleration
         terms = self._dynamics.terms(position, velocity)
-        command.inertia[:], command.load[:] = terms.inertia.diagonal(), terms.bias
+        command.inertia[:] = terms.inertia.diagonal()
+        command.load[:] = terms.bias
         command.opening, command.force = self._work.grip
         command.operator = self._orders.rests_on(self._agenda.rests_on)
 
@@ -184,7 +183,8 @@ class TrajectoryExecutor(Executor):
         status.progress = self._work.progress
         status.resting = motion.resting
         position, velocity, _ = motion.state
-        status.position[:], status.velocity[:] = position, velocity
+        status.position[:] = position
+        status.velocity[:] = velocity
         tool = self._ik.tool_at(position)
         status.tool[:] = tool.position
         reached = goal is not None and goal.live and motion.leg is not None and motion.settled

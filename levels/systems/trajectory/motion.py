@@ -139,16 +139,15 @@ class SampledMotion:
             )
         self._leg = None
         try:
-            self._leg, self._begun_s = make(self._rest), self.time_s
+            self._leg = make(self._rest)
+            self._begun_s = self.time_s
         finally:
             self._look_ahead()
 
     def _settle(self, state: JointState, part: float, least_s: float) -> None:
         least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
-        self._settling, self._settles_s = (
-            Settling(state, part * self._limits.acceleration, least_s),
-            self.time_s,
-        )
+        self._settling = Settling(state, part * self._limits.acceleration, least_s)
+        self._settles_s = self.time_s
         self._rest = self._settling.end
 
     def _look_ahead(self) -> None:

@@ -167,7 +167,8 @@ class Agenda:
             self.missing = True
             return False
         self.missing = False
-        self.taken, self.rests_on = request.id, max(self.rests_on, request.operator)
+        self.taken = request.id
+        self.rests_on = max(self.rests_on, request.operator)
         if request.kind == MotionKind.CANCEL:
             self._flush(RequestEnd.CANCELLED)
             self.error = Error.NONE
@@ -223,7 +224,8 @@ class Agenda:
         status.current = current.id if current is not None else 0
         status.done = self.done
         for k, (request, how) in enumerate(self._ended):
-            status.ended[k], status.ends[k] = request, how
+            status.ended[k] = request
+            status.ends[k] = how
 
     def save(self, state: Message) -> None:
         """Fill a `MOTION_STATE`."""

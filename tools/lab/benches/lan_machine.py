@@ -86,7 +86,8 @@ class Machine:
         self._place = task.place
         self._echoes = task.echoes
         self._seen: set[int] = set()
-        self._all_there, self._answered = threading.Event(), threading.Event()
+        self._all_there = threading.Event()
+        self._answered = threading.Event()
         self._awaited = 0
         self._round_trips: list[float] = []
         self._numbers: dict[int, int] = {}

@@ -146,7 +146,8 @@ def _plan(work: str, shared: _Shared) -> None:
             now = monotonic_ns()
             if now - last > longest:
                 longest = now - last
-                gaps[2 * at], gaps[over] = last, now
+                gaps[2 * at] = last
+                gaps[over] = now
                 now = monotonic_ns()
             last = now
 

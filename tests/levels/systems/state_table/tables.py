@@ -14,7 +14,6 @@ DOOR = """
 start = "shut"
 
 [[row]]
-format = 2
 name = "open it"
 state = "shut"
 when = { command = "open", new = "yes", lock = "free" }
@@ -23,7 +22,6 @@ do = ["take", "drive slowly"]
 status = "executing"
 
 [[row]]
-format = 2
 name = "locked"
 state = "shut"
 when = { command = "open", new = "yes", lock = ["stuck", "locked"] }
@@ -33,7 +31,6 @@ status = "holding"
 reason = "locked"
 
 [[row]]
-format = 2
 name = "stay shut"
 state = "shut"
 else = true
@@ -42,7 +39,6 @@ do = []
 status = "idle"
 
 [[row]]
-format = 2
 name = "moves"
 state = "moving"
 when = { place = "between", late = "no" }
@@ -51,7 +47,6 @@ do = []
 status = "executing"
 
 [[row]]
-format = 2
 name = "arrived"
 state = "moving"
 when = { place = ["open", "shut"] }
@@ -60,7 +55,6 @@ do = ["drive stop"]
 status = "done"
 
 [[row]]
-format = 2
 name = "jams"
 state = "moving"
 when = { place = "between", late = "yes" }

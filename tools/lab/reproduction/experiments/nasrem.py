@@ -73,7 +73,7 @@ class MailboxTraffic:
 
 
 @dataclass(frozen=True)
-class BusTraffic:
+class BusAccesses:
     """Accesses of a task to the backplane."""
 
     reads: int
@@ -118,7 +118,7 @@ class NasremRun:
     loads: dict[int, float]
     response: SystemResponse
     mailboxes: tuple[MailboxTraffic, ...]
-    bus: dict[str, BusTraffic]
+    bus: dict[str, BusAccesses]
     pictures: dict[str, str]
 
 
@@ -150,7 +150,7 @@ def _run(workshop: Workshop) -> NasremRun:
         loads=dict(analysis.loads),
         response=TypeAdapter(SystemResponse).validate_python(analysis.response),
         mailboxes=tuple(_mailbox(recording, name) for name in recording.mailboxes),
-        bus=TypeAdapter(dict[str, BusTraffic]).validate_python(ended["tasks"]),
+        bus=TypeAdapter(dict[str, BusAccesses]).validate_python(ended["tasks"]),
         pictures={"residuals": drawn},
     )
 
