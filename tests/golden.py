@@ -25,19 +25,19 @@ FILE = Path(__file__).with_suffix(".toml")
 OFTEN = (
     "nasrem --seconds 14",
     "nasrem --faults kill-each-board --seconds 9",
-    "nasrem-1khz --seconds 8",
-    "crossing --seconds 14",
     "k1607",
     "nist-state-table --seconds 5",
-    "rccl --seconds 4",
     "brown --seconds 4",
     "hic --seconds 6",
-    "chimera",
     "fig2 --seconds 1",
 )
 """What `make test` runs, too; the others are for `make thorough`."""
 RUNS = (
     *OFTEN,
+    "nasrem-1khz --seconds 8",
+    "crossing --seconds 14",
+    "rccl --seconds 4",
+    "chimera",
     "penn --seconds 14",
     "ibm --seconds 14",
     "condor --seconds 4",

@@ -14,7 +14,7 @@ from rack.boards.events import Event
 from rack.tools.faults.ending import strikes
 from rack.tools.faults.judge import Circumstances, FaultVerdict, judge
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 FIRST, APART = 101, 41
 """First fault, and ticks from one to the next: odd, so that the skips begin in every phase of the

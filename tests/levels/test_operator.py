@@ -22,6 +22,8 @@ from rack.levels.operator import (
 from tests.levels.lockstep import Operator
 from tests.levels.whole_rack import WholeRack
 
+pytestmark = pytest.mark.thorough
+
 TAKES = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.JOINTS, Goal.HOME)}
 STATUS = status("answering", 1, *ANSWER)
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])

@@ -15,7 +15,7 @@ import pytest
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
-from rack.backplane.process import state_of
+from rack.backplane.process import processor_ns, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
@@ -191,6 +191,8 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
     release(bus, 0)
     cycle.wait()
     with forked(clock) as pid:
+        # A process that has just been forked may wait for its memory.
+        wait_until(lambda: clock is not busy or processor_ns(pid) > 20_000_000)
         bus.words[System.CLOCK_PID] = pid
         with in_thread(cycle.wait):
             # The checks a tenth of a second apart or more.

@@ -17,7 +17,7 @@ from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import LOOSE, MakeConfig
 from tests.processes import wait_until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 KINDS_OF_WRITERS = ("mute", "drop", "delay", "reorder", "corrupt", "babble", "masquerade")
 

@@ -17,7 +17,7 @@ from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import ENDS, HOSTED, codes, status, watch
 from tests.processes import wait_until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 SECOND = (
     HOSTED

@@ -26,7 +26,7 @@ from tests.boards.lan.racks import RackProcess, rack_text
 from tests.machine import needs_fifo, needs_lab
 from tests.processes import BOUND_S, wait_until
 
-pytestmark = [pytest.mark.alone, needs_lab, needs_fifo]
+pytestmark = [pytest.mark.alone, pytest.mark.thorough, needs_lab, needs_fifo]
 
 PORT = 7447
 LEASE_TICKS = 80

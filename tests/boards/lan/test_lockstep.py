@@ -27,7 +27,7 @@ from tests.boards.lan.racks import (
 )
 from tests.processes import forked, parent_of, runs, wait_until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 CYCLE = 8
 """Ticks in a cycle of the adapters, at 50 Hz."""

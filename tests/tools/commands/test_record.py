@@ -27,6 +27,8 @@ from tests.boards.lan.racks import configs, ring_texts
 from tests.processes import RACK, wait_until
 from tests.tools.machines import A, B, recorded
 
+pytestmark = pytest.mark.thorough
+
 WATCHED = """
 [adapter.lan.permit]
 operator = ["watch"]

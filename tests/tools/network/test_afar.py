@@ -23,6 +23,8 @@ from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S, RACK, wait_until
 from tests.tools.command_line import ROOT, rack
 
+pytestmark = pytest.mark.thorough
+
 OF_LAN = """
 [adapter.lan]
 slot = 5

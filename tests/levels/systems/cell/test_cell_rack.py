@@ -13,7 +13,7 @@ from rack.levels.systems.cell.messages import Phase, Response
 from tests.levels.lockstep import Lockstep, Operator
 from tests.levels.systems.cell.rack import CellRack
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 PLACE = [0.50, -0.20, 0.475]
 TRANSFER = {"do": "transfer", "object": "block1", "to": PLACE}

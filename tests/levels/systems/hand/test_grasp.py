@@ -17,6 +17,8 @@ from tests.levels.arms import config
 from tests.levels.lockstep import Operator
 from tests.levels.systems.hand.grasp_rig import CLOSE, LIFT, PRESHAPE, SQUEEZE, GraspRig, program
 
+pytestmark = pytest.mark.thorough
+
 PULL = PushConfig(body="can", at=2.4, seconds=0.5, force=(-4.0, 0.0, 0.0), rise=0.1)
 LOWER = {**LIFT, "by": [0.0, 0.0, -0.006]}
 HOLD = {"do": "hold", "seconds": 0.8}

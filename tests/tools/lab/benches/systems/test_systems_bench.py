@@ -72,7 +72,8 @@ def test_the_highest_level_that_responds_within_the_run_is_held() -> None:
     assert hold_for(config, timing, layout, 0.1) is None
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
+@pytest.mark.alone
 def test_a_rack_is_compared_by_its_runs(
     jointed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
