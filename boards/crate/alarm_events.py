@@ -99,6 +99,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
         "joint",
         "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
     ),
+    Alarm.LIMIT_EXCEEDED: ("joint", "{subject} is beyond its limit, as sensed: {value:.4g}"),
     Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
     Alarm.TENSION_LIMIT: (
         "joint",

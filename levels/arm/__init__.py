@@ -4,10 +4,20 @@ two."""
 from rack.levels.arm import drives, poses, substeps
 from rack.levels.arm.arm import Arm, Link, Sensed, find_arm
 from rack.levels.arm.faulty import FaultyLink
+from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot import dynamics
 
-__all__ = ["Arm", "FaultyLink", "Link", "Sensed", "SimulatedArm", "find_arm", "preload"]
+__all__ = [
+    "Arm",
+    "FaultyLink",
+    "GuardedArm",
+    "Link",
+    "Sensed",
+    "SimulatedArm",
+    "find_arm",
+    "preload",
+]
 
 
 def preload() -> None:

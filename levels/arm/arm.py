@@ -63,6 +63,10 @@ class Arm(Plant, ABC):
     board.
     """
 
+    keeps_limits = False
+    """Whether its drives keep positions and velocities within the limits by themselves, as the
+    simulated ones do. Every other arm is driven through `rack.levels.arm.guard.GuardedArm`."""
+
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, Sensed
+from rack.levels.arm.arm import Arm, Link, Sensed
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.cell import Cell
@@ -32,9 +32,13 @@ class FaultyLink:
     """Implements `Link` with injected faults. `acted` collects those that act, for
     `Executor.acted`."""
 
-    def __init__(self, arm: Arm, cell: Cell, every: int, acted: dict[int, bool]) -> None:
-        """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell."""
+    def __init__(
+        self, arm: Arm, cell: Cell, every: int, acted: dict[int, bool], link: Link | None = None
+    ) -> None:
+        """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell; by its
+        `link`, if it has one of its own."""
         self._arm = arm
+        self._next: Link = link or arm
         self._every = every
         self._acted = acted
         self._limits = limits = cell.bounds.torque
@@ -80,7 +84,7 @@ class FaultyLink:
 
     def sense(self) -> Sensed:
         """Return the newest sample with the faults applied."""
-        sample = self._arm.sense()
+        sample = self._next.sense()
         for step, active in self._sensors:
             sample, shows = step.act(sample, active)
             if shows is not None:
@@ -91,7 +95,7 @@ class FaultyLink:
         """Pass on torques with the faults applied."""
         if self._commands:
             torque = self._corrupt(torque)
-        found = self._arm.drive(torque, grip_force)
+        found = self._next.drive(torque, grip_force)
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
             hidden = self._hidden + self._pushed()

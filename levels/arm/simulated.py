@@ -29,6 +29,8 @@ class SimulatedArm(Simulation, Arm):
     tick, even in those that the servo level missed.
     """
 
+    keeps_limits = True
+
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import AT_START, BY_DEMAND, NO_TORQUE
 from rack.levels.algebra import Array
-from rack.levels.arm import Arm, FaultyLink, Link, Sensed, find_arm, preload
+from rack.levels.arm import Arm, FaultyLink, GuardedArm, Link, Sensed, find_arm, preload
 from rack.levels.arm.faulty import STEPS
 from rack.levels.compiled import compiled
 from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
@@ -72,10 +72,14 @@ class ArmDriver(Executor):
         self.arm: Arm = find_arm(params.arm)(
             cell, context.scene, context.clock_ns, every, context.seed
         )
-        self._faulty = FaultyLink(self.arm, cell, every, self.acted)
-        self._link: Link = (
-            self.arm
-        )  # the path to the arm; through `_faulty` while faults are injected
+        self._guard = (
+            None
+            if self.arm.keeps_limits
+            else GuardedArm(self.arm, cell, context.robot.joints, context.period_s)
+        )
+        self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._guard)
+        # The path to the arm; through `_faulty` while faults are injected.
+        self._link: Link = self._guard or self.arm
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
@@ -120,7 +124,7 @@ class ArmDriver(Executor):
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
         self._faulty.inject(faults)
-        self._link = self._faulty if faults else self.arm
+        self._link = self._faulty if faults else self._guard or self.arm
 
     @abstractmethod
     def take_messages(self, read: Ports) -> None:
@@ -182,6 +186,8 @@ class ArmDriver(Executor):
         )
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
+        if self._guard is not None and self._guard.exceeded is not None:
+            self.stopping.exceeds(*self._guard.exceeded, tick)
         self.feel(tick)
         reaction = self.stopping.decide(self.demand, sensors, tick)
         if reaction is Reaction.BRAKE:

@@ -124,6 +124,11 @@ class Stopping:
         it."""
         self._stop_for(Cause(Error.FORCE, text, value=finding.value), finding, reaction, tick)
 
+    def exceeds(self, finding: Finding, text: str, tick: int) -> None:
+        """Register a joint beyond its limit, with its text."""
+        cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
+        self._stop_for(cause, finding, Reaction.BRAKE, tick)
+
     def _stop_for(self, blow: Cause, finding: Finding, reaction: Reaction, tick: int) -> None:
         if self._struck_until is None or blow.error is not self._blow.error:
             self.findings.append(finding)

@@ -1,0 +1,206 @@
+"""An arm of the user's own keeps its limits, whatever the torques, and whatever its samples say."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from rack.backplane.watch.alarms import Alarm
+from rack.boards.config import load
+from rack.boards.config.cell import built_cell
+from rack.levels.algebra import Array
+from rack.levels.arm import Arm, GuardedArm, Sensed, SimulatedArm
+from rack.levels.messages import Error
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.tables import SceneConfig
+from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
+from tests.levels.arms import pendulum
+from tests.levels.lockstep import CLOCK_NS
+from tests.levels.servo.rig import Course, ServoRig
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLE = ROOT / "configs" / "examples" / "own-hardware"
+TICK_S = CLOCK_NS * 1e-9
+JOINTS = tuple(f"j{n}" for n in range(1, 7))
+
+
+class FarArm(IdealArm):
+    """Its samples jump beyond the range of the first joint, or beyond its speed, in some cycles."""
+
+    jumps: dict[int, tuple[float, float]]
+
+    def sense(self) -> Sensed:
+        sample = super().sense()
+        q, qd = self.jumps.get(self.tick, (0.0, 0.0))
+        sample.position[0] += q
+        sample.velocity[0] += qd
+        return sample
+
+
+class CoarseArm(IdealArm):
+    """Its samples are off by as much as its encoders may be, either way."""
+
+    def sense(self) -> Sensed:
+        sample = super().sense()
+        encoders = self.cell.encoders
+        way = np.where(np.random.default_rng(self.tick).random((2, len(encoders.off))) < 0.5, -1, 1)
+        return sample._replace(
+            position=sample.position + way[0] * encoders.off,
+            velocity=sample.velocity + way[1] * encoders.speed_off,
+        )
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The module of the example's arm."""
+    monkeypatch.syspath_prepend(EXAMPLE)
+    yield importlib.import_module("hardware_arm")
+    for name in ("hardware_arm", "drives"):
+        sys.modules.pop(name, None)
+
+
+def driven(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[Array, Array]:
+    """Drive an arm cycle by cycle; return the positions, and the velocities, that it had."""
+    true = []
+    for torque in torques:
+        link.sense()
+        link.drive(torque, 0.0)
+        arm.step(1)
+        state = arm.drives if hasattr(arm, "drives") else arm
+        q, qd = ("position", "velocity") if hasattr(arm, "drives") else ("_q", "_qd")
+        true.append((getattr(state, q).copy(), getattr(state, qd).copy()))
+    positions, velocities = (np.array(rows) for rows in zip(*true, strict=True))
+    return positions, velocities
+
+
+def excess(cell: Cell, motion: tuple[Array, Array]) -> tuple[float, float]:
+    """Return by how much the positions and the velocities of a motion are beyond the limits."""
+    positions, velocities = motion
+    low, high = cell.bounds.position.T
+    beyond = np.maximum(low - positions, positions - high).max()
+    return float(beyond), float((np.abs(velocities) - cell.bounds.velocity).max())
+
+
+def puma() -> Cell:
+    config = load("nasrem")
+    assert config.robot is not None
+    return built_cell(config.robot, config.scene, config.clock_ns)
+
+
+def random_torques(cell: Cell, seed: int, cycles: int) -> Iterator[Array]:
+    """Yield torques up to the limits, kept for some cycles each."""
+    random = np.random.default_rng(seed)
+    torque = np.zeros(len(cell.qpos))
+    for cycle in range(cycles):
+        if cycle % 40 == 0:
+            torque = random.uniform(-1.0, 1.0, len(torque)) * cell.bounds.torque
+        yield torque
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", range(6))
+def test_the_examples_arm_keeps_its_limits_under_a_constant_torque(
+    example: ModuleType, joint: int
+) -> None:
+    cell = puma()
+    torque = np.zeros(6)
+    torque[joint] = 0.95 * cell.bounds.torque[joint]
+
+    def moved(is_guarded: bool) -> tuple[float, float]:
+        arm = example.HardwareArm(cell, SceneConfig(), CLOCK_NS)
+        link = GuardedArm(arm, cell, JOINTS, TICK_S) if is_guarded else arm
+        return excess(cell, driven(link, arm, iter([torque] * 800)))
+
+    assert max(moved(is_guarded=True)) <= 0.0
+    # By itself it does not.
+    assert max(moved(is_guarded=False)) > 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_no_torques_move_the_examples_arm_beyond_its_limits(example: ModuleType, seed: int) -> None:
+    cell = puma()
+    arm = example.HardwareArm(cell, SceneConfig(), CLOCK_NS)
+    guard = GuardedArm(arm, cell, JOINTS, TICK_S)
+    assert max(excess(cell, driven(guard, arm, random_torques(cell, seed, 1200)))) <= 0.0
+    assert arm.clipped > 100
+    assert (arm.violations, guard.exceeded) == (0, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [IdealArm, CoarseArm])
+@pytest.mark.parametrize("seed", range(3))
+def test_as_coarse_as_its_encoders_may_be_it_keeps_them_too(
+    tmp_path: Path, kind: type[IdealArm], seed: int
+) -> None:
+    robot = pendulum(tmp_path)
+    sensors = robot.sensors.model_copy(update={"resolution": 2e-3, "noise": 3e-4})
+    cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
+    assert cell.encoders.off.min() > 2e-3
+    arm = kind(cell, SceneConfig(), CLOCK_NS)
+    guard = GuardedArm(arm, cell, robot.joints, TICK_S)
+    assert max(excess(cell, driven(guard, arm, random_torques(cell, seed, 1500)))) <= 0.0
+    assert arm.clipped > 50
+    assert arm.violations == 0
+
+
+def test_a_torque_that_no_drive_may_have_engages_the_brakes(tmp_path: Path) -> None:
+    robot = pendulum(tmp_path)
+    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    most = cell.bounds.torque
+    for torque, alarm in (
+        (np.array([np.nan, 0.0]), Alarm.COMMAND_INVALID),
+        (np.array([0.0, 2.0 * most[1]]), Alarm.COMMAND_LIMIT),
+    ):
+        arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
+        guard = GuardedArm(arm, cell, robot.joints, TICK_S)
+        guard.sense()
+        assert guard.drive(np.zeros(2), 0.0) is None
+        assert not arm.braked
+        refused = guard.drive(torque, 0.0)
+        assert refused is not None
+        assert (refused.alarm, arm.braked, arm.clipped) == (alarm, True, 1)
+
+
+def rig(folder: Path, jumps: dict[int, tuple[float, float]]) -> ServoRig:
+    FarArm.jumps = jumps
+    return ServoRig(pendulum(folder), SceneConfig(), arm="tests.levels.arm.test_guard:FarArm")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("jump", "what"), [((9.0, 0.0), "position"), ((0.0, 99.0), "velocity")])
+def test_a_sample_beyond_a_limit_is_said_counted_and_brakes(
+    tmp_path: Path, jump: tuple[float, float], what: str
+) -> None:
+    servo = rig(tmp_path, dict.fromkeys(range(100, 103), jump))
+    course = Course(START, GOAL, 0.8)
+    servo.run(100, course.at)
+    assert not servo.servo.arm.braked
+    servo.run(3, course.at)
+    arm = servo.servo.arm
+    assert arm.braked
+    assert arm.violations == 3
+    assert arm.first_violation.startswith(f"{what} ")
+    assert "as sensed; permitted: " in arm.first_violation
+    assert Alarm.LIMIT_EXCEEDED in servo.alarms()
+    assert servo.alarms().count(Alarm.LIMIT_EXCEEDED) == 1
+    servo.run(1200, course.at)
+    assert servo.status.violations == 3
+    assert servo.status.error in (Error.LIMIT, Error.SENSORS)
+    if what == "position":
+        # Once the samples are right again, it goes on; a velocity that lied leaves doubt.
+        assert np.abs(servo.status.position - GOAL).max() < 5e-3
+
+
+def test_an_arm_that_keeps_its_limits_itself_is_driven_directly(tmp_path: Path) -> None:
+    simulated = ServoRig(pendulum(tmp_path), SceneConfig())
+    assert isinstance(simulated.servo.arm, SimulatedArm)
+    assert simulated.servo._link is simulated.servo.arm
+    own = rig(tmp_path, {})
+    assert isinstance(own.servo._link, GuardedArm)
