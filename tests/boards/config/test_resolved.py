@@ -112,3 +112,26 @@ def test_the_crate_is_below_every_real_time_executor(
         "board.lower.planner_priority=20" if lower > 20 else "board.lower.planner_priority=0",
     ]
     assert resolve(load(small, settings)).crate_priority == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ([], 0),
+        (["protocol.default=lock"], 50),
+        (["protocol.default=lock", "board.lower.coupling=loose", "board.lower.planner_slot=7"], 0),
+    ],
+    ids=["without locks", "locks on one core", "locks on two boards"],
+)
+def test_a_planner_that_may_hold_a_lock_has_its_executors_priority_meanwhile(
+    small: Path, settings: list[str], expected: int
+) -> None:
+    priorities = ["board.lower.priority=50", "board.upper.priority=40"]
+    plan = resolve(load(small, ["clock.mode=realtime", *priorities, *settings]))
+    assert {task.task: task.critical_priority for task in plan.tasks} == {
+        "upper": 0,
+        "lower": 0,
+        "lower.planner": expected,
+    }
+    # The fastest executor looks after the clock.
+    assert [task.task for task in plan.tasks if task.guards_clock] == ["lower"]

@@ -96,3 +96,15 @@ def test_what_comes_after_the_window_is_bounded() -> None:
     assert not found.admits(head(2))
     assert not found.admits(head(2))
     assert count.disordered == 2
+
+
+def test_a_number_that_a_restarted_sender_gives_twice_moves_nothing() -> None:
+    found, count = order()
+    assert [found.admits(head(number)) for number in (2, 4, 5)] == [True] * 3
+    assert found.admits(head(5, serial=16))
+    assert (count.missing, count.repeated, found.number, found.serial) == (1, 0, 5, 16)
+    # The third has not come, the second has.
+    assert not found.admits(head(3))
+    assert (count.disordered, count.repeated) == (1, 0)
+    assert not found.admits(head(2))
+    assert (count.disordered, count.repeated) == (1, 1)

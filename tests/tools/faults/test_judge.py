@@ -487,6 +487,7 @@ def test_a_fault_of_the_arm_that_is_found_has_struck_however_slight_it_was() -> 
     after = strike("actuator-off", "lower", 156, 170, place=1, joint="elbow")
     first, second = verdict([slight, after], found(160, "actuator", "lower", "elbow")).faults
     assert (first.seen, second.seen, second.delay) == ("not struck", "detected", 4)
+    assert first.struck == -1
 
 
 def test_faults_are_listed_as_they_struck_and_those_that_never_did_last() -> None:

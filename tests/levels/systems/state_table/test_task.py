@@ -152,6 +152,8 @@ def test_a_hold_and_rest_of_the_level_below_are_passed_on(bench: Bench) -> None:
     assert bench.write.command.hold == 0
     bench.level._kept = "held"
     assert bench.level.holds
+    bench.level.give(bench.write, 9)  # type: ignore[arg-type]
+    assert bench.write.command.hold == 1
 
 
 def test_objects_that_the_scene_lacks_are_named() -> None:

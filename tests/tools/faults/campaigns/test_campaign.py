@@ -191,3 +191,38 @@ def test_a_plan_is_said_in_a_few_words() -> None:
     assert _text(Plan(7, "faults", True, (hang, mute, hang))) == "trial 7, 2 hang, mute"
     assert _text(Plan(8, "kills", False, (), kills)) == "trial 8, 2 external kill"
     assert _text(Plan(0, "nominal", True)) == "nominal"
+
+
+def test_an_order_is_for_faults_of_all_kinds_and_nothing_else_unless_it_says_so() -> None:
+    order = Order(name="nasrem", config=load("nasrem"), injections=3, seed=0, modes=(True,))
+    assert (order.kinds, order.kills, order.sizes, order.faultless_s) == (None, 0, 0, 0.0)
+    assert (order.loads, order.seconds) == ((False, True), None)
+
+
+def test_after_a_signal_nothing_is_drawn_again(
+    make: MakeCampaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(plan: Plan) -> TrialResult:
+        if plan.faults:
+            monkeypatch.setattr(module.INTERRUPT, "number", 2)
+        found = struck(plan)
+        return replace(found, faults=tuple(replace(f, seen="not struck") for f in found.faults))
+
+    campaign, trials = make(interrupted)
+    results = campaign.run()
+    kinds = [table["kind"] for plan in trials.made for table in plan.faults]
+    assert (kinds.count("mute"), kinds.count("drop")) == (3, 3)
+    assert results.is_interrupted
+
+
+def test_a_rack_that_is_done_in_time_is_run_as_often_as_fills_the_faultless_time(
+    make: MakeCampaign,
+) -> None:
+    campaign, trials = make(faultless_s=25.0, modes=(False,), kinds="mute", loads=(False,))
+    results = campaign.run()
+    faultless = [plan for plan in trials.made if plan.purpose == "faultless"]
+    # Each is done after 10 s.
+    (stretch,) = results.faultless
+    assert len(faultless) == len(stretch.runs) == 3
+    assert (stretch.load, stretch.seconds) == ("", 30.0)
+    assert not any(plan.lockstep for plan in faultless)
