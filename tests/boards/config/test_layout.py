@@ -173,3 +173,19 @@ def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_gives_i
         1,
     )
     assert core("lockstep", "board.upper.core=0", *POLLING) == 0
+
+
+def test_a_queue_keeps_what_may_be_unread_and_what_a_recorder_may_be_behind() -> None:
+    layout = wire(load("penn"))
+    sizes = {box.name: (box.capacity, box.depth) for box in layout.mailboxes}
+    # Of a host board: its capacity, what may be under way, and what a writer needs; a power of two.
+    assert sizes["coordinator.requests"] == (32, 64)
+    # Two seconds of four messages in each cycle of 20 ms, twice the capacity more.
+    assert sizes["bridge.requests"] == (32, 512)
+    # Two seconds of the reader's cycles.
+    assert sizes["bridge.requests_taken"] == (0, 128)
+    slow = wire(load("penn", ["protocol.depth={ 'bridge.requests' = 4 }"]))
+    assert (slow.mailbox("bridge.requests").capacity, slow.mailbox("bridge.requests").depth) == (
+        4,
+        256,
+    )

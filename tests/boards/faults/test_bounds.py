@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rack.backplane.layout import Layout
-from rack.boards.config import wire
+from rack.boards.config import load, wire
 from rack.boards.config.faults import injections
-from rack.boards.faults.bounds import BY_SIZE, NOT_ARMED, cycle_ticks
+from rack.boards.faults.bounds import BY_SIZE, NOT_ARMED, cycle_ticks, struck_mailboxes
 from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
@@ -139,3 +140,16 @@ def test_the_clocks_cycle_is_a_tick_and_a_planners_is_its_slice(config: MakeConf
         4,
         8,
     ]
+
+
+def test_a_fault_concerns_one_mailbox_of_its_task_or_all_that_it_writes(small: Path) -> None:
+    layout = wire(load(small))
+    names = [box.name for box in layout.mailboxes]
+    assert names[:3] == ["upper.command", "upper.status", "lower.status"]
+
+    def struck(at: int, board: str) -> list[str]:
+        return [box.name for box in struck_mailboxes(layout, at, board)]
+
+    assert struck(-1, "upper") == names[:2]
+    assert [struck(at, "upper") for at in range(3)] == [[names[0]], [names[1]], []]
+    assert struck(2, "lower") == [names[2]]
