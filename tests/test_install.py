@@ -152,6 +152,7 @@ def test_wheel_and_source_archive_are_of_one_version(installed: Path, tmp_path: 
     assert run(tmp_path, installed / "rack", "--version") == f"rack {version}\n"
     assert f"## {version} (" in (ROOT / "CHANGELOG.md").read_text()
     assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"`pip install {names[0]}`" in (ROOT / "README.md").read_text()
 
 
 @pytest.mark.slow
