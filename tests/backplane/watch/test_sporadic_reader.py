@@ -67,13 +67,20 @@ def test_several_messages_of_one_tick_are_no_babble(segment: Segment, writer: Wr
 
 
 def test_a_damaged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:
-    reader = open_reader(segment)
+    task = ReadingTask()
+    reader = watched(segment, BOX, AlarmWriter(segment, "reader"), task)
     for number in (1, 2):
         writer.message.id = number
         writer.write(10 * number)
     segment.bytes[message_address(segment, 2, BOX)] ^= 1
     assert reader.read(30).value.id == 1
     assert rung(segment) == [Alarm.DAMAGED]
+    assert task.troubles == 1
+    # The next good one is no trouble.
+    writer.message.id = 3
+    writer.write(40)
+    assert reader.read(50).value.id == 3
+    assert (task.troubles, rung(segment)) == (1, [Alarm.DAMAGED])
 
 
 def test_a_forged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:

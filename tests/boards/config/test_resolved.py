@@ -135,3 +135,23 @@ def test_a_planner_that_may_hold_a_lock_has_its_executors_priority_meanwhile(
     }
     # The fastest executor looks after the clock.
     assert [task.task for task in plan.tasks if task.guards_clock] == ["lower"]
+
+
+def test_in_lockstep_the_clock_is_on_the_core_of_the_fastest_board_that_gives_it_away(
+    small: Path,
+) -> None:
+    cores = ["clock.core=0", "board.upper.core=0", "board.lower.core=1"]
+
+    def core(*settings: str) -> int:
+        return resolve(load(small, [*cores, *settings]))._clock_core
+
+    assert core() == 1
+    assert core("clock.mode=realtime") == 0
+    # As fast, and in a lower slot; one that polls keeps its core.
+    assert core("board.upper.rate_hz=400") == 0
+    apart = [
+        "board.lower.coupling=loose",
+        "board.lower.planner_slot=7",
+        "board.lower.planner_core=0",
+    ]
+    assert core("board.lower.wake=poll", *apart) == 0

@@ -133,6 +133,12 @@ def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importin
     assert importing.read(72) == (NEW, 2, False)
 
 
+def test_what_has_not_come_has_no_age(importing: Importing) -> None:
+    importing.cycle(8)
+    shown = importing.status.import_other
+    assert (shown["age"], shown["age_s"]) == (-1, -1.0)
+
+
 def test_what_is_too_old_when_it_comes_is_counted_and_not_passed(importing: Importing) -> None:
     importing.send(1, written=0)
     importing.cycle(MAX_AGE)

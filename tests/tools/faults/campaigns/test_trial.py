@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
-from rack.tools.faults.campaigns.plan import Kill
-from rack.tools.faults.campaigns.trial import Killer
+from rack.boards.config import load
+from rack.tools.faults.campaigns import trial
+from rack.tools.faults.campaigns.plan import Kill, Plan
+from rack.tools.faults.campaigns.trial import Killer, _watch, run_trial
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
@@ -81,3 +85,108 @@ def test_it_looks_often_in_lockstep_and_sleeps_to_its_instant_in_real_time(
     assert Killer(segment, [near]).due_in_s() == 0.0
     segment.words[System.LOCKSTEP] = 1
     assert Killer(segment, [far]).due_in_s() < 0.05
+
+
+@pytest.mark.slow
+def test_a_trial_has_what_its_judgement_needs(small: Path, rack_name: str) -> None:
+    config = load(small)
+    fault = {"kind": "mute", "board": "lower", "tick": 40, "for": "50ms"}
+    plan = Plan(3, "faults", lockstep=True, faults=(fault,))
+    found = run_trial(config, plan, rack_name, ticks=0, seconds=0.5)
+    assert found.plan is plan
+    assert found.outcome is not None
+    assert (found.outcome.cause, found.outcome.ticks, found.refused) == ("time over", 200, "")
+    assert [(strike.kind, strike.board, strike.tick) for strike in found.strikes] == [
+        ("mute", "lower", 40)
+    ]
+    assert found.layout is not None
+    assert [task.name for task in found.layout.tasks] == ["upper", "lower", "lower.planner"]
+    assert any(event.code == "mute" for event in found.events)
+    assert (found.left, found.moving, found.again, found.is_late) == ((), (), None, False)
+    assert found.restart_s == config.supervision.lockstep_restart_s
+    assert abs(time.time_ns() - time.monotonic_ns() - found.offset_ns) < 10**9
+    assert 0.0 < found.wall_s < BOUND_S
+    assert "upper" in found.levels
+
+
+@pytest.mark.slow
+def test_a_rack_that_a_fault_keeps_from_launching_is_tried_without_it(
+    small: Path, rack_name: str
+) -> None:
+    plan = Plan(4, "faults", lockstep=True, faults=({"kind": "self-test", "board": "lower"},))
+    found = run_trial(load(small), plan, rack_name, ticks=0, seconds=0.5)
+    assert "lower" in found.refused
+    assert found.again is not None
+    # Two seconds of simulated time.
+    assert (found.again.cause, found.again.ticks) == ("time over", 800)
+    assert found.strikes == ()
+
+
+class Run:
+    """A run as a trial sees it: its ticks go on by `pace` at each look, and it ends when it is told
+    to, unless it is `stuck`."""
+
+    def __init__(self, pace: int, now: list[float], stuck: bool = False) -> None:
+        self.words = [0] * (max(System) + 1)
+        self.segment = SimpleNamespace(words=self.words)
+        self.config = SimpleNamespace(clock_ns=PERIOD_NS)
+        self.stopped: list[str] = []
+        self.looks = 0
+        self._pace = pace
+        self._now = now
+        self._stuck = stuck
+
+    def start(self, seconds: float | None) -> None:
+        """Begin."""
+        self.seconds = seconds
+
+    def stop(self, why: str) -> None:
+        """Note it."""
+        self.stopped.append(why)
+
+    def watch(self, timeout_s: float) -> bool:
+        """Let half a second pass."""
+        self.looks += 1
+        self._now[0] += 0.5
+        self.words[System.TICK] += self._pace
+        return self._stuck or not self.stopped
+
+
+NO_KILLS = SimpleNamespace(due_in_s=lambda: 0.5, advance=lambda: None)
+LONG = "the trial takes too long"
+
+
+@pytest.mark.parametrize(
+    ("ticks", "seconds", "pace", "ends_at"),
+    [
+        # Four times the length, and a minute.
+        (1000, None, 1000, 4000 + 24_000),
+        (1000, 90.0, 1000, 4000 + 36_000),
+        # Half an hour where no length is known.
+        (0, None, 40_000, 720_000),
+    ],
+)
+def test_no_run_goes_on_for_ever(
+    monkeypatch: pytest.MonkeyPatch, ticks: int, seconds: float | None, pace: int, ends_at: int
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(trial, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    run = Run(pace, now)
+    _watch(run, NO_KILLS, ticks, seconds)  # type: ignore[arg-type]
+    assert run.stopped == [LONG]
+    assert run.seconds == seconds
+    # The look after it is the first beyond.
+    assert ends_at < run.words[System.TICK] <= ends_at + 2 * pace
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_a_run_that_stands_still_is_stopped_and_left_if_it_is_stuck(
+    monkeypatch: pytest.MonkeyPatch, stuck: bool
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(trial, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    run = Run(0, now, stuck)
+    _watch(run, NO_KILLS, 1000, None)  # type: ignore[arg-type]
+    assert run.stopped == [LONG]
+    # Two minutes of half seconds, and twenty seconds more if it does not end.
+    assert run.looks in (range(280, 286) if stuck else range(240, 246))
