@@ -71,8 +71,8 @@ class HostWiring:
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     context: LevelContext
-    is_external: bool = False
-    computing: int = 0
+    is_external: bool
+    computing: int
 
 
 @dataclass(frozen=True)

@@ -354,3 +354,24 @@ def test_whoever_changes_the_bytes_of_a_message_changes_its_version(context: Lev
         "joint_move_status": (1, 544),
         "move_table_status": (1, 448),
     }
+
+
+def test_a_set_point_is_due_two_cycles_after_its_release_and_carries_the_load_there(
+    bench: Bench,
+) -> None:
+    level = bench.level
+    every = level.context.every
+    assert level._due(10 * every) == 12 * every
+    # A new curve begins where the set point before ends.
+    assert level._last_due == 11 * every
+    bench.follow()
+    bench.command(bench.home + 0.3)
+    bench.look()
+    level.do_begin()
+    for _ in range(12):
+        bench.follow()
+    command = bench.write.command
+    assert np.abs(command.velocity).max() > 0.0
+    inertia, bias = level._dynamics.terms(command.position, command.velocity)
+    np.testing.assert_allclose(command.load, bias)
+    np.testing.assert_allclose(command.inertia, np.diagonal(inertia))
