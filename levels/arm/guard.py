@@ -12,6 +12,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import LimitGate
+from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -29,14 +30,17 @@ class GuardedArm:
     """Implements `Link` around an arm, by its samples alone.
 
     A torque that is not finite, or beyond its limit, is refused and engages the brakes. Others are
-    cut so that the cycle ends within the limits, at a state from which the arm can still be stopped
-    (`LimitGate`). The largest error that the encoders may have is kept as a margin on each limit;
-    a sample beyond a limit by more than that error is a violation, is counted, and shows in
-    `exceeded`. What only a simulation knows, contacts and the truth, is not judged here.
+    cut so that the arm stays within the limits, at a state from which it can still be stopped
+    (`LimitGate`), for as long as the motors would keep them: for the arm's patience, as later
+    cycles may be missed. The largest error that the encoders may have is kept as a margin on each
+    limit. A sample beyond a limit by more than that error, or not finite, is a violation: it is
+    counted, shows in `exceeded`, and nothing is driven on it. What only a simulation knows,
+    contacts and the truth, is not judged here.
     """
 
-    def __init__(self, arm: Arm, cell: Cell, joints: Sequence[str], cycle_s: float) -> None:
-        """Guard an arm with these `joints` that gets a torque every `cycle_s`."""
+    def __init__(self, arm: Arm, cell: Cell, joints: Sequence[str], tick_s: float) -> None:
+        """Guard an arm with these `joints`. Raises `RobotError` for encoders too coarse to tell a
+        limit."""
         self._arm = arm
         bounds = cell.bounds
         off = cell.encoders.off
@@ -47,10 +51,19 @@ class GuardedArm:
         self._joints = joints
         kept = Bounds(
             position=bounds.position + np.stack((off, -off), axis=1),
-            velocity=np.maximum(bounds.velocity - speed_off, speed_off),
+            velocity=bounds.velocity - speed_off,
             torque=bounds.torque,
         )
-        self._gate = LimitGate(kept, cell.limits.acceleration, cycle_s, Dynamics(cell))
+        coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
+        if coarse.any():
+            joint = int(coarse.argmax())
+            raise RobotError(
+                f"robot.sensors: '{joints[joint]}' may be off by {off[joint]:g} rad,"
+                f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
+                f" {bounds.velocity[joint]:g} rad/s; permitted: less than half of that"
+            )
+        span_s = arm.patience * tick_s
+        self._gate = LimitGate(kept, cell.limits.acceleration, span_s, Dynamics(cell))
         self._sample: Sensed | None = None
         self.exceeded: Exceeded | None = None
         """Of the newest sample."""
@@ -71,17 +84,19 @@ class GuardedArm:
             arm.clipped += 1
             arm.brake()
             return refused
-        if (sample := self._sample) is not None and np.isfinite(sample[:2]).all():
-            torque, cut = self._gate.admit(torque, sample.position, sample.velocity)
-            arm.clipped += cut
+        sample = self._sample or self.sense()
+        if self.exceeded is not None:
+            arm.brake()
+            return self.exceeded.finding
+        torque, cut = self._gate.admit(torque, sample.position, sample.velocity)
+        arm.clipped += cut
         return arm.drive(torque, grip_force)
 
     def _judge(self, sample: Sensed) -> None:
-        # What is not finite is the sensors' fault, and found as that.
         q = sample.position
-        speed = np.abs(sample.velocity)
-        far = (q < self._low) | (q > self._high)
-        fast = speed > self._fastest
+        # NaN is not within limits either.
+        far = ~((q >= self._low) & (q <= self._high))
+        fast = ~(np.abs(sample.velocity) <= self._fastest)
         if not (far.any() or fast.any()):
             self.exceeded = None
             return

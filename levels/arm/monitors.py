@@ -26,7 +26,7 @@ class LimitMonitor:
             cell.model.joint(int(joint)).name for joint in cell.model.dof_jntid[cell.dof]
         ]
         self._seen = steps.seen
-        (self._low, self._high) = steps.judged[:2]
+        self._low, self._high = steps.judged[:2]
         self.count = 0  # steps in which the drives broke a limit
         # steps in which a blow broke a limit of position or velocity: no drive can prevent it
         self.pushed = 0

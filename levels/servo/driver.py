@@ -75,7 +75,7 @@ class ArmDriver(Executor):
         self._guard = (
             None
             if self.arm.keeps_limits
-            else GuardedArm(self.arm, cell, context.robot.joints, context.period_s)
+            else GuardedArm(self.arm, cell, context.robot.joints, context.tick_s)
         )
         self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._guard)
         # The path to the arm; through `_faulty` while faults are injected.

@@ -13,7 +13,7 @@ import typer
 
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Json, Settings
-from rack.tools.console.pictures import can_draw
+from rack.tools.console.pictures import NO_PICTURES, can_draw
 
 if TYPE_CHECKING:
     from rack.tools.faults.campaigns.campaign import Campaign
@@ -161,7 +161,8 @@ def campaign(
             work = Campaign(order, folder, progress)
             results = work.run()
         report, text = _write(work, results, time.monotonic() - started)
-    print_json(report) if as_json else print(f"{text}\n{folder}/")
+    lacking = "" if can_draw() else f"; {NO_PICTURES}"
+    print_json(report) if as_json else print(f"{text}\n{folder}/{lacking}")
     sys.exit(1 if report["shortfalls"] or report["interrupted"] else 0)
 
 

@@ -16,6 +16,7 @@ from rack.boards.config import load
 from rack.boards.config.cell import built_cell
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, GuardedArm, Sensed, SimulatedArm
+from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import SceneConfig
@@ -166,6 +167,68 @@ def test_a_torque_that_no_drive_may_have_engages_the_brakes(tmp_path: Path) -> N
         refused = guard.drive(torque, 0.0)
         assert refused is not None
         assert (refused.alarm, arm.braked, arm.clipped) == (alarm, True, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path, seed: int) -> None:
+    robot = pendulum(tmp_path)
+    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    random = np.random.default_rng(seed)
+
+    def moved(is_guarded: bool) -> float:
+        arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
+        link = GuardedArm(arm, cell, robot.joints, TICK_S) if is_guarded else arm
+        worst = -np.inf
+        for torque in random_torques(cell, seed, 1500):
+            link.sense()
+            link.drive(torque, 0.0)
+            # The torque is kept until the brakes engage, at the latest.
+            for _ in range(random.integers(1, arm.patience, endpoint=True)):
+                arm.step(1)
+                motion = (arm._q[None], arm._qd[None])
+                worst = max(worst, *excess(cell, motion))
+        assert arm.violations == 0
+        return float(worst)
+
+    assert moved(is_guarded=True) <= 0.0
+    assert moved(is_guarded=False) > 0.1
+
+
+@pytest.mark.parametrize("sample", [(np.nan, 0.0), (0.0, np.nan), (np.inf, 0.0)])
+def test_nothing_is_driven_on_a_sample_that_is_not_finite(
+    tmp_path: Path, sample: tuple[float, float]
+) -> None:
+    robot = pendulum(tmp_path)
+    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    FarArm.jumps = {1: sample}
+    arm = FarArm(cell, SceneConfig(), CLOCK_NS)
+    guard = GuardedArm(arm, cell, robot.joints, TICK_S)
+    guard.sense()
+    assert guard.drive(np.zeros(2), 0.0) is None
+    arm.step(1)
+    guard.sense()
+    refused = guard.drive(np.zeros(2), 0.0)
+    assert refused is not None
+    assert (refused.alarm, refused.subject) == (Alarm.LIMIT_EXCEEDED, 0)
+    assert (arm.braked, arm.violations) == (True, 1)
+    arm.step(1)
+    guard.sense()
+    assert guard.drive(np.zeros(2), 0.0) is None
+    assert not arm.braked
+
+
+def test_encoders_too_coarse_to_tell_a_limit_are_refused(tmp_path: Path) -> None:
+    robot = pendulum(tmp_path)
+    sensors = robot.sensors.model_copy(update={"resolution": 0.25})
+    cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
+    arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
+    with pytest.raises(RobotError) as error:
+        GuardedArm(arm, cell, robot.joints, TICK_S)
+    assert str(error.value) == (
+        "robot.sensors: 'shoulder' may be off by 0.125 rad, 1.25 rad/s: too coarse to keep it below"
+        " 2 rad/s; permitted: less than half of that"
+    )
 
 
 def rig(folder: Path, jumps: dict[int, tuple[float, float]]) -> ServoRig:

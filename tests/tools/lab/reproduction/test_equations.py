@@ -56,7 +56,7 @@ def verdict(holds: bool, mostly: bool) -> JudgedPair:
     """Return a pair as a run keeps it: one equation, measured for one level."""
     left = 1e6 if holds else 3e6
     measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, holds, "")
-    return JudgedPair("3.1", "servo", None, measured, mostly)
+    return JudgedPair("3.1", "servo", measured, mostly)
 
 
 @pytest.mark.parametrize(

@@ -34,12 +34,10 @@ PHASES = ("exchange", "read", "process", "write")
 
 @dataclass(frozen=True)
 class JudgedPair:
-    """An equation on a subject: predicted, measured in the worst cycle, and whether it holds
-    mostly."""
+    """An equation on a subject: measured in the worst cycle, and whether it holds mostly."""
 
     equation: str
     subject: str
-    predicted: EquationVerdict | None
     measured: EquationVerdict | None
     mostly: bool
 
@@ -166,13 +164,12 @@ NASREM = Experiment(
 
 
 def _pairs(analysis: Analysis) -> Iterator[JudgedPair]:
-    """Yield every equation on every subject: predicted, measured in the worst cycle, and in
-    most."""
+    """Yield every equation on every subject: measured in the worst cycle, and in most."""
     mostly = {_key(pair): pair for pair in analysis.mostly}
     for pair in analysis.pairs:
         found = mostly.get(_key(pair))
         holds = found is None or not found.fails
-        yield JudgedPair(pair.equation, pair.subject, pair.predicted, pair.measured, holds)
+        yield JudgedPair(pair.equation, pair.subject, pair.measured, holds)
 
 
 def _key(pair: Pair) -> tuple[str, str, str]:
