@@ -27,8 +27,9 @@ quick: $(STAMP) ## run the quick tests, under a minute: those not marked slow, a
 mutants: $(STAMP) ## check that a campaign notices when a detector is switched off
 	$(BIN)/python -m tests.mutants
 
-golden: $(STAMP) ## write the digests of the shipped racks anew, after a change of what they do
+golden: $(STAMP) ## write digests and snapshots anew, after a change of what racks do
 	$(BIN)/python -m tests.golden
+	WRITE_SNAPSHOTS=1 $(BIN)/python -m pytest -q -n0 $$(git ls-files 'tests/**/test_*.toml' | sed 's/toml$$/py/')
 
 reference: $(STAMP) ## write configs/REFERENCE.md anew, after a change of what a config may hold
 	$(BIN)/python -m tests.reference

@@ -130,17 +130,15 @@ class Targets:
     def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
         """Return whether the mailbox has readers, and messages often enough: plans are not
         periodic."""
-        # The clock writes only for an operator.
-        if (
-            not box.readers
-            or box.writer == CLOCK
-            or (kind.where == "lock" and box.protocol != "lock")
-        ):
+        # The clock writes only for an operator, and a host board when its program says so.
+        role = self._roles.get(box.writer)
+        if role is None or not box.readers:
+            return False
+        if kind.where == "lock" and box.protocol != "lock":
             return False
         # A queue is written on demand, and the position of its reader through no port.
         if kind.where == "writer" and (box.protocol == "queue" or is_position(box)):
             return False
-        role = self._roles[box.writer]
         return role in kind.tasks and (kind.where != "writer" or role == "executor")
 
     def _cycle(self, task: str) -> int:

@@ -1,0 +1,54 @@
+"""Faults of every kind in lockstep: each strikes, is found and is over as it was before."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kind import KINDS, Kind
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import DRIVEN, FOLLOWED, LOCKED, TARGETS
+from tests.snapshots import Snapshots
+from tests.whole_runs import whole_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+SNAPSHOTS = Snapshots(__file__)
+SECONDS = 1.5
+STRIKES: tuple[dict[str, Any], ...] = (
+    {"tick": 101, "seed": 5, "cycles": 3},
+    {"tick": 250, "seed": 6, "for": 0.11},
+    {"tick": 420, "for": 0.3},
+)
+BY_ORDER = ("mute", "masquerade")
+"""Kinds that a reader finds, or not, by whether it or the writer comes first in a tick."""
+LOCKSTEP = [kind for kind in KINDS if not kind.realtime and kind.where != "start"]
+
+
+def faults(kind: Kind) -> tuple[FaultConfig, ...]:
+    """Return three faults of a kind, one after the other."""
+    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
+    once = ("tick", "seed")
+    return tuple(
+        FaultConfig(
+            kind=kind.name,
+            board=board,
+            **{key: value for key, value in strike.items() if key in once or not kind.once},
+        )
+        for strike in STRIKES
+    )
+
+
+@pytest.mark.parametrize("kind", LOCKSTEP, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("text", [FOLLOWED, DRIVEN], ids=["followed", "driven"])
+def test_a_fault_strikes_as_it_did(kind: Kind, text: str, config: MakeConfig) -> None:
+    if kind.where == "arm" and text is FOLLOWED:
+        pytest.skip("that rack has no arm")
+    settings = [LOCKED] if kind.where == "lock" else []
+    rack = config(*settings, text=text).model_copy(update={"fault": faults(kind)})
+    where = "followed" if text is FOLLOWED else "driven"
+    parts = dict(whole_run(rack, SECONDS))
+    if kind.name in BY_ORDER:
+        del parts["events"]
+    SNAPSHOTS.check(f"{kind.name}, {where}", parts)

@@ -1,0 +1,95 @@
+"""What the product derives from the shipped configs, as digests by case and part.
+
+A snapshot says that something changed, not what is right: other tests say that. It stands in a TOML
+file beside its test. `make golden` writes all anew, and git shows which cases changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = tuple(
+    str(path.relative_to(ROOT / "configs"))
+    for path in sorted((ROOT / "configs").rglob("*.toml"))
+    if re.search(r"^(format|name) = ", path.read_text(), re.MULTILINE)
+    and "[[row]]" not in path.read_text()
+)
+"""The shipped configs that are whole racks."""
+WRITES = "WRITE_SNAPSHOTS"
+"""Set in the environment, it makes `Snapshots.check` write."""
+
+
+class Snapshots:
+    """The snapshots of a test's file."""
+
+    def __init__(self, test: str) -> None:
+        self._path = Path(test).with_suffix(".toml")
+
+    def check(self, case: str, parts: Mapping[str, object]) -> None:
+        """Compare the parts of a case with what the file says of them."""
+        found = {part: digest(value) for part, value in parts.items()}
+        known = tomllib.loads(self._path.read_text()) if self._path.exists() else {}
+        if WRITES in os.environ:
+            known[case] = found
+            self._write(known)
+        changed = [part for part in found if known.get(case, {}).get(part) != found[part]]
+        assert not changed, f"{case}: other {', '.join(changed)} than before; meant? make golden"
+        assert found.keys() == known[case].keys()
+
+    def cases(self) -> set[str]:
+        """Return the cases in the file."""
+        return set(tomllib.loads(self._path.read_text()))
+
+    def _write(self, known: Mapping[str, Mapping[str, str]]) -> None:
+        lines = ["# Made by `make golden`, see tests/snapshots.py."]
+        for case, parts in sorted(known.items()):
+            lines += ["", f"[{json.dumps(case)}]"]
+            lines += [f"{json.dumps(part)} = {json.dumps(parts[part])}" for part in parts]
+        self._path.write_text("\n".join(lines) + "\n")
+
+
+def digest(value: object) -> str:
+    """Return a digest of a value: of the plain data in it, without this machine's paths."""
+    text = json.dumps(plain(value)).replace(str(ROOT), "")
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def plain(value: Any) -> Any:  # one match of all kinds
+    """Return a value as JSON may hold it."""
+    match value:
+        case Enum():
+            return value.name
+        case BaseModel():
+            return plain(dict(value))
+        case _ if is_dataclass(value) and not isinstance(value, type):
+            return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        case Mapping():
+            return {str(key): plain(entry) for key, entry in value.items()}
+        case np.ndarray() | np.generic():
+            return value.tolist()
+        case set() | frozenset():
+            return sorted(map(str, value))
+        case tuple() | list():
+            return [plain(entry) for entry in value]
+        case None | bool() | int() | float() | str():
+            return value
+        case Path():
+            return str(value)
+        case type():
+            return f"{value.__module__}.{value.__qualname__}"
+        case bytes():
+            return value.hex()
+    raise TypeError(f"{type(value)} is no plain data")
