@@ -240,8 +240,8 @@ class Layout:
     def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
         """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises
         `KeyError`."""
-        slowest = max((e.grid for e in mailbox.exchanges if e.task == reader), default=None)
-        return slowest or self.task(reader).grid
+        exchanged = (e.grid for e in mailbox.exchanges if e.task == reader)
+        return max(exchanged, default=self.task(reader).grid)
 
 
 def depth_for(span_ticks: int, every: int, least: int = 4) -> int:

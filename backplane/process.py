@@ -58,7 +58,7 @@ def is_alive(pid: int, started: int = 0) -> bool:
     """Say whether a process is alive; with `started`, whether it is still the same process, since
     pids are reused."""
     found = start_time(pid) if pid > 0 else 0
-    return found > 0 and started in (0, found)
+    return bool(found) and started in (0, found)
 
 
 def readable(fd: int, timeout_s: float) -> bool:

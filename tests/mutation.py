@@ -112,6 +112,8 @@ class Mutations:
         match node:
             case (
                 ast.Expr(value=ast.Call(func=ast.Attribute(value=ast.Name("gc"))))
+                | ast.Expr(value=ast.Constant())
+                | ast.If(test=ast.Name("TYPE_CHECKING"))
                 | ast.keyword(arg="strict")
             ):
                 return
@@ -179,7 +181,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:  # noqa: C901  # one match of
         # The positions within an f-string are wrong before Python 3.12, and it is text.
         case ast.JoinedStr() | ast.Raise() | ast.Import() | ast.ImportFrom() | ast.Assert():
             return
-        case ast.If(test=ast.Name("TYPE_CHECKING") | ast.Compare(left=ast.Name("__name__"))):
+        case ast.If(test=ast.Compare(left=ast.Name("__name__"))):
             return
         case ast.Call(func=ast.Name("print" | "cast" | "TypeVar" | "warn")):
             return

@@ -8,6 +8,7 @@ memory: boards, `rack check` and recordings use the same arithmetic.
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from heapq import merge
@@ -79,7 +80,7 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
     load = sum(source.service_ns / source.every_ns for source in sources)
     if load >= FULL_LOAD:
         return Burst(load, None, None)
-    inbox = Inbox(1 << 62)
+    inbox = Inbox(sys.maxsize)
     free_ns = 0
     longest_ns = 0
     for at_ns, service_ns in merge(*(_arrivals(source) for source in sources)):

@@ -81,7 +81,7 @@ class MessageOrder:
             self.launch = head.launch
         else:
             self.launch = head.launch
-            self.number = head.number - 1
+            self.number = head.number
             self.serial = 0
             self._came = 0
 

@@ -7,9 +7,16 @@ from typing import cast
 
 import pytest
 
+from rack.backplane.segment import Segment
 from rack.boards.crate import patience
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.patience import COMPILE_S, PATIENCE_S, Patience, await_opened
+from rack.boards.crate.patience import (
+    COMPILE_S,
+    PATIENCE_S,
+    Patience,
+    RackAwaited,
+    await_opened,
+)
 from rack.boards.crate.requests import Compiling, Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
 from rack.boards.events import Journal
@@ -130,3 +137,23 @@ def test_a_crate_that_fails_or_ends_says_why(clock: Clock) -> None:
     assert opened(clock, (0.0, failed))[1] == "'a:B' cannot be preloaded: no such file"
     assert opened(clock, (0.0, None))[1] == "the crate has ended"
     assert opened(clock, (0.0, None), output="killed")[1] == "killed"
+
+
+def test_a_rack_that_is_awaited_is_named_each_time_the_wait_has_doubled(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits = [("lan", "waits for rack 'b'")]
+    monkeypatch.setattr(patience, "awaited", lambda segment: iter(waits))
+    journal = Journal(None)
+    rack = RackAwaited(cast("Segment", None), journal)
+    for passed in (0.0, 1.9, 2.1, 4.1):
+        clock.now = 1000.0 + passed
+        rack.look()
+    assert said(journal) == [f"'lan' waits for rack 'b', {s} s so far" for s in (2, 4)]
+    waits.clear()
+    rack.look()
+    waits.append(("lan", "waits for rack 'c'"))
+    rack.look()
+    clock.now += 2.1
+    rack.look()
+    assert said(journal)[2:] == ["'lan' waits for rack 'c', 2 s so far"]

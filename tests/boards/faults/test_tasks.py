@@ -3,6 +3,7 @@ time costs."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from typing import cast
@@ -48,6 +49,7 @@ def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(
         begun = time.monotonic()
         wait_until(lambda: time.monotonic() - begun > LEAST_S, BOUND_S)
         assert processor_ns(pid) < 0.5 * (time.monotonic() - begun) * 1e9
+        assert os.sched_getaffinity(pid) == {0}
         segment.words[System.STATE] = Run.STOPPED
         assert exit_status(pid) == 0
 

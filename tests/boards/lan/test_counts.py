@@ -108,3 +108,21 @@ def test_a_number_that_a_restarted_sender_gives_twice_moves_nothing() -> None:
     assert (count.disordered, count.repeated) == (1, 0)
     assert not found.admits(head(2))
     assert (count.disordered, count.repeated) == (1, 1)
+
+
+def test_a_number_given_twice_takes_no_place_of_one_that_is_missing() -> None:
+    found, count = order()
+    assert found.admits(head(18, serial=54))
+    assert found.admits(head(20, serial=60))
+    assert found.admits(head(20, serial=64))
+    assert not found.admits(head(19, serial=57))
+    assert (count.missing, count.disordered, count.repeated) == (1, 1, 0)
+
+
+def test_an_old_write_under_the_newest_number_is_repeated() -> None:
+    found, count = order()
+    assert found.admits(head(18, serial=54))
+    assert found.admits(head(20, serial=60))
+    assert not found.admits(head(20, serial=59))
+    assert not found.admits(head(21, serial=58))
+    assert (count.disordered, count.repeated) == (0, 2)

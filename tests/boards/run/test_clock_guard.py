@@ -94,3 +94,30 @@ def test_a_skip_while_the_guard_is_lost_is_seen_when_it_is_back(config: MakeConf
     (back,) = [event for event in rack.events if event.code == "rejoined"]
     assert (found.board, found.value, found.since, found.tick) == ("wave", 3.0, 150, back.tick)
     assert reported == 3
+
+
+def test_a_skip_from_the_very_tick_of_a_release_is_reported_in_it(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    segment = make_bus(task("level", every=4))
+    guard = guard_of(segment)
+    RealtimeDriver(segment, lambda _: None).count_skipped(8, 2)
+    guard.report_skipped(8)
+    assert rung(segment) == [(8, 8, 2.0)]
+
+
+@pytest.mark.parametrize(("part", "count"), [(0.4, 0), (0.6, 1)])
+def test_a_clock_is_late_from_half_a_tick_on(
+    part: float,
+    count: int,
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    segment = make_bus(task("level", every=4))
+    segment.words[System.PERIOD_NS] = PERIOD_NS
+    guard = guard_of(segment)
+    segment.words[System.TICK] = 4
+    segment.words[System.TICK_NS] = 4 * PERIOD_NS + round(part * PERIOD_NS)
+    guard.check_release(4)
+    guard.check_release(4)
+    rows, _ = alarm_ring(segment, "level").drain()
+    assert [int(row["code"]) for row in rows] == [Alarm.CLOCK_LATE] * count

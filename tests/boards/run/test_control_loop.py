@@ -12,6 +12,7 @@ import pytest
 
 from rack.backplane import semaphores
 from rack.backplane.errors import MailboxError
+from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock, open_writer
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.process import die_with_parent, set_priority, take_processor
@@ -20,6 +21,7 @@ from rack.backplane.trace import Flag, trace_ring
 from rack.backplane.words import Block, System
 from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
+from rack.boards.faults.kind import KINDS
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
 from tests.backplane.bus import task as task_spec
@@ -240,3 +242,32 @@ def test_a_board_dies_with_its_crate() -> None:
     os.kill(pid, 9)
     assert exit_status(pid) == -9
     wait_until(lambda: not runs(board))
+
+
+def test_a_pause_in_reading_is_noted_in_a_cycle_that_begins_late(bench: MakeBench) -> None:
+    rack = bench()
+    watch = rack.task("watch")
+    rack.to(8)
+    watch.cycle(8)
+    assert watch.inputs.task.since == 8
+    rack.to(16)
+    watch.cycle(16)
+    assert watch.inputs.task.since == 8
+    rack.to(32)
+    watch.next_cycle.skipped = 1
+    watch.cycle(32)
+    assert watch.inputs.task.since == 32
+
+
+def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
+    rack = bench()
+    wave = rack.task("wave")
+    at = [task.name for task in rack.segment.layout.processes].index("wave")
+    kind = KINDS["overrun"]
+    entry = FaultTable(rack.segment).add(Injection(kind.number, at, parameters=(0.0, 0.0)))
+    entry.words[Entry.STAGE] = Stage.ACTIVE
+    wave.faults.refresh(0)
+    rack.to(0)
+    wave.cycle(0)
+    assert entry[Entry.COUNT] == 1
+    assert entry[Entry.STRUCK_TICK] == 0

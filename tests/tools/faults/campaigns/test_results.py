@@ -182,3 +182,7 @@ def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_pa
     keep(judged, path)
     assert kept(path) == judged.result()
     assert [file.name for file in path.parent.iterdir()] == ["1.json"]
+
+
+def test_the_time_of_a_trial_is_kept_to_a_millisecond() -> None:
+    assert Judged.of(replace(trial(SEEN, FLOWS), wall_s=1.23456)).result().wall_s == 1.235

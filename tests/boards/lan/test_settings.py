@@ -1,0 +1,40 @@
+"""What the network may do, as the libraries are told: nothing of it changes unseen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.boards.lan.access import access_control
+from rack.boards.lan.config import LanTable
+from rack.boards.lan.link import _settings
+from tests.snapshots import Snapshots
+
+SNAPSHOTS = Snapshots(__file__)
+ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
+TABLES: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "loopback": {"listen": ("tcp/127.0.0.1:7447",), "export": {"a": {"from": "a.status"}}},
+    "beyond": {"listen": ("tcp/10.0.0.1:7447",), "insecure": True, "permit": {"x": ["stop"]}},
+    "tls": {
+        "listen": ("tls/10.0.0.1:7447",),
+        "connect": ("tls/friend.example:7447",),
+        "export": {"a": {"from": "a.status"}},
+        "import": {"own": {"from": "friend/pulse.status", **ENTRY}},
+        "peers": ("other",),
+        "permit": {"x": ["watch", "command"], "other": ["stop"]},
+        "lease_ms": 300.0,
+    },
+}
+
+
+@pytest.mark.parametrize("asks", [False, True])
+@pytest.mark.parametrize("name", TABLES)
+def test_the_network_is_permitted_what_it_was(name: str, asks: bool) -> None:
+    table = LanTable.model_validate(TABLES[name])
+    parts = {
+        "access": access_control("home", table, asks),
+        "settings": str(_settings("home", table, None, asks)),
+    }
+    SNAPSHOTS.check(f"{name}{', asking' if asks else ''}", parts)

@@ -1,0 +1,70 @@
+"""The numbers on which a room is built: its constants, and the defaults of its functions and
+records. None changes unseen."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rack.backplane.message import MessageType
+from tests.snapshots import ROOT, Snapshots, digest
+
+KINDS = (bool, int, float, str, tuple, frozenset, MessageType)
+
+
+def check_numbers(test: str) -> None:
+    """Compare the numbers of the room that a file of tests mirrors with those beside it."""
+    room = Path(test).parent.relative_to(ROOT / "tests")
+    name = ".".join(("rack", *room.parts))
+    package = importlib.import_module(name)
+    found = {}
+    for info in pkgutil.iter_modules(package.__path__, f"{name}."):
+        if not info.ispkg and not info.name.endswith("__main__"):
+            numbers = dict(_numbers(importlib.import_module(info.name)))
+            if numbers:
+                found[info.name] = numbers
+    Snapshots(test).check(str(room), found)
+
+
+def _numbers(module: ModuleType) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers of a module by name."""
+    for name, value in sorted(vars(module).items()):
+        if name.startswith("__"):
+            continue
+        if name.isupper() and isinstance(value, KINDS) and _is_plain(value):
+            yield name, value
+        elif getattr(value, "__module__", "") == module.__name__:
+            yield from _defaults(name, value)
+
+
+def _defaults(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the defaults of a function, or of a class's fields and methods."""
+    if inspect.isfunction(value):
+        for parameter in inspect.signature(value).parameters.values():
+            if isinstance(parameter.default, KINDS) and _is_plain(parameter.default):
+                yield f"{name}({parameter.name})", parameter.default
+    elif inspect.isclass(value):
+        if is_dataclass(value):
+            for field in fields(value):
+                if field.default is not MISSING and _is_plain(field.default):
+                    yield f"{name}.{field.name}", field.default
+        for key, method in sorted(vars(value).items()):
+            yield from (
+                _defaults(f"{name}.{key}", inspect.unwrap(method))
+                if inspect.isfunction(method)
+                else ()
+            )
+
+
+def _is_plain(value: object) -> bool:
+    try:
+        digest(value)
+    except TypeError:
+        return False
+    return True
