@@ -15,7 +15,7 @@ from typing import Any
 from rack.backplane.message import MessageType
 from tests.snapshots import ROOT, Snapshots, digest
 
-KINDS = (bool, int, float, str, tuple, frozenset, MessageType)
+KINDS = (bool, int, float, str, tuple, frozenset, dict, MessageType)
 
 
 def check_numbers(test: str) -> None:
@@ -44,22 +44,26 @@ def _numbers(module: ModuleType) -> Iterator[tuple[str, Any]]:
 
 
 def _defaults(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the defaults of a function, or of a class's fields and methods."""
+    """Yield the defaults of a function, or those in a class."""
     if inspect.isfunction(value):
         for parameter in inspect.signature(value).parameters.values():
             if isinstance(parameter.default, KINDS) and _is_plain(parameter.default):
                 yield f"{name}({parameter.name})", parameter.default
     elif inspect.isclass(value):
-        if is_dataclass(value):
-            for field in fields(value):
-                if field.default is not MISSING and _is_plain(field.default):
-                    yield f"{name}.{field.name}", field.default
-        for key, method in sorted(vars(value).items()):
-            yield from (
-                _defaults(f"{name}.{key}", inspect.unwrap(method))
-                if inspect.isfunction(method)
-                else ()
-            )
+        yield from _of_class(name, value)
+
+
+def _of_class(name: str, value: type) -> Iterator[tuple[str, Any]]:
+    """Yield the defaults of a class's fields and methods, and what it declares."""
+    if is_dataclass(value):
+        for field in fields(value):
+            if field.default is not MISSING and _is_plain(field.default):
+                yield f"{name}.{field.name}", field.default
+    for key, entry in sorted(vars(value).items()):
+        if inspect.isfunction(entry):
+            yield from _defaults(f"{name}.{key}", inspect.unwrap(entry))
+        elif not key.startswith("__") and isinstance(entry, KINDS) and _is_plain(entry):
+            yield f"{name}.{key}", entry
 
 
 def _is_plain(value: object) -> bool:

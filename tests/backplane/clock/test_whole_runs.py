@@ -1,0 +1,48 @@
+"""The clock in whole racks in lockstep: what is released, awaited, held, lost and taken back stays
+as it was."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.boards.faults.config import FaultConfig
+from tests.boards.conftest import PLAIN, PLANNED, MakeConfig, config  # noqa: F401  a fixture
+from tests.boards.fault_racks import DRIVEN, FOLLOWED
+from tests.boards.run.test_exchange import TEXT as EXCHANGE
+from tests.snapshots import Snapshots
+from tests.whole_runs import whole_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+SNAPSHOTS = Snapshots(__file__)
+SECONDS = 1.5
+RACKS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "planned": (PLANNED, ()),
+    "phase": (PLAIN, ("board.watch.phase=3",)),
+    "given up": (FOLLOWED, ("supervision.restarts=0",)),
+    "driven": (DRIVEN, ()),
+    "exchange": (EXCHANGE, ()),
+}
+LOST: tuple[dict[str, Any], ...] = (
+    {"kind": "kill", "board": "wave", "tick": 101},
+    {"kind": "clock-skip", "board": "clock", "tick": 150},
+    {"kind": "hang", "board": "watch", "tick": 240, "for": 0.1},
+)
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["whole", "lost"])
+@pytest.mark.parametrize("case", RACKS)
+def test_the_clock_of_a_rack_does_what_it_did(
+    case: str,
+    lost: bool,
+    config: MakeConfig,  # noqa: F811
+) -> None:
+    text, settings = RACKS[case]
+    rack = config(*settings, text=text)
+    if lost:
+        faults = [
+            FaultConfig(**fault) for fault in LOST if fault["board"] in (*rack.board, "clock")
+        ]
+        rack = rack.model_copy(update={"fault": tuple(faults)})
+    SNAPSHOTS.check(f"{case}, {'lost' if lost else 'whole'}", whole_run(rack, SECONDS))
