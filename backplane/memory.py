@@ -28,10 +28,9 @@ _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _MCL_ONFAULT = 4
-_POPULATE_READ, _POPULATE_WRITE = (
-    22,
-    23,
-)  # MADV_*, since Linux 5.14; without them pages are touched by the first cycles
+# MADV_*, since Linux 5.14; without them pages are touched by the first cycles.
+_POPULATE_READ = 22
+_POPULATE_WRITE = 23
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
 RESERVE = 4 << 20
@@ -74,8 +73,11 @@ def touch_memory() -> None:
     reserve = ctypes.create_string_buffer(RESERVE)
     del reserve
     for span, rights, used in _mappings():
-        # "rw-s" is the segment: all of it.
-        for first, last in [span] if rights == "rw-s" else used if rights[1] == "w" else ():
+        if rights == "rw-s":
+            used = [span]  # the segment: all of it
+        elif rights[1] != "w":
+            continue
+        for first, last in used:
             _libc.madvise(first, last - first, _POPULATE_WRITE)
     for first, last in _FILES:
         _libc.madvise(first, last - first, _POPULATE_READ)

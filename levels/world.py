@@ -52,10 +52,8 @@ class WorldModel(Executor):
         self._moving = np.zeros(bodies, dtype=bool)
         self._slow_s = np.zeros(bodies)
         self._find = find_motion.load()
-        self._seen_tick, self._interval = (
-            -1,
-            0,
-        )  # tick of the last scene, and ticks since the one before it
+        self._seen_tick = -1
+        self._interval = 0
         self._started = False
 
     @classmethod

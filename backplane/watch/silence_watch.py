@@ -81,7 +81,10 @@ class SilenceWatch:
     ) -> None:
         spec = reader.spec
         is_periodic = segment.layout.task(spec.writer).role == "executor"
-        self.quiet = 0 if spec.max_age else MUTE_CYCLES * spec.every if is_periodic else NOT_YET
+        if spec.max_age:
+            self.quiet = 0
+        else:
+            self.quiet = MUTE_CYCLES * spec.every if is_periodic else NOT_YET
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._reader = reader

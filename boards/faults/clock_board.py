@@ -266,9 +266,10 @@ class FaultStage:
         kind = KINDS[entry[Entry.KIND]]
         words[Entry.FROM] = tick
         lasts = entry[Entry.TICKS]
-        # Such a fault of a task stays active until the task's next cycle.
-        is_over_at_once = kind.once and not kind.is_of_task
-        words[Entry.UNTIL] = tick + 1 if is_over_at_once else tick + lasts if lasts else NEVER
+        if kind.once and not kind.is_of_task:
+            # Such a fault of a task stays active until the task's next cycle.
+            lasts = 1
+        words[Entry.UNTIL] = tick + lasts if lasts else NEVER
         words[Entry.STAGE] = Stage.ACTIVE
         self._words[System.FAULTS] += 1
         self._alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)

@@ -72,10 +72,9 @@ class CollisionChecker:
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
         self._required = self._base.copy()
-        self._q, self._least = (
-            np.zeros(len(cell.qpos)),
-            np.inf,
-        )  # the last configuration checked, and its clearance
+        # The last configuration checked, and its clearance.
+        self._q = np.zeros(len(cell.qpos))
+        self._least = np.inf
         m = self._model
         d = self._data
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])

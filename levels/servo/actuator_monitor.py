@@ -73,10 +73,9 @@ class ActuatorMonitor:
         self._judge = partial(left_over.load(), self._table, 0.5 / period_s, following)
         self._begun = False
         self._pushed = False  # weak motors do not explain the difference
-        self._cycles, self._joint = (
-            0,
-            -1,
-        )  # cycles for which a motor has lacked torque, and its joint
+        # For how many cycles a motor has lacked torque, and its joint.
+        self._cycles = 0
+        self._joint = -1
         self._commanded = self._given = self._most = (
             0.0  # N m: commanded and given at first, most given since
         )
@@ -188,17 +187,15 @@ def left_over(
 ) -> int:
     """Compare the torques that a motion took with those commanded; keep the present state for the
     next cycle."""
-    velocity_before, bias_before, torque = (
-        table[0],
-        table[1],
-        table[2],
-    )  # rad/s, N m, N m: at the cycle's beginning
+    # At the beginning of the cycle: rad/s, N m, N m.
+    velocity_before = table[0]
+    bias_before = table[1]
+    torque = table[2]
     inertia_before = table[13:]  # kg m2
-    dry, early = table[3], table[4]  # friction, N m; time constant of the simulated one, s
-    noise, uncertain = (
-        table[5],
-        table[6],
-    )  # N m, rad/s2: of exact encoders, and acceleration that others may simulate
+    dry = table[3]  # friction, N m
+    early = table[4]  # time constant of the simulated one, s
+    noise = table[5]  # of exact encoders, N m
+    uncertain = table[6]  # acceleration that others may simulate, rad/s2
     off = table[7]  # rad: error of the positions
     position = state[0]
     velocity = state[1]

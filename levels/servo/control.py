@@ -136,12 +136,10 @@ def set_torque(
     bias: Array,  # (joints,), N m
 ) -> bool:
     """Set the torques of `ComputedTorque`; return whether a limit cut one."""
-    stiffness, damping, dry, limits = (
-        table[0],
-        table[1],
-        table[2],
-        table[3],
-    )  # 1/s2, 1/s, N m (friction), N m
+    stiffness = table[0]  # 1/s2
+    damping = table[1]  # 1/s
+    dry = table[2]  # friction, N m
+    limits = table[3]  # N m
     torque = table[4]  # N m: set
     cut = False
     for j in range(len(torque)):

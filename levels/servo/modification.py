@@ -135,10 +135,8 @@ class ModificationConfig(Table):
     @field_validator("cls")
     @classmethod
     def _has_a_hook(cls, reference: str) -> str:
-        hook, known = (
-            getattr(named_class(reference, Modification), "hook", None),
-            [str(hook) for hook in Hook],
-        )
+        hook = getattr(named_class(reference, Modification), "hook", None)
+        known = [str(hook) for hook in Hook]
         if hook not in known:
             name = reference.partition(":")[2]
             raise ValueError(f"class '{name}' has the hook {hook!r}; permitted: {', '.join(known)}")

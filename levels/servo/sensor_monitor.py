@@ -301,32 +301,32 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
 ) -> int:
     """Check a sample against the estimate, and take it if nothing is in doubt; return the
     verdict."""
-    q, qd, last_q, last_qd = (
-        table[0],
-        table[1],
-        table[2],
-        table[3],
-    )  # this sample and the one before it: rad, rad/s
-    position, velocity, doubt = table[4], table[5], table[6]  # the estimate: rad, rad/s, rad
-    room, speed_room, unshown = (
-        table[7],
-        table[8],
-        table[9],
-    )  # for errors, rad, rad/s; motion that must show, rad
+    # This sample and the one before it, rad and rad/s.
+    q = table[0]
+    qd = table[1]
+    last_q = table[2]
+    last_qd = table[3]
+    # The estimate: rad, rad/s, rad.
+    position = table[4]
+    velocity = table[5]
+    doubt = table[6]
+    # For errors, rad and rad/s; motion that must show, rad.
+    room = table[7]
+    speed_room = table[8]
+    unshown = table[9]
     # Cycles without a change while the set point moves, and its motion in that time, rad;
     # integrated velocity while the sample does not change, rad.
     still = table[10]
     still_way = table[11]
     claimed = table[12]
-    way, allowed = (
-        table[13],
-        table[14],
-    )  # set: motion since the last sample, and room for its errors, rad
-    braking, fastest = table[15], table[16]  # rad/s2, rad/s
-    fits, unchanged = (
-        table[17],
-        table[18],
-    )  # set to 0 or 1: agrees with velocities; if taken, is as before
+    # Set here: motion since the last sample, and room for its errors, rad.
+    way = table[13]
+    allowed = table[14]
+    braking = table[15]  # rad/s2
+    fastest = table[16]  # rad/s
+    # Set to 0 or 1: agrees with velocities; if taken, is as before.
+    fits = table[17]
+    unchanged = table[18]
     good = not faulty
     in_doubt = False
     at_rest = False

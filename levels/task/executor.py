@@ -207,9 +207,10 @@ class TaskExecutor(Executor):
         if waits and status.state == State.EXECUTING:
             status.state = State.HOLDING
         status.error = self._error
-        status.reason = (
-            self._reason if self._error else waits if status.state == State.HOLDING else ""
-        )
+        if self._error:
+            status.reason = self._reason
+        else:
+            status.reason = waits if status.state == State.HOLDING else ""
         status.action = self._actions_done(plan)
         status.actions = len(self._actions)
         status.moves_done = self._done

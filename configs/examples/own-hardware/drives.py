@@ -35,7 +35,9 @@ class Drives:
 
     def write(self, torque: Array) -> None:
         """Release the brakes and apply torques, (joints,), N m."""
-        self.torque[:], self.braked, self._silent_ticks = torque, False, 0
+        self.torque[:] = torque
+        self.braked = False
+        self._silent_ticks = 0
 
     def brake(self) -> None:
         """Engage the brakes."""

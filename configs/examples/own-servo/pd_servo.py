@@ -42,7 +42,8 @@ class PdServo(Executor):
         self.grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
         self.dynamics = Dynamics(cell)
         self.rest = np.zeros(len(cell.home))  # (joints,), rad/s
-        self.target, self.target_velocity = cell.home, self.rest  # (joints,), rad and rad/s
+        self.target = cell.home  # (joints,), rad
+        self.target_velocity = self.rest  # rad/s
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Let the arm's time pass to `tick`, sense, drive, report."""
