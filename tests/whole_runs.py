@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, System
@@ -66,6 +67,7 @@ def counted(segment: Segment) -> dict[str, object]:
             for task in layout.processes
         },
         "system": [segment.words[word] for word in OF_SYSTEM],
+        "sysfail": UtilityLines(segment).sysfail,
         "cycles": cycles,
     }
 

@@ -62,7 +62,7 @@ class ReleasedTask:
         """Say whether the task can take a release; it cannot while it works on a plan or is
         lost."""
         block = self.block
-        return block[_DEADLINE] <= release and not block[_LOST]
+        return block[_DEADLINE] <= release and not self.is_lost
 
     def release(self, tick: int) -> None:
         """Give the task its newest release."""
@@ -86,7 +86,7 @@ class ReleasedTask:
     def is_settled(self) -> bool:
         """Say whether it has finished, or will not: there is nothing to wait for."""
         block = self.block
-        return block[_DONE] == block[_RELEASED] or bool(block[_LOST]) or self.is_stopped
+        return block[_DONE] == block[_RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
@@ -98,8 +98,13 @@ class ReleasedTask:
         self.is_stopped = state_of(self.block[Block.PID]) in STOPPED
 
     @property
+    def is_lost(self) -> bool:
+        """Whether the task was found lost and has not rejoined."""
+        return bool(self.block[_LOST])
+
+    @property
     def lost_tick(self) -> int:
-        """Tick at which the task was found lost; -1: it is not."""
+        """Tick at which a lost task was found so."""
         return self.block[_LOST] - 1
 
     @property

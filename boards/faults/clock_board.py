@@ -60,7 +60,7 @@ class StruckRack:
         pid = task.block[Block.PID]
         # A host board whose program is done, or given up, or which a replay does without, has no
         # process; the crate may not have seen yet that one has ended.
-        if task.lost_tick >= 0 or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
+        if task.is_lost or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
             return False
         entry.acted(tick)
         try:
@@ -102,9 +102,7 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     words = rack.segment.words
     before = words[System.LOSSES]
     if rack.send(entry, tick, task, signal.SIGKILL):
-        rack.driver.await_state(
-            task, lambda: task.lost_tick >= 0 and words[System.LOSSES] != before
-        )
+        rack.driver.await_state(task, lambda: task.is_lost and words[System.LOSSES] != before)
 
 
 def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
@@ -113,12 +111,12 @@ def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         task.is_stopped = True
         if task.spec.role == "host":
             # The Rack ends its process some time; lockstep waits for that here.
-            rack.driver.await_state(task, lambda: task.lost_tick >= 0)
+            rack.driver.await_state(task, lambda: task.is_lost)
 
 
 def _continue(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
-    if task is not None and task.is_stopped and task.lost_tick < 0:
+    if task is not None and task.is_stopped and not task.is_lost:
         with suppress(ProcessLookupError):
             os.kill(task.block[Block.PID], signal.SIGCONT)
         task.is_stopped = False
@@ -127,7 +125,7 @@ def _continue(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
 
 def _is_lost(rack: StruckRack, entry: FaultEntry) -> bool:
     task = rack.target(entry)
-    return task is not None and task.lost_tick >= 0
+    return task is not None and task.is_lost
 
 
 def _masquerade(rack: StruckRack, entry: FaultEntry, tick: int) -> None:

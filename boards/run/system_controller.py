@@ -80,9 +80,9 @@ class SystemController:
         seen = words[_LOSSES], self._driver.watchdog.losses
         processes = self._driver.processes
         for task in processes:
-            if task.lost_tick >= 0:
+            if task.is_lost:
                 self._handle_loss(task, tick)
-        lost = [task for task in processes if task.lost_tick >= 0]
+        lost = [task for task in processes if task.is_lost]
         # Read before they are acted on: a change in between is handled at the next tick.
         emergency = words[_EMERGENCY]
         peer = words[_PEER_STOP]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import monotonic_ns
 
 import pytest
@@ -49,6 +50,11 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     assert read.parameters[:3].tolist() == [0.5, -1.0, 3.25]
     assert (read.stage, read[Entry.UNTIL], read[Entry.STRUCK_TICK]) == (Stage.WAITING, NEVER, -1)
     assert segment.words[System.INJECTED] == 1
+
+
+def test_a_fault_without_a_condition_waits_for_its_tick_alone(make_bus: MakeBus) -> None:
+    entry = FaultTable(make_bus(mailbox())).add(replace(WHOLE, when=None))
+    assert entry[Entry.WHEN_BOX] == -1
 
 
 def test_a_task_finds_its_own_active_faults(make_bus: MakeBus) -> None:

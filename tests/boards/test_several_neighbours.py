@@ -132,6 +132,9 @@ def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConf
         "arm.status",
         "joint2.status",
     ]
+    # Of two boards it is the one between them, of one board none.
+    assert [box.name for box in mailboxes_along(layout, ("joint2", "arm"))] == ["joint2.part"]
+    assert mailboxes_along(layout, ("arm",)) == ()
     assert command_paths(rack_timing(config, layout), layout)["path"].cycles == (8, 1, 1)
 
 

@@ -59,8 +59,21 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
         assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
         assert not writer.write(1, now=1)
     assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (1, 1, 1)
+    # Its holder lives: the reader was held up by no fault.
+    assert (reader.statistics.held_up, reader.statistics.bad_reads) == (0, 1)
     assert writer.write(2, now=2)
     assert reader.read(2).is_new
+
+
+def test_a_read_that_a_dead_holder_held_up_is_counted_once(bus: Segment) -> None:
+    reader = open_reader(bus, NAME)
+    holder = fork(lambda: hold(bus))
+    wait_until(lambda: bus.words[REPORT])
+    kill(holder)
+    for _ in range(3):
+        reader.read(0)
+    assert (reader.statistics.held_up, reader.statistics.bad_reads) == (1, 1)
+    assert reader.statistics.bus_errors == 0
 
 
 def test_a_bus_error_before_the_first_message_gives_none(bus: Segment) -> None:

@@ -49,6 +49,13 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("kind", ["kill", "hang"])
+def test_a_fault_at_the_first_tick_strikes_as_later(kind: str, config: MakeConfig) -> None:
+    fault = FaultConfig(kind=kind, board="wave", tick=0)
+    struck = config(text=FOLLOWED).model_copy(update={"fault": (fault,)})
+    SNAPSHOTS.check(f"{kind} at the first tick", whole_run(struck, SECONDS))
+
+
 @pytest.mark.parametrize(("kind", "rack"), CASES)
 def test_a_fault_strikes_as_it_did(kind: Kind, rack: str, config: MakeConfig) -> None:
     settings = [LOCKED] if kind.where == "lock" else []

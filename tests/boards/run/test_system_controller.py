@@ -8,6 +8,7 @@ import pytest
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
+from rack.backplane.operator_table import OperatorTable, Request, RequestStage, RequestWord
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter, alarm_ring
 from rack.backplane.words import Block, Demand, System, TaskState
@@ -16,7 +17,7 @@ from rack.boards.faults.config import FaultConfig
 from rack.boards.run.system_controller import EndOfRun, SystemController
 from rack.boards.wiring import ClockWiring
 from rack.levels.messages import TASK_STATUS
-from tests.backplane.bus import task
+from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.boards.conftest import MakeConfig
 from tests.tools.faults.test_ending import box
@@ -97,6 +98,23 @@ def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> Non
     # Rejoined after two ticks, and after six.
     values = rack.alarms.drain().rows["value"].tolist()
     assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
+
+
+def test_a_command_whose_client_has_died_is_not_issued_and_says_so(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    segment = make_bus(mailbox(name="left.operator", writer="clock"), *BOARDS)
+    rack, table = Controlled(segment), OperatorTable(segment)
+    claim = table.try_claim(Request(0, b"", tick=2))
+    assert claim is not None
+    rack.controller.begin(1)
+    claim.leave()
+    rack.controller.begin(2)
+    assert claim.entry[RequestWord.GIVEN_TICK] == -1
+    assert claim.entry.stage is RequestStage.WAITING
+    assert segment.words[System.COMMANDED] == 0
+    # Left out for good: the clock has no more to do with it.
+    assert not table.waiting()
 
 
 def test_the_emergency_stop_engages_brakes_until_it_is_released(

@@ -1,0 +1,47 @@
+"""What every kind of fault declares, with the values that a campaign draws for it."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from random import Random
+from typing import Any
+
+import pytest
+
+from rack.boards.faults.drawing import Drawing
+from rack.boards.faults.kind import KINDS, Kind, Parameter
+from tests.snapshots import Snapshots
+
+SNAPSHOTS = Snapshots(__file__)
+DRAWS = 20
+
+
+def declared(record: Kind | Parameter) -> dict[str, Any]:
+    """Return what a record holds, but for functions."""
+    values = {field.name: getattr(record, field.name) for field in fields(record)}
+    return {
+        name: value
+        for name, value in values.items()
+        if not callable(value) and name not in ("bound", "parameters", "step")
+    }
+
+
+def drawn(kind: Kind) -> list[list[float]]:
+    """Return what a campaign draws for each parameter of a kind, and how long it lasts."""
+    draws = [parameter.drawn for parameter in kind.parameters] + [kind.lasts]
+    basis = Drawing(Random(7), cycle=8, reader=100, second=400.0, joints=6)
+    return [[draw(basis) for _ in range(DRAWS)] for draw in draws if draw]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_a_kind_declares_what_it_did(kind: Kind) -> None:
+    SNAPSHOTS.check(
+        kind.name,
+        {
+            "kind": declared(kind),
+            "parameters": [declared(parameter) for parameter in kind.parameters],
+            "bound": str(kind.bound),
+            "number": kind.number,
+            "drawn": drawn(kind),
+        },
+    )
