@@ -152,7 +152,7 @@ class BoardInbox:
     def __init__(self, segment: Segment, slot: int) -> None:
         boxes = segment.layout.interrupting(slot)
         self.lines = {box.name: InterruptLine(segment, box) for box in boxes}
-        self.inbox = Inbox(min((how_sent(box).depth for box in boxes), default=0))
+        self.inbox = Inbox(min(how_sent(box).depth for box in boxes))
         self.count = 0
         """Messages served."""
         self.service_ns = 0

@@ -42,11 +42,7 @@ class SimulatedArm(Simulation, Arm):
         self._qpos: memoryview[float] = memoryview(d.qpos)
         self._qvel: memoryview[float] = memoryview(d.qvel)
         self._ctrl: memoryview[float] = memoryview(d.ctrl)
-        self._grip = cell.gripper_actuator
-        gripped = cell.gripper_qpos, cell.gripper_dof
-        self._gripper = (
-            None if gripped[0] is None or gripped[1] is None else (gripped[0], gripped[1])
-        )
+        self._gripper = cell.gripper
         dynamics = Dynamics(cell)
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
@@ -83,17 +79,18 @@ class SimulatedArm(Simulation, Arm):
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
-        if self._gripper is None:
+        gripper = self._gripper
+        if gripper is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
-        at, dof = self._gripper
-        return Sensed(position, velocity, self._qpos[at], self._qvel[dof], self.tick)
+        opening = self._qpos[gripper.linkage.driven]
+        return Sensed(position, velocity, opening, self._qvel[gripper.dof], self.tick)
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and give torques and gripper force for the coming torque cycle; see
         `Link.drive`."""
         self._asked[:] = torque
-        if self._grip is not None and math.isfinite(grip_force):
-            self._ctrl[self._grip] = self.grip_force = grip_force
+        if self._gripper is not None and math.isfinite(grip_force):
+            self._ctrl[self._gripper.actuator] = self.grip_force = grip_force
         if self._most is None and self._give_clear(*self._clear):
             self.waited = 0
             self.braked = False
@@ -162,7 +159,7 @@ class SimulatedArm(Simulation, Arm):
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
-        self.grip_force = 0.0 if self._grip is None else self._ctrl[self._grip]
+        self.grip_force = 0.0 if self._gripper is None else self._ctrl[self._gripper.actuator]
         self._given = True
 
     def _give(self) -> None:

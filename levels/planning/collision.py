@@ -96,8 +96,8 @@ class CollisionChecker:
 
     def open_gripper(self, opening: float) -> None:
         """Set the gripper to `opening`, m or rad; initially it is at its widest."""
-        if self.cell.linkage is not None:
-            self.cell.linkage.set(self._data.qpos, opening)
+        if self.cell.gripper is not None:
+            self.cell.gripper.linkage.set(self._data.qpos, opening)
 
     def hold(
         self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)

@@ -101,11 +101,10 @@ class Payloads:
         if surfaces is None or wide is None or narrow is None or wide.gap <= narrow.gap:
             return None
         model = self._cell.model
-        cell = self._cell
-        assert cell.gripper_closed is not None, "there are jaws"
-        assert cell.gripper_stiffness is not None, "there are jaws"
-        most = float(model.actuator_forcerange[cell.gripper_actuator, 1])
-        force = min(most, cell.gripper_stiffness * abs(narrow.opening - cell.gripper_closed))
+        gripper = self._cell.gripper
+        assert gripper is not None, "there are jaws"
+        most = float(model.actuator_forcerange[gripper.actuator, 1])
+        force = min(most, gripper.stiffness * abs(narrow.opening - gripper.closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
         parts = self._objects[row]
         return normal * sum(
@@ -139,17 +138,21 @@ class Payloads:
         """Return the jaws from open to closed, while there is a gap and a finger on either side."""
         cell = self._cell
         data = self._data
-        if cell.linkage is None:
+        gripper = cell.gripper
+        if gripper is None:
             return []
-        openings = cell.linkage.openings
-        hand = cell.model.jnt_bodyid[cell.model.jnt_qposadr == cell.gripper_qpos]
+        linkage = gripper.linkage
+        openings = linkage.openings
+        if openings[0] != gripper.open:
+            openings = openings[::-1]
+        hand = cell.model.jnt_bodyid[cell.model.jnt_qposadr == linkage.driven]
         fingers = np.setdiff1d(
             cell.gripper_geoms,
             np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
         jaws: list[Jaws] = []
-        for opening in openings if openings[0] == cell.gripper_open else openings[::-1]:
-            cell.linkage.set(data.qpos, float(opening))
+        for opening in openings:
+            linkage.set(data.qpos, float(opening))
             mujoco.mj_fwdPosition(cell.model, data)
             sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]
@@ -157,7 +160,7 @@ class Payloads:
             # side.
             if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
                 break
-            length = float(data.actuator_length[cell.gripper_actuator])
+            length = float(data.actuator_length[gripper.actuator])
             jaws.append(Jaws(float(opening), gap, length, (sides[0][1], sides[1][1])))
         return jaws
 

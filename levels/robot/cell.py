@@ -25,10 +25,22 @@ from rack.levels.robot.limits import (
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.robot.wrist import Wrist, find_wrist
-from rack.levels.tables import RobotConfig, SceneConfig
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything the next step depends on: a simulation restored from it continues bit for bit."""
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """An arm's gripper, driven at one joint. Indices are addresses in the model."""
+
+    dof: int  # the driven joint in qvel
+    actuator: int
+    open: float  # joint position, m or rad
+    closed: float  # joint position when closed without a part, m or rad
+    stiffness: float  # of the gripper's position loop, N/m or N m/rad
+    linkage: Linkage  # positions of all its joints, by its opening
 
 
 @dataclass(frozen=True)
@@ -43,13 +55,7 @@ class Cell:
     actuators: NDArray[np.int_]  # (joints,), their motors in ctrl; of a hand, its flexors
     home: NDArray[np.float64]  # (joints,), rad: positions at the start
     tool: int  # site
-    gripper_qpos: int | None  # None, here and below, for an arm without a gripper
-    gripper_dof: int | None
-    gripper_actuator: int | None
-    gripper_open: float | None  # joint position, m or rad
-    gripper_closed: float | None  # joint position when closed without a part, m or rad
-    gripper_stiffness: float | None  # of the gripper's position loop, N/m or N m/rad
-    linkage: Linkage | None  # positions of all joints of the gripper, by its opening
+    gripper: Gripper | None  # None: there is none
     arm_geoms: NDArray[np.int_]  # geoms that the arm moves, gripper included
     gripper_geoms: NDArray[np.int_]  # those of hand and fingers
     bodies: NDArray[np.int_]  # in the order of `scene.bodies`
@@ -126,7 +132,6 @@ def index(
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
     tool = lookup.tool_site(model, robot.tool, moved if hand is None else None)
-    gripper = robot.gripper
     joint = lookup.gripper_joint(model, robot, moved)
     bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects = bodies[: len(scene.objects)]
@@ -152,17 +157,7 @@ def index(
         actuators=np.array([model.actuator(name).id for name in motors]),
         home=np.array(robot.home),
         tool=tool,
-        gripper_qpos=None if joint is None else int(model.jnt_qposadr[joint]),
-        gripper_dof=None if joint is None else int(model.jnt_dofadr[joint]),
-        gripper_actuator=None if gripper is None else int(model.actuator(gripper.actuator).id),
-        gripper_open=None if gripper is None else gripper.open,
-        gripper_closed=None if gripper is None else gripper.closed,
-        gripper_stiffness=None if gripper is None else gripper.stiffness,
-        linkage=(
-            None
-            if gripper is None or joint is None
-            else solve_linkage(model, joint, linked, (gripper.open, gripper.closed))
-        ),
+        gripper=_gripper(model, robot.gripper, joint, linked),
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
@@ -222,13 +217,31 @@ def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArra
     return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)])
 
 
+def _gripper(
+    model: mujoco.MjModel,
+    config: GripperConfig | None,
+    joint: int | None,
+    linked: NDArray[np.bool_],
+) -> Gripper | None:
+    if config is None or joint is None:
+        return None
+    return Gripper(
+        dof=int(model.jnt_dofadr[joint]),
+        actuator=int(model.actuator(config.actuator).id),
+        open=config.open,
+        closed=config.closed,
+        stiffness=config.stiffness,
+        linkage=solve_linkage(model, joint, linked, (config.open, config.closed)),
+    )
+
+
 def start_qpos(cell: Cell) -> NDArray[np.float64]:
     """Return qpos of the start: arm at home, gripper and its linkage open, the rest as in the
     model."""
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = cell.home
-    if cell.linkage is not None and cell.gripper_open is not None:
-        cell.linkage.set(qpos, cell.gripper_open)
+    if cell.gripper is not None:
+        cell.gripper.linkage.set(qpos, cell.gripper.open)
     return qpos
 
 

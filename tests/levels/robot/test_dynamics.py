@@ -92,8 +92,8 @@ def test_torques_from_the_equation_give_the_acceleration_that_was_wanted(name: s
     data.ctrl[made.actuators] = (
         inertia @ wanted + bias + made.model.dof_frictionloss[made.dof] * np.sign(qd)
     )
-    if made.gripper_dof is not None:  # fingers that do not fly apart
-        data.qvel[made.gripper_dof] = 0.0
+    if made.gripper is not None:  # fingers that do not fly apart
+        data.qvel[made.gripper.dof] = 0.0
     mujoco.mj_forward(made.model, data)
     assert data.qacc[made.dof] == pytest.approx(wanted, abs=0.05)
 

@@ -29,8 +29,9 @@ def built(folder: Path, old: str = "", new: str = "") -> Cell:
 def settled(made: Cell, force: float) -> mujoco.MjData:
     """Return the simulated cell after a second with `force` on the gripper, its arm held at
     home."""
+    assert made.gripper is not None
     data = made.start()
-    data.ctrl[made.gripper_actuator] = force
+    data.ctrl[made.gripper.actuator] = force
     for _ in range(2000):
         data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
         mujoco.mj_step(made.model, data)
@@ -40,29 +41,29 @@ def settled(made: Cell, force: float) -> mujoco.MjData:
 def away(made: Cell, data: mujoco.MjData) -> float:
     """Return how far the farthest joint of the gripper is from where the linkage puts it, in
     rad."""
-    assert made.linkage is not None
+    assert made.gripper is not None
     posed = np.array(data.qpos)
-    made.linkage.set(posed, float(data.qpos[made.gripper_qpos]))
-    return float(np.max(np.abs(posed - data.qpos)[made.linkage.joints]))
+    made.gripper.linkage.set(posed, float(data.qpos[made.gripper.linkage.driven]))
+    return float(np.max(np.abs(posed - data.qpos)[made.gripper.linkage.joints]))
 
 
 def test_geared_finger_follows_over_the_whole_range() -> None:
     made = cell("puma560")
-    assert made.linkage is not None
+    assert made.gripper is not None
     for opening in (0.0, 0.0123, 0.04):
         qpos = np.array(made.model.qpos0)
-        made.linkage.set(qpos, opening)
+        made.gripper.linkage.set(qpos, opening)
         assert qpos[made.model.joint("finger_right").qposadr[0]] == pytest.approx(opening, abs=1e-9)
 
 
 def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> None:
     made = built(tmp_path)
-    assert made.linkage is not None
-    assert len(made.linkage.joints) == 5
+    assert made.gripper is not None
+    assert len(made.gripper.linkage.joints) == 5
     assert away(made, made.start()) == 0.0
     data = made.start()
-    data.qpos[made.gripper_qpos] = 0.35
-    made.linkage.set(data.qpos, 0.35)
+    data.qpos[made.gripper.linkage.driven] = 0.35
+    made.gripper.linkage.set(data.qpos, 0.35)
     mujoco.mj_forward(made.model, data)
     equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     assert np.abs(data.efc_pos[equality]).max() < 1e-5
@@ -79,9 +80,9 @@ def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
     text = text.replace('<joint name="rod_left" ', '<joint name="rod_left" stiffness=".1" ')
     arm.write_text(text.replace('<joint name="tip_left" ', spring))
     made = build_cell(robot, scene, CLOCK_NS)
-    assert made.linkage is not None
+    assert made.gripper is not None
     qpos = np.array(made.model.qpos0)
-    made.linkage.set(qpos, 0.3)
+    made.gripper.linkage.set(qpos, 0.3)
     assert qpos[made.model.joint("tip_left").qposadr[0]] == pytest.approx(np.deg2rad(20), abs=1e-3)
 
 

@@ -65,8 +65,8 @@ class Replay:
         given = (ticks >= first) & (ticks < last)
         controls = np.zeros((last - first, cell.model.nu))
         controls[:, cell.actuators] = recording.signal(status, "torque")[given]
-        if cell.gripper_actuator is not None:
-            controls[:, cell.gripper_actuator] = recording.signal(status, "grip_force")[given]
+        if cell.gripper is not None:
+            controls[:, cell.gripper.actuator] = recording.signal(status, "grip_force")[given]
         states = dict(
             zip(
                 recording.signal(state, "tick").tolist(),
