@@ -199,6 +199,15 @@ class RobotConfig(Table):
     sensors: SensorConfig = Field(
         SensorConfig(), description="resolution and noise of the joints' encoders"
     )
+    latency_ticks: int = Field(
+        0,
+        ge=0,
+        le=20,
+        description=(
+            "age of the newest sample when a cycle reads it, ticks, as a bus to the drives has it;"
+            " the simulated arm's samples are that old, too"
+        ),
+    )
     wrist: WristConfig | None = Field(None, description="force/torque sensor, if the arm has one")
     hand: HandConfig | None = Field(
         None, description="tendons and fingers, for a hand in place of an arm"

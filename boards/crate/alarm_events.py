@@ -89,6 +89,7 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
         "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven",
     ),
     Alarm.SENSOR_SILENT: ("nothing", "sensors silent: no new sample for {span}"),
+    Alarm.SENSOR_LATE: ("nothing", "samples late: {span} old"),
     Alarm.SENSOR_MODEL: ("joint", "sensor {subject} disagrees with the model: off by {value:.3g}"),
     Alarm.ACTUATOR: (
         "joint",

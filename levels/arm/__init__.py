@@ -5,6 +5,7 @@ from rack.levels.arm import drives, poses, substeps
 from rack.levels.arm.arm import Arm, Link, Sensed, find_arm
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm
+from rack.levels.arm.present import PresentLink
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot import dynamics
 
@@ -13,6 +14,7 @@ __all__ = [
     "FaultyLink",
     "GuardedArm",
     "Link",
+    "PresentLink",
     "Sensed",
     "SimulatedArm",
     "find_arm",

@@ -39,6 +39,11 @@ class Sensed(NamedTuple):
     tick: int  # of the sample: an older one than that of the cycle counts as no new sample
 
 
+def copied(sample: Sensed) -> Sensed:
+    """Return a sample whose arrays stay valid."""
+    return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
+
+
 class Link(Protocol):
     """The path between the servo level and an arm: samples come up, torques go down."""
 

@@ -12,6 +12,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import Arm, Sensed
 from rack.levels.arm.drives import LimitGate
+from rack.levels.arm.present import PresentLink
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
@@ -38,10 +39,18 @@ class GuardedArm:
     contacts and the truth, is not judged here.
     """
 
-    def __init__(self, arm: Arm, cell: Cell, joints: Sequence[str], tick_s: float) -> None:
-        """Guard an arm with these `joints`. Raises `RobotError` for encoders too coarse to tell a
-        limit."""
+    def __init__(
+        self,
+        arm: Arm,
+        cell: Cell,
+        joints: Sequence[str],
+        tick_s: float,
+        present: PresentLink | None = None,
+    ) -> None:
+        """Guard an arm with these `joints`; `present` brings its samples to the present, if they
+        are late. Raises `RobotError` for encoders too coarse to tell a limit."""
         self._arm = arm
+        self._present = present
         bounds = cell.bounds
         off = cell.encoders.off
         speed_off = cell.encoders.speed_off
@@ -57,24 +66,28 @@ class GuardedArm:
         coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
         if coarse.any():
             joint = int(coarse.argmax())
+            name = "latency_ticks" if cell.encoders.latency_ticks else "sensors"
             raise RobotError(
-                f"robot.sensors: '{joints[joint]}' may be off by {off[joint]:g} rad,"
+                f"robot.{name}: '{joints[joint]}' may be off by {off[joint]:g} rad,"
                 f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
                 f" {bounds.velocity[joint]:g} rad/s; permitted: less than half of that"
             )
         span_s = arm.patience * tick_s
         self._gate = LimitGate(kept, cell.limits.acceleration, span_s, Dynamics(cell))
-        self._sample: Sensed | None = None
+        self._state: Sensed | None = None
         self.exceeded: Exceeded | None = None
         """Of the newest sample."""
 
     def sense(self) -> Sensed:
         """Return the newest sample, judged."""
-        sample = self._arm.sense()
-        is_new = self._sample is None or sample.tick != self._sample.tick
-        self._sample = sample
+        if self._present is None:
+            state = sample = self._arm.sense()
+        else:
+            _, state, sample = self._present.look()
+        is_new = self._state is None or state.tick != self._state.tick
+        self._state = state
         if is_new:
-            self._judge(sample)
+            self._judge(state)
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
@@ -84,11 +97,12 @@ class GuardedArm:
             arm.clipped += 1
             arm.brake()
             return refused
-        sample = self._sample or self.sense()
+        state = self._state
+        assert state is not None, "it is sensed before it is driven"
         if self.exceeded is not None:
             arm.brake()
             return self.exceeded.finding
-        torque, cut = self._gate.admit(torque, sample.position, sample.velocity)
+        torque, cut = self._gate.admit(torque, state.position, state.velocity)
         arm.clipped += cut
         return arm.drive(torque, grip_force)
 

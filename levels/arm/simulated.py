@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import mujoco
 import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, Sensed
+from rack.levels.arm.arm import Arm, Sensed, copied
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
 from rack.levels.arm.simulation import Simulation
 from rack.levels.arm.wrist import WristSensor
@@ -48,6 +49,9 @@ class SimulatedArm(Simulation, Arm):
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._latency = cell.encoders.latency_ticks
+        # The newest, oldest first: all that are on their way.
+        self._samples: deque[Sensed] = deque(maxlen=self._latency + 1)
         self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
         # N m: the newest command, the one in force, and its torque as given.
         self._asked, self._command, self.torque = torques = np.zeros((3, joints))
@@ -76,6 +80,9 @@ class SimulatedArm(Simulation, Arm):
 
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
+        return self._samples[0] if self._samples else self._sampled()
+
+    def _sampled(self) -> Sensed:
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
@@ -136,6 +143,8 @@ class SimulatedArm(Simulation, Arm):
             if not self.fault:
                 self._simulate()
             self.tick += 1
+            if self._latency:
+                self._samples.append(copied(self._sampled()))
         if self.fault:
             self._data.time = self._now_s
 

@@ -168,7 +168,7 @@ def index(
         & ~pressed_pairs(model, wrist, supports),
         bounds=bounds,
         limits=planned_limits(bounds, robot),
-        encoders=Encoders.of(robot),
+        encoders=Encoders.of(robot, robot.substeps * model.opt.timestep),
         wrist=wrist,
         hand=hand,
         patience=patience_of(robot, bounds, data.energy[1]),

@@ -76,14 +76,27 @@ class Encoders:
 
     resolution: NDArray[np.float64]  # (joints,), rad: step of a position
     noise: NDArray[np.float64]  # (joints,), rad: standard deviation of a position
+    latency_ticks: int = 0  # age of a sample when it is read
+    off_late: NDArray[np.float64] | float = 0.0  # (joints,), rad: largest error due to that
+    speed_off_late: NDArray[np.float64] | float = 0.0  # (joints,), rad/s: likewise
 
     @classmethod
-    def of(cls, robot: RobotConfig) -> Encoders:
-        """Return the encoders of a `[robot]` table."""
+    def of(cls, robot: RobotConfig, tick_s: float) -> Encoders:
+        """Return the encoders of a `[robot]` table.
+
+        A sample is brought to the present by the arm's equation of motion, which may be wrong by as
+        much as the acceleration that is planned with.
+        """
         joints = len(robot.joints)
         sensors = robot.sensors
+        late_s = robot.latency_ticks * tick_s
+        wrong = np.array(robot.acceleration)
         return cls(
-            np.broadcast_to(sensors.resolution, joints), np.broadcast_to(sensors.noise, joints)
+            np.broadcast_to(sensors.resolution, joints),
+            np.broadcast_to(sensors.noise, joints),
+            robot.latency_ticks,
+            0.5 * wrong * late_s**2,
+            wrong * late_s,
         )
 
     @property
@@ -94,12 +107,16 @@ class Encoders:
     @property
     def off(self) -> NDArray[np.float64]:
         """Largest error of a good position, (joints,), rad."""
-        return np.asarray(0.5 * self.resolution + SIGMAS * self.noise)
+        return self._off_sampled + self.off_late
 
     @property
     def speed_off(self) -> NDArray[np.float64]:
         """Largest error of a good velocity, (joints,), rad/s."""
-        return self.off / EDGE_TIMING_S
+        return self._off_sampled / EDGE_TIMING_S + self.speed_off_late
+
+    @property
+    def _off_sampled(self) -> NDArray[np.float64]:
+        return np.asarray(0.5 * self.resolution + SIGMAS * self.noise)
 
 
 class MotorPatience(NamedTuple):

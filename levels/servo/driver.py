@@ -12,7 +12,16 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import AT_START, BY_DEMAND, NO_TORQUE
 from rack.levels.algebra import Array
-from rack.levels.arm import Arm, FaultyLink, GuardedArm, Link, Sensed, find_arm, preload
+from rack.levels.arm import (
+    Arm,
+    FaultyLink,
+    GuardedArm,
+    Link,
+    PresentLink,
+    Sensed,
+    find_arm,
+    preload,
+)
 from rack.levels.arm.faulty import STEPS
 from rack.levels.compiled import compiled
 from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
@@ -72,14 +81,16 @@ class ArmDriver(Executor):
         self.arm: Arm = find_arm(params.arm)(
             cell, context.scene, context.clock_ns, every, context.seed
         )
-        self._guard = (
-            None
-            if self.arm.keeps_limits
-            else GuardedArm(self.arm, cell, context.robot.joints, context.tick_s)
-        )
-        self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._guard)
         # The path to the arm; through `_faulty` while faults are injected.
-        self._link: Link = self._guard or self.arm
+        present = None
+        if context.robot.latency_ticks:
+            present = PresentLink(self.arm, cell, context.tick_s)
+        self._guard = None
+        if not self.arm.keeps_limits:
+            self._guard = GuardedArm(self.arm, cell, context.robot.joints, context.tick_s, present)
+        self._sound: Link = self._guard or present or self.arm
+        self._link: Link = self._sound
+        self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._sound)
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
@@ -124,7 +135,7 @@ class ArmDriver(Executor):
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
         self._faulty.inject(faults)
-        self._link = self._faulty if faults else self._guard or self.arm
+        self._link = self._faulty if faults else self._sound
 
     @abstractmethod
     def take_messages(self, read: Ports) -> None:

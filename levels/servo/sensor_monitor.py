@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 
 import numpy as np
@@ -44,7 +45,9 @@ BRAKE_TAIL_S2 = 1e-3
 STRUCK_SPEED = 5.0
 """Multiple of the fastest velocity that a blow may give a joint within a cycle."""
 SILENT_CYCLES = 2
-"""Cycles without a new sample after which the sensors are silent."""
+"""Cycles without a new sample after which the sensors are silent; with none but old ones, after
+which they are late."""
+NO_SAMPLES = "sensors give no new samples"
 DOUBTFUL = 0
 GOOD = 1
 TAKEN = 2
@@ -104,6 +107,10 @@ class SensorMonitor:
         self._sent = self._everyone  # its set point moves, or may have moved
         self._check = partial(check.load(), self._table, self._coarse)
         self._tick: int | None = None
+        self._sampled = -sys.maxsize  # tick of the newest sample
+        self._latency = encoders.latency_ticks
+        self.missing = NO_SAMPLES  # what was wrong with all of them last
+        self._late = 0  # cycles in a row with a new sample that was too old
         self._streak = 0  # good samples in a row
         self._rung: set[Alarm] = set()  # alarms raised in this episode
 
@@ -125,6 +132,8 @@ class SensorMonitor:
         self._tick = tick
         passed_s = passed * self._tick_s
         self.fresh = sampled == tick
+        self._late = self._late + 1 if sampled > self._sampled and not self.fresh else 0
+        self._sampled = sampled
         if not self.fresh:
             self._estimate_blind(passed_s, tick - sampled)
             return
@@ -238,8 +247,17 @@ class SensorMonitor:
 
     def _estimate_blind(self, passed_s: float, age: int) -> None:
         """Estimate the joints without a sample."""
-        if age >= SILENT_CYCLES * self._every:
+        is_late = self._late >= SILENT_CYCLES
+        if is_late:
+            self._ring(Finding(Alarm.SENSOR_LATE, -1, age))
+            self.missing = (
+                f"the newest sample is {age} ticks old; permitted by robot.latency_ticks:"
+                f" {self._latency}"
+            )
+        elif not self._late and age >= SILENT_CYCLES * self._every:
             self._ring(Finding(Alarm.SENSOR_SILENT, -1, age))
+            self.missing = NO_SAMPLES
+        if is_late or age >= SILENT_CYCLES * self._every:
             self.drivable = False
             self._suspect[:] = True
             self.blamed = -1, float(age), 0.0

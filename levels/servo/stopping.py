@@ -192,7 +192,7 @@ class Stopping:
     def _about_sensors(self, sensors: SensorMonitor) -> Cause:
         joint, read, off = sensors.blamed
         if joint < 0:
-            return Cause(Error.SENSORS, "sensors give no new samples", joint, read)
+            return Cause(Error.SENSORS, sensors.missing, joint, read)
         text = f"sensor of '{self._joints[joint]}' reads {read:.4g} rad"
         return Cause(
             Error.SENSORS, f"{text}, off by {off:.3g}" if off == off else text, joint, read

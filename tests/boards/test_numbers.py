@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.numbers import check_numbers
+from tests.room_numbers import check_numbers
 
 
 def test_no_number_changes_unseen() -> None:

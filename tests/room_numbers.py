@@ -37,7 +37,9 @@ def _numbers(module: ModuleType) -> Iterator[tuple[str, Any]]:
     for name, value in sorted(vars(module).items()):
         if name.startswith("__"):
             continue
-        if name.isupper() and isinstance(value, KINDS) and _is_plain(value):
+        # A private table may be one that a process fills.
+        is_filled = isinstance(value, dict) and name.startswith("_")
+        if name.isupper() and isinstance(value, KINDS) and not is_filled and _is_plain(value):
             yield name, value
         elif getattr(value, "__module__", "") == module.__name__:
             yield from _defaults(name, value)
