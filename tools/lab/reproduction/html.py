@@ -4,7 +4,7 @@ for paper."""
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from rack.tools.lab.reproduction.sections.page import (
     PageClaim,
     PageSection,
     Plate,
-    Prose,
     Ruling,
     Side,
     plain,
@@ -100,15 +99,19 @@ nav .mark { display: inline-block; width: 1.3rem; font-weight: 700; }
 def html(page: Page, folder: Path) -> str:
     """Return the page as HTML; its pictures are read from `folder`."""
     body = "\n".join(_body(page, folder))
-    head = (
-        '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width,'
-        ' initial-scale=1">\n'
-    )
-    head += f"<title>{TITLE}</title>\n<style>{STYLE}</style>"
-    return (
-        "<!doctype html>\n<html"
-        f' lang="en">\n<head>\n{head}\n</head>\n<body>\n{body}\n</body>\n</html>\n'
-    )
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{TITLE}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
 
 
 def _body(page: Page, folder: Path) -> Iterator[str]:
@@ -140,9 +143,9 @@ def opening(page: Page) -> Iterator[str]:
 def rulings(page: Page) -> Columns:
     """Return the table of rulings, those that occur."""
     rows = [
-        (f"{MARKS[ruling]} {ruling.value}", str(count), MEANINGS[ruling])
+        (f"{MARKS[ruling]} {ruling.value}", len(claims), MEANINGS[ruling])
         for ruling in Ruling
-        if (count := len(page.of(ruling)))
+        if (claims := page.of(ruling))
     ]
     return Columns(("ruling", "claims", "meaning"), rows)
 
@@ -194,16 +197,16 @@ def _claim(claim: PageClaim, folder: Path) -> Iterator[str]:
 
 
 def _side(name: str, side: Side, folder: Path) -> Iterator[str]:
-    if side.items:
+    if side:
         yield f"<h4>{name}</h4>"
-    for item in side.items:
+    for item in side:
         yield from _item(item, folder)
 
 
 def _item(item: Item, folder: Path) -> Iterator[str]:
     match item:
-        case Prose(words):
-            yield f"<p>{words}</p>"
+        case str():
+            yield f"<p>{item}</p>"
         case Columns():
             yield from _table(item)
         case Plate(path, caption):
@@ -218,21 +221,22 @@ def _item(item: Item, folder: Path) -> Iterator[str]:
 
 
 def _table(table: Columns) -> Iterator[str]:
-    columns = zip(*table.rows, strict=True) if table.rows else [() for _ in table.head]
-    numeric = [
-        ' class="number"' if column and all(map(is_figure, column)) else "" for column in columns
-    ]
+    kinds = []
+    for _, *cells in zip(table.head, *table.cells, strict=True):
+        is_numeric = bool(cells) and all(map(is_figure, cells))
+        kinds.append(' class="number"' if is_numeric else "")
     yield '<div class="wide"><table>'
     if any(table.head):
-        yield (
-            f"<tr>{''.join(f'<th{kind}>{cell}</th>' for cell, kind in zip(table.head, numeric, strict=True))}</tr>"
-        )
-    for row in table.rows:
-        yield (
-            f"<tr>{''.join(f'<td{kind}>{cell}</td>' for cell, kind in zip(row, numeric, strict=True))}</tr>"
-        )
+        yield _row("th", table.head, kinds)
+    for row in table.cells:
+        yield _row("td", row, kinds)
     yield "</table></div>"
     yield from _caption(table.caption)
+
+
+def _row(tag: str, cells: Sequence[str], kinds: Sequence[str]) -> str:
+    filled = (f"<{tag}{kind}>{cell}</{tag}>" for cell, kind in zip(cells, kinds, strict=True))
+    return f"<tr>{''.join(filled)}</tr>"
 
 
 def _caption(words: str) -> Iterator[str]:

@@ -13,7 +13,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Page,
     PageClaim,
     Plate,
-    Prose,
     Side,
     plain,
 )
@@ -67,27 +66,25 @@ def _claim(claim: PageClaim) -> Iterator[str]:
 
 
 def _side(name: str, side: Side) -> Iterator[str]:
-    if side.items:
+    if side:
         yield from (f"**{name}**", "")
-    for item in side.items:
+    for item in side:
         yield from _item(item)
 
 
 def _item(item: Item) -> Iterator[str]:
     match item:
-        case Prose(words):
-            yield from (words, "")
+        case str():
+            yield from (item, "")
         case Columns():
             yield from _table(item)
         case Plate(path, caption):
-            yield from (f"![{_alt(caption)}]({path})", "", f"<sub>{caption}</sub>", "")
+            alt = plain(caption).replace("[", "(").replace("]", ")")
+            yield from (f"![{alt}]({path})", "", f"<sub>{caption}</sub>", "")
         case Listing(lines, caption):
             yield from ("```text", lines, "```", "")
-            yield from ([f"<sub>{caption}</sub>", ""] if caption else [])
-
-
-def _alt(caption: str) -> str:
-    return plain(caption).replace("[", "(").replace("]", ")")
+            if caption:
+                yield from (f"<sub>{caption}</sub>", "")
 
 
 def _table(table: Columns) -> Iterator[str]:
@@ -95,7 +92,6 @@ def _table(table: Columns) -> Iterator[str]:
         yield from (table.caption, "")
     # GitHub shows no table without a head.
     head = [cell or " " for cell in table.head]
-    yield from markdown_table(
-        head, [[cell.replace("|", "&#124;") for cell in row] for row in table.rows]
-    )
+    rows = [[cell.replace("|", "&#124;") for cell in row] for row in table.cells]
+    yield from markdown_table(head, rows)
     yield ""

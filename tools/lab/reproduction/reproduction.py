@@ -4,7 +4,7 @@ page."""
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     made,
     program,
 )
-from rack.tools.lab.reproduction.html import MARKS, html, rulings
+from rack.tools.lab.reproduction.html import MARKS, html
 from rack.tools.lab.reproduction.markdown import markdown
 from rack.tools.lab.reproduction.sections import (
     application,
@@ -35,7 +35,7 @@ from rack.tools.lab.reproduction.sections import (
     time,
     timing,
 )
-from rack.tools.lab.reproduction.sections.page import Page, plain, text
+from rack.tools.lab.reproduction.sections.page import Page, Ruling, plain, text
 from rack.tools.lab.reproduction.sections.statement import Chapter
 
 CHAPTERS: tuple[Chapter, ...] = (
@@ -52,7 +52,10 @@ CHAPTERS: tuple[Chapter, ...] = (
     conclusion.CHAPTER,
 )
 """The sections of the page, in the paper's order."""
-FILES = ("index.html", "README.md", "paper.json")
+HTML = "index.html"
+MARKDOWN = "README.md"
+DATA = "paper.json"
+"""Forms of the page, in its folder."""
 PROJECT = (BackplaneError, BoardError, LevelError, Failure)
 """Errors that the project raises on purpose: one experiment fails, the others go on."""
 
@@ -68,83 +71,66 @@ def chapters_named(names: Sequence[str]) -> list[Chapter]:
 
 def forget(wanted: Sequence[Chapter], folder: Path) -> None:
     """Remove what is kept for these chapters, so that it is made again."""
-    for one in experiments(wanted):
-        (folder / KEPT / f"{one.name}.json").unlink(missing_ok=True)
+    for experiment in experiments(wanted):
+        (folder / KEPT / f"{experiment.name}.json").unlink(missing_ok=True)
 
 
 def reproduce(wanted: Sequence[Chapter], workshop: Workshop, progress: Progress) -> Page:
     """Make what is still to be made for these chapters; return the page of all, written into the
     folder."""
     workshop.prepare()
-    results = {
-        one.name: found for one in experiments(CHAPTERS) if (found := kept(one, workshop.folder))
-    }
+    results: dict[str, Kept | str] = {}
+    for experiment in experiments(CHAPTERS):
+        if result := kept(experiment, workshop.folder):
+            results[experiment.name] = result
     needed = [one for one in experiments(wanted) if one.name not in results]
-    reasons = _make(needed, workshop, progress, results)
-    return write(workshop, {**results, **reasons})
+    if needed:
+        progress.total(sum(one.seconds for one in needed))
+    for number, experiment in enumerate(needed, 1):
+        progress.begin(f"{number} of {len(needed)}: {experiment.about}")
+        try:
+            result = made(experiment, workshop)
+        except PROJECT as error:
+            results[experiment.name] = str(error)
+            progress.end(experiment.seconds, "failed", [f"{experiment.name}: {error}"])
+        else:
+            results[experiment.name] = result
+            done = f"done in {result.took_s:.0f} s"
+            progress.end(experiment.seconds, result.lacking or done)
+    return write(workshop, results)
 
 
 def experiments(chapters: Sequence[Chapter]) -> list[Experiment[Any]]:
     """Return the experiments of these chapters, each once."""
-    return list({one.name: one for chapter in chapters for one in chapter.experiments}.values())
-
-
-def _make(
-    needed: Sequence[Experiment[Any]],
-    workshop: Workshop,
-    progress: Progress,
-    results: dict[str, Kept],
-) -> dict[str, str]:
-    """Make experiments, add their results, and return why others could not be made, by name."""
-    reasons = {}
-    if needed:
-        progress.total(sum(one.seconds for one in needed))
-    for number, one in enumerate(needed, 1):
-        progress.begin(f"{number} of {len(needed)}: {one.about}")
-        try:
-            results[one.name] = found = made(one, workshop)
-            progress.end(one.seconds, found.lacking or f"done in {found.took_s:.0f} s")
-        except PROJECT as error:
-            reasons[one.name] = str(error)
-            progress.end(one.seconds, "failed", [f"{one.name}: {error}"])
-    return reasons
+    statements = [statement for chapter in chapters for statement in chapter.statements]
+    return list({one.name: one for each in statements for one in each.experiments}.values())
 
 
 def write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
     """Write the page into the folder, as HTML, Markdown and data, and return it."""
     sections = tuple(chapter.section(workshop, results) for chapter in CHAPTERS)
     page = Page(sections, tuple(_facts(results)))
-    documents = (
-        html(page, workshop.folder),
-        markdown(page),
-        json.dumps(page.document(), indent=2) + "\n",
-    )
-    for name, document in zip(FILES, documents, strict=True):
+    documents = {
+        HTML: html(page, workshop.folder),
+        MARKDOWN: markdown(page),
+        DATA: json.dumps(page.document(), indent=2) + "\n",
+    }
+    for name, document in documents.items():
         (workshop.folder / name).write_text(document, encoding="utf-8")
     return page
 
 
-def _facts(results: dict[str, Kept | str]) -> list[tuple[str, str]]:
-    here = machine()
-    libraries = ", ".join(f"{name} {number}" for name, number in here["libraries"].items())
-    found = [one for one in results.values() if isinstance(one, Kept)]
-    facts = [(name, text(value)) for name, value in here.items() if name != "libraries"]
-    facts += [("libraries", libraries), ("program", program())]
-    facts += [
-        (
-            "experiments",
-            f"{len(found)} of {len(experiments(CHAPTERS))}, {sum(f.took_s for f in found):.0f} s",
-        )
-    ]
-    rows = [
-        (
-            f"experiment {name}",
-            f"{one.made_at}, {one.took_s:g} s{f'; {text(one.lacking)}' if one.lacking else ''}",
-        )
-        for name, one in results.items()
-        if isinstance(one, Kept)
-    ]
-    return [*facts, *rows]
+def _facts(results: dict[str, Kept | str]) -> Iterator[tuple[str, str]]:
+    """Yield what the page says of the machine, the program and the runs."""
+    found = {name: one for name, one in results.items() if isinstance(one, Kept)}
+    took_s = sum(one.took_s for one in found.values())
+    for name, value in machine().items():
+        yield name, text(value)
+    yield "program", program()
+    yield "experiments", f"{len(found)} of {len(experiments(CHAPTERS))}, {took_s:.0f} s"
+    for name, one in found.items():
+        lacking = f"; {text(one.lacking)}" if one.lacking else ""
+        yield f"experiment {name}", f"{one.made_at}, {one.took_s:g} s{lacking}"
 
 
 def worked(page: Page, wanted: Sequence[Chapter]) -> bool:
@@ -162,8 +148,8 @@ def summary(page: Page, folder: Path) -> list[str]:
         f"{MARKS[claim.tested.ruling]} {plain(claim.title)}: {claim.tested.ruling.value}"
         for claim in page.claims
     ]
-    counted = ", ".join(f"{count} {ruling[2:]}" for ruling, count, _ in rulings(page).rows)
-    return [*lines, "", counted, f"{folder}/{FILES[0]}, {FILES[1]}"]
+    counted = [f"{len(claims)} {ruling.value}" for ruling in Ruling if (claims := page.of(ruling))]
+    return [*lines, "", ", ".join(counted), f"{folder}/{HTML}, {MARKDOWN}"]
 
 
 def document(page: Page, folder: Path, is_good: bool) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def test_determinism_is_judged_by_digests_and_by_the_first_miss(
 def test_five_levels_take_five_cycles(
     lockstep: dict[int, int], realtime: dict[int, int], ruling: Ruling
 ) -> None:
-    found = PipelineRun(5, {"lockstep": lockstep, "realtime": realtime})
+    found = PipelineRun(5, lockstep, realtime)
     assert judged(model.CHAPTER, "pipeline", PIPELINE, found).ruling is ruling
 
 
@@ -199,7 +199,7 @@ def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None
     assert "the rack did not run" in failed.tested.why
     assert lacking.tested.ruling is Ruling.UNTESTABLE
     assert lacking.tested.why == "this machine has one processor."
-    assert all(claim.predicted.items for claim in (unmade, failed, lacking))
+    assert all(claim.predicted for claim in (unmade, failed, lacking))
 
 
 def test_a_section_is_made_again_when_it_is_forgotten(tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.nasrem import (
     NASREM,
-    JudgedPair,
+    MeasuredVerdict,
     NasremRun,
+    Spread,
     SystemResponse,
     WayResponse,
 )
@@ -23,9 +24,9 @@ from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
 from rack.tools.lab.reproduction.sections.statement import Findings
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
-WAY = WayResponse(4.0, {"max": 3.0}, ())
+WAY = WayResponse(4.0, Spread(1.0, 2.0, 3.0), ())
 RUN = NasremRun(
-    *(800, 0, 0, {}, (), {}, {}, {}, {}),
+    *(800, 0, 0, {}, (), {}, {}, {}),
     SystemResponse(("task", "servo"), 4.0, 4.0, WAY, WAY),
     *((), {}, {}),
 )
@@ -52,11 +53,11 @@ def test_each_fails_in_the_rack_that_is_to_show_it(equation: PaperEquation) -> N
         assert any("FAILS" in row for row in shown.rows)
 
 
-def verdict(holds: bool, mostly: bool) -> JudgedPair:
-    """Return a pair as a run keeps it: one equation, measured for one level."""
+def verdict(holds: bool, mostly: bool) -> MeasuredVerdict:
+    """Return a verdict as a run keeps it: one equation, measured for one level."""
     left = 1e6 if holds else 3e6
     measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, holds, "")
-    return JudgedPair("3.1", "servo", measured, mostly)
+    return MeasuredVerdict(measured, mostly)
 
 
 @pytest.mark.parametrize(
@@ -67,6 +68,6 @@ def verdict(holds: bool, mostly: bool) -> JudgedPair:
 def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(
     holds: bool, mostly: bool, ruling: Ruling
 ) -> None:
-    run = NASREM.document(replace(RUN, pairs=(verdict(holds, mostly),)))
+    run = NASREM.document(replace(RUN, verdicts=(verdict(holds, mostly),)))
     found = judged(timing.FITS, Findings({"nasrem": run}, NOWHERE))
     assert found.ruling is ruling

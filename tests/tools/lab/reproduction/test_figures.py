@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
-from rack.tools.lab.reproduction.experiments.figures import FigureRack, FigureRun, planning, sweep
+from rack.tools.lab.reproduction.experiments.figures import (
+    FigureRack,
+    FigureRun,
+    PatternCount,
+    planning,
+    sweep,
+)
 from rack.tools.lab.reproduction.sections import gantt
 from rack.tools.lab.reproduction.sections.page import Listing, Plate, Ruling
 from rack.tools.lab.reproduction.sections.statement import Findings
@@ -53,7 +59,7 @@ def test_figure_4_has_no_idle_time_with_the_longest_x() -> None:
 def document(late: int, jobs: int = 100) -> Document:
     """Return what a run of a figure leaves, with so many late plans."""
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
-    patterns = {"level": ((("R X W P | R X W P U -", jobs),), ())}
+    patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
     run = FigureRun(counts, patterns, {}, {"measured": "pictures/x.svg"})
     return gantt.FIG2.experiment().document(run)
 

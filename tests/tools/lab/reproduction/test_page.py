@@ -32,17 +32,17 @@ PICTURE = '<svg xmlns="http://www.w3.org/2000/svg" width="8" height="8"/>'
 def page(tmp_path: Path) -> Page:
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "one.svg").write_text(PICTURE)
-    measured = Side.of(
+    measured: Side = [
         f"A value below {text('<limit>')}.",
-        Columns(("of", "ms"), [("servo", "1.5"), (code("a | b"), "20")]),
+        Columns(("of", "ms"), [("servo", "1.5"), (code("a | b"), 20), ("task", None)]),
         Plate(Path("pictures/one.svg"), "A picture of t<sub>exec</sub>."),
         Listing("R X W P | <U>"),
-    )
+    ]
     claim = PageClaim(
         name="equation-3.8",
         title="Equation 3.8",
         quote="A plan must finish.",
-        predicted=Side.of("So it is."),
+        predicted=["So it is."],
         tested=Assessment(measured, Ruling.CONTRADICTS, "Both cannot be."),
         equation="t<sub>plan</sub> / d &lt; t<sub>residual</sub>",
     )
@@ -125,5 +125,9 @@ def test_both_forms_hold_the_same_words(page: Page, tmp_path: Path) -> None:
 def test_data_are_plain_text(page: Page) -> None:
     (claim,) = page.document()["sections"][0]["claims"]
     assert claim["measured"][0] == "A value below <limit>."
-    assert claim["measured"][1] == [{"of": "servo", "ms": "1.5"}, {"of": "a | b", "ms": "20"}]
+    assert claim["measured"][1] == [
+        {"of": "servo", "ms": "1.5"},
+        {"of": "a | b", "ms": "20"},
+        {"of": "task", "ms": "-"},
+    ]
     assert plain("t<sub>i</sub><sup>2</sup> &minus; <i>x</i>") == "t_i^2 \N{MINUS SIGN} x"

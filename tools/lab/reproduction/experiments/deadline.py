@@ -77,15 +77,16 @@ def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | N
     """Run GOTO A, then GOTO B, the start; return when A was reported done, or the refusal."""
     by = "" if by_s is None else f", by = {by_s!r}"
     program = f'task.action=[{{ do = "goto", position = {place}{by} }}, {{ do = "home" }}]'
-    recording = workshop.run(label, workshop.config(NAME, ["clock.mode=lockstep", program]), None)
-    outcome = recording.ended["outcome"]
+    config = workshop.config(NAME, ["clock.mode=lockstep", program])
+    result, recording = workshop.run(label, config, None)
+    outcome = result.outcome
     return GotoRun(
         by_s=by_s,
         done_s=_done_s(recording),
         earliest_s=_earliest_s(recording),
         moved=_has_moved(recording),
-        cause=outcome["cause"],
-        reason=outcome["reason"] or str(recording.signal("task.status", "reason")[-1]),
+        cause=outcome.cause,
+        reason=outcome.reason or str(recording.signal("task.status", "reason")[-1]),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.boards.config import load
+from rack.tools.lab.benches.observed import Recorded
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.recording.history import Difference, first_difference, misses
 from rack.tools.recording.recording import Recording
@@ -41,11 +42,11 @@ class ComparedRuns:
 
 def _run(workshop: Workshop) -> ComparedRuns:
     first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
-    runs = [_outcome(first, None), _outcome(second, first)]
+    runs = [_compared(first, None), _compared(second, first.recording)]
     for attempt in range(1, ATTEMPTS + 1):
-        found = _outcome(_recorded(workshop, f"{NAME}-realtime-{attempt}", "realtime"), first)
-        runs.append(found)
-        if found.first_miss is None:
+        run = _recorded(workshop, f"{NAME}-realtime-{attempt}", "realtime")
+        runs.append(_compared(run, first.recording))
+        if runs[-1].first_miss is None:
             break
     return ComparedRuns(tuple(runs))
 
@@ -60,22 +61,20 @@ DETERMINISM = Experiment(
 )
 
 
-def _recorded(workshop: Workshop, label: str, mode: str) -> Recording:
+def _recorded(workshop: Workshop, label: str, mode: str) -> Recorded:
     return workshop.run(label, workshop.config(NAME, [f"clock.mode={mode}"]), SECONDS)
 
 
-def _outcome(recording: Recording, reference: Recording | None) -> ComparedRun:
-    ended = recording.ended
-    config = recording.rack_config
-    found = misses(recording)
-    difference = None if reference is None else first_difference(recording, reference)
+def _compared(run: Recorded, reference: Recording | None) -> ComparedRun:
+    result, recording = run
+    missed = misses(recording)
     return ComparedRun(
         run=recording.folder.name,
-        mode=config.clock.mode,
-        digest=ended["outcome"]["digest"],
-        wall_s=ended["wall_s"],
+        mode=recording.rack_config.clock.mode,
+        digest=result.outcome.digest,
+        wall_s=result.wall_s,
         messages=sum(len(recording.signal(name, "serial")) for name in recording.mailboxes),
-        missed=len(found),
-        first_miss=min((miss["tick"] for miss in found), default=None),
-        difference=difference,
+        missed=len(missed),
+        first_miss=min((miss["tick"] for miss in missed), default=None),
+        difference=None if reference is None else first_difference(recording, reference),
     )

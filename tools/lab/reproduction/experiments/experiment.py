@@ -32,8 +32,7 @@ from rack.boards.crate.clean import remove_dead
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.lab.benches.cyclictest import permits_fifo
-from rack.tools.lab.benches.observed import record
-from rack.tools.recording.recording import Recording
+from rack.tools.lab.benches.observed import Recorded, record
 
 KEPT = "parts"
 RUNS = "runs"
@@ -83,12 +82,12 @@ class Workshop:
         """Return a config under a name of its own. Raises `ConfigError`."""
         return load(name, [*settings, f"name={self.rack}"], faults)
 
-    def run(self, label: str, config: RackConfig, seconds: float | None) -> Recording:
-        """Run a rack and return its recording, which stays in the folder; one of an unfinished run
-        is replaced."""
+    def run(self, label: str, config: RackConfig, seconds: float | None) -> Recorded:
+        """Run a rack and return how it went and its recording, which stays in the folder; one of an
+        unfinished run is replaced."""
         folder = self.folder / RUNS / label
         shutil.rmtree(folder, ignore_errors=True)
-        return record(config, seconds, folder, self.share).recording
+        return record(config, seconds, folder, self.share)
 
     def picture(self, name: str) -> Path:
         """Return the path of a picture without its suffix."""
@@ -148,15 +147,14 @@ def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
         document = json.loads(
             (folder / KEPT / f"{experiment.name}.json").read_text(encoding="utf-8")
         )
-        found = Kept(
-            document["found"], document["took_s"], document["made_at"], document["lacking"]
-        )
-        pictures = found.found.get("pictures", {})
+        depends = document.pop("depends")
+        result = Kept(**document)
+        pictures = result.found.get("pictures", {})
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    if document.get("depends") != json.loads(json.dumps(experiment.depends())):
+    if depends != json.loads(json.dumps(experiment.depends())):
         return None
-    return found if all((folder / path).is_file() for path in pictures.values()) else None
+    return result if all((folder / path).is_file() for path in pictures.values()) else None
 
 
 def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
@@ -198,7 +196,7 @@ def machine() -> Document:
         "kernel": platform.release(),
         "python": platform.python_version(),
         "real-time priorities": permits_fifo(),
-        "libraries": {name: version(name) for name in LIBRARIES},
+        "libraries": ", ".join(f"{name} {version(name)}" for name in LIBRARIES),
     }
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from rack.boards.config import RackConfig, load, rack_timing, wire
+from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.forecast import Forecast
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
@@ -15,7 +16,6 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     need_real_time,
 )
 from rack.tools.recording.history import steal
-from rack.tools.timing.charts.letters import column_for
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.scheduled import Schedule
@@ -47,15 +47,9 @@ class FigureRack:
         return self.config if self.process_ms is None else f"{self.config}-x{self.process_ms:g}"
 
     @property
-    def settings(self) -> list[str]:
-        """The settings with which the executor takes this X, in its budget and on its board."""
-        if self.process_ms is None:
-            return []
-        board = load(self.config).board[LEVEL]
-        assert board.budget is not None, "every figure has a budget"
-        own_ms = board.budget.process_ms - board.params["process_ms"]
-        computed = f"board.{LEVEL}.params.process_ms={max(self.process_ms - own_ms, 0.0):.6g}"
-        return [f"board.{LEVEL}.budget.process_ms={self.process_ms:g}", computed]
+    def settings(self) -> tuple[str, ...]:
+        """The settings with which its executor takes this X."""
+        return () if self.process_ms is None else settings_of(self.config, self.process_ms)
 
     def loaded(self) -> RackConfig:
         """Return the config."""
@@ -75,28 +69,56 @@ class FigureRack:
             "attempts": ATTEMPTS,
         }
 
-    def panel(self) -> Panel:
-        """Return the schedule that follows from its budget, from the first cycle on."""
+    def schedule(self) -> Schedule:
+        """Return the schedule that follows from its budget."""
         config = self.loaded()
-        return Schedule(config, wire(config), {}).panel(0, self.window_ns(config))
+        return Schedule(config, wire(config), {})
 
-    def window_ns(self, config: RackConfig) -> int:
-        """Return the time that its charts show."""
+    def panel(self) -> Panel:
+        """Return this schedule, from the first cycle on."""
+        return self.schedule().panel(0, self.window_ns)
+
+    @property
+    def window_ns(self) -> int:
+        """The time that its charts show."""
+        config = self.loaded()
         return self.cycles * config.every(LEVEL) * config.clock_ns
 
 
-def column_ns(config: RackConfig, window_ns: int) -> int:
-    """Return the time of a letter in a chart: its shortest unit function."""
-    return column_for(window_ns, Schedule(config, wire(config), {}).shortest_ns)
+def budget_of(config: RackConfig) -> BudgetConfig:
+    """Return the budget of a figure's only level."""
+    budget = config.board[LEVEL].budget
+    assert budget is not None, "every figure has a budget"
+    return budget
+
+
+def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
+    """Return the settings with which the executor of a figure takes this X, ms, in its budget and
+    on its board."""
+    config = load(name)
+    own_ms = budget_of(config).process_ms - config.board[LEVEL].params["process_ms"]
+    computed_ms = max(process_ms - own_ms, 0.0)
+    return (
+        f"board.{LEVEL}.budget.process_ms={process_ms:g}",
+        f"board.{LEVEL}.params.process_ms={computed_ms:.6g}",
+    )
+
+
+class PatternCount(NamedTuple):
+    """How often a pattern came in a lane."""
+
+    lane: str
+    pattern: str
+    times: int
 
 
 @dataclass(frozen=True)
 class FigureRun:
-    """A run of a figure: jobs of its tasks, the most frequent patterns of each lane and how often
-    they came, for plans and for cycles, and the hypervisor's part of each core, percent."""
+    """A run of a figure: jobs of its tasks, the most frequent patterns of each lane, for plans and
+    for cycles, and the hypervisor's part of each core, percent."""
 
     tasks: dict[str, Count]
-    patterns: dict[str, tuple[tuple[tuple[str, int], ...], ...]]
+    patterns: tuple[PatternCount, ...]
     steal: dict[str, float]
     pictures: dict[str, str]
 
@@ -109,19 +131,20 @@ class FigureRun:
 def _run(figure: FigureRack, workshop: Workshop) -> FigureRun:
     from rack.tools.timing.charts.picture import save
 
-    config = figure.loaded()
-    need_real_time(2 if config.board[LEVEL].coupling == "loose" else 1)
+    is_loose = figure.loaded().board[LEVEL].coupling == "loose"
+    need_real_time(cores=2 if is_loose else 1)
     run = _least_disturbed(figure, workshop)
     start = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
-    window_ns = figure.window_ns(config)
-    panel = run.panel(start, start + window_ns, lambda part: None)
+    panel = run.panel(start, start + figure.window_ns, lambda part: None)
     drawn = save([panel], f"{figure.label}: a run", workshop.picture(f"{figure.label}-run"))
     return FigureRun(
         tasks=dict(panel.counts),
-        patterns={
-            lane: tuple(tuple(one.most_common(COMMON)) for one in counts)
-            for lane, counts in panel.patterns.items()
-        },
+        patterns=tuple(
+            PatternCount(lane, *most)
+            for lane, patterns in panel.patterns.items()
+            for counts in patterns
+            for most in counts.most_common(COMMON)
+        ),
         steal=steal(run.recording)["percent"],
         pictures={"measured": workshop.shown(drawn)},
     )
@@ -136,10 +159,8 @@ def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
     tried: list[tuple[int, TracedRun]] = []
     is_late = bool(figure.panel().chart.late(LEVEL))
     for attempt in range(1, ATTEMPTS + 1):
-        label = f"{figure.label}-{attempt}"
-        run = TracedRun(
-            workshop.run(label, workshop.config(figure.config, figure.settings), SECONDS)
-        )
+        config = workshop.config(figure.config, figure.settings)
+        run = TracedRun(workshop.run(f"{figure.label}-{attempt}", config, SECONDS).recording)
         late = len(run.chart(0, run.end_ns).late(LEVEL))
         tried.append((late, run))
         if is_late or not late:
@@ -173,15 +194,15 @@ class Planning:
 
 def planning(name: str, process_ms: float) -> Planning:
     """Return what the timing model says of a figure with this X, ms."""
-    config = FigureRack(name, 1, process_ms).loaded()
+    config = load(name, settings_of(name, process_ms))
     layout = wire(config)
     rack = rack_timing(config, layout)
     level = rack.level(LEVEL)
     panel = Schedule(config, layout, {}).panel(0, level.cycle_ns)
+    patterns = panel.patterns[LEVEL]
     once_ns = level.cycle_ns if level.coupling == "loose" else level.residual_ns
     each_ns = once_ns - level.update_ns
     plan_ns = level.plan_ns or 0
-    patterns = panel.patterns[LEVEL]
     return Planning(
         process_ms=process_ms,
         each_ms=each_ns * MS,

@@ -9,7 +9,7 @@ from functools import partial
 from pydantic import TypeAdapter
 
 from rack.boards.config import load
-from rack.tools.faults.judge import faults
+from rack.tools.faults.judge import Judgement, faults
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 NAME = "nasrem"
@@ -17,29 +17,11 @@ LASTS_S = 13.0
 
 
 @dataclass(frozen=True)
-class JudgedLoss:
-    """A fault of a run, as its report lists it: ticks, and ms until it was recovered from."""
-
-    kind: str
-    struck: int
-    board: str
-    joint: str
-    found_by: str
-    found_as: str
-    delay: int | None
-    bound: int | None
-    reactions: tuple[str, ...]
-    recovery_ms: float | None
-    is_within: bool
-    is_recovered: bool
-
-
-@dataclass(frozen=True)
 class LossesRun:
     """A run with a script of faults: each fault, detections that none explains, and how it
     ended."""
 
-    faults: tuple[JudgedLoss, ...]
+    faults: tuple[Judgement, ...]
     unexplained: int
     cause: str
     ticks: int
@@ -60,16 +42,16 @@ def losses_of(script: str, about: str) -> Experiment[LossesRun]:
 
 
 def _run(script: str, workshop: Workshop) -> LossesRun:
-    recording = workshop.run(script, workshop.config(NAME, ["clock.mode=lockstep"], script), None)
-    found = faults(recording.events, recording.layout)
-    ended = recording.ended
+    config = workshop.config(NAME, ["clock.mode=lockstep"], script)
+    result, recording = workshop.run(script, config, None)
+    report = faults(recording.events, recording.layout)
     return LossesRun(
-        faults=TypeAdapter(tuple[JudgedLoss, ...]).validate_python(found["faults"]),
-        unexplained=len(found["unexplained"]),
-        cause=ended["outcome"]["cause"],
-        ticks=ended["outcome"]["ticks"],
-        worked=ended["worked"],
-        clock_ms=recording.rack_config.clock.period_ms,
+        faults=TypeAdapter(tuple[Judgement, ...]).validate_python(report["faults"]),
+        unexplained=len(report["unexplained"]),
+        cause=result.outcome.cause,
+        ticks=result.outcome.ticks,
+        worked=result.worked,
+        clock_ms=config.clock.period_ms,
     )
 
 

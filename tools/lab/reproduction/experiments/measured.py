@@ -1,20 +1,25 @@
 """Measurements that `rack bench` makes too: context switch, pipeline, response to an operator,
-partitions."""
+partitions, and the paper's other systems, each rack by itself."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from pydantic import TypeAdapter
 
 from rack.boards.config import load, loads
+from rack.boards.config.schema import Mode
 from rack.levels.timing.equations import response_ticks
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import partition, switch
 from rack.tools.lab.benches.boards import responses_of
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import observe
+from rack.tools.lab.benches.observed import Runs, observe
 from rack.tools.lab.benches.response import ResponseRuns, Twin
+from rack.tools.lab.benches.systems.bench import measure, systems
+from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import (
     PICTURES,
     Experiment,
@@ -30,6 +35,8 @@ COMMANDS = 16
 TWINS = 1
 SEED = 1
 PARTITION_S = 4.0
+SYSTEM_S = 4.0
+SYSTEM_LASTS_S = 35.0
 LAUNCH_S = 3.0
 NAME = "nasrem"
 
@@ -54,18 +61,22 @@ class PipelineRun:
     """How many messages took how many cycles down the levels, in lockstep and in real time."""
 
     predicted: int
-    cycles: dict[str, dict[int, int]]
+    lockstep: dict[int, int]
+    realtime: dict[int, int]
 
 
 def _pipeline(workshop: Workshop) -> PipelineRun:
-    chains = {mode: Chain(LEVELS, RATE_HZ, mode) for mode in ("lockstep", "realtime")}
-    last = f"{chains['lockstep'].names[-1]}.status"
-    found: dict[str, dict[int, int]] = {}
-    for mode, chain in chains.items():
-        config = loads(chain.text()).model_copy(update={"name": workshop.rack})
-        run = observe(config, PIPELINE_S, workshop.share, [last])
-        found[mode] = responses_of([run.messages[last]])
-    return PipelineRun(response_ticks([1] * LEVELS), found)
+    predicted = response_ticks([1] * LEVELS)
+    return PipelineRun(predicted, _cycles(workshop, "lockstep"), _cycles(workshop, "realtime"))
+
+
+def _cycles(workshop: Workshop, mode: Mode) -> dict[int, int]:
+    """Return how many messages took how many cycles."""
+    chain = Chain(LEVELS, RATE_HZ, mode)
+    last = f"{chain.names[-1]}.status"
+    config = loads(chain.text()).model_copy(update={"name": workshop.rack})
+    run = observe(config, PIPELINE_S, workshop.share, [last])
+    return responses_of([run.messages[last]])
 
 
 PIPELINE = Experiment(
@@ -108,9 +119,9 @@ class OperatorRun:
 
 
 def _response(workshop: Workshop) -> OperatorRun:
-    found = ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
-    paths = found.plot(workshop.folder / PICTURES)
-    document = found.document() | {"pictures": {"response": workshop.shown(paths)}}
+    bench = ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
+    paths = bench.plot(workshop.folder / PICTURES)
+    document = bench.document() | {"pictures": {"response": workshop.shown(paths)}}
     return TypeAdapter(OperatorRun).validate_python(document)
 
 
@@ -137,3 +148,30 @@ PARTITION = Experiment(
     lambda: {"config": load(NAME).text(), "seconds": PARTITION_S},
     _partition,
 )
+
+
+def system_experiment(name: str) -> Experiment[Systems]:
+    """Return the figures of one rack, in lockstep and in real time."""
+    return Experiment(
+        f"system-{name}",
+        f"{name} next to the other systems",
+        SYSTEM_LASTS_S,
+        Systems,
+        lambda: {"config": load(name).text(), "seconds": SYSTEM_S},
+        partial(_system, name),
+    )
+
+
+def _system(name: str, workshop: Workshop) -> Systems:
+    return measure([name], Runs(SYSTEM_S, 1, workshop.share), Progress())
+
+
+def compared(each: Sequence[Systems]) -> Systems:
+    """Return what was measured of several racks, as one comparison."""
+    return Systems(
+        tuple(figures for one in each for figures in one.systems), SYSTEM_S, each[0].absent
+    )
+
+
+SYSTEMS = tuple(system_experiment(name) for name in systems())
+"""Every rack that models a system, NASREM first."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 from pydantic import TypeAdapter
 
 from rack.boards.config import load
-from rack.levels.timing.trace_times import Distribution, distribution
+from rack.levels.timing.rack import RackTiming
+from rack.levels.timing.trace_times import distribution
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
@@ -21,43 +22,58 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 from rack.tools.recording.cycles import Cycles
 from rack.tools.recording.history import counted, misses, steal
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.analysis import Analysis, Pair
+from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import task_document
 
 NAME = "nasrem"
 LASTS_S = 34.0
 US = 1e-3
 MS = 1e-6
-PHASES = ("exchange", "read", "process", "write")
-"""The stamped parts of an executor's cycle: C, R, X, W."""
 
 
 @dataclass(frozen=True)
-class JudgedPair:
-    """An equation on a subject: measured in the worst cycle, and whether it holds mostly."""
+class Spread:
+    """Median and longest of the times of a run; 99 of 100 are at most `p99`."""
 
-    equation: str
-    subject: str
-    measured: EquationVerdict | None
+    p50: float
+    p99: float
+    max: float
+
+
+@dataclass(frozen=True)
+class Phases:
+    """The stamped parts of an executor's cycle, C, R, X and W, us."""
+
+    exchange: Spread
+    read: Spread
+    process: Spread
+    write: Spread
+
+
+@dataclass(frozen=True)
+class MeasuredVerdict:
+    """A verdict on the worst cycle of a run, and whether the equation holds in most cycles."""
+
+    measured: EquationVerdict
     mostly: bool
 
 
 @dataclass(frozen=True)
-class TaskCycles:
-    """The cycles of a task, with times in ms."""
+class ExecutorCycles:
+    """The cycles of an executor, with times in ms."""
 
-    role: str
     core: int
     cycles: int
     start_up: int
     stalled: int
     missed: int
     skipped: int
-    used_ms: Distribution
+    used_ms: Spread
     deviation_ms: float
-    lateness_ms: Distribution
+    lateness_ms: Spread
     slice_ms: float
-    largest_gap_ms: float | None
+    largest_gap_ms: float
+    phases: Phases
 
 
 @dataclass(frozen=True)
@@ -85,7 +101,7 @@ class WayResponse:
     """The response of a hierarchy one way, ms."""
 
     bound_ms: float
-    measured_ms: Distribution
+    measured_ms: Spread
     beyond: tuple[Document, ...]
 
 
@@ -103,16 +119,15 @@ class SystemResponse:
 @dataclass(frozen=True)
 class NasremRun:
     """What a run in real time left: `steal` is the hypervisor's part of a core, percent, `loads`
-    the tasks', of 1; `phases` are us."""
+    the tasks', of 1; `breaches` are the cycles that broke an equation by their own numbers."""
 
     ticks: int
     missed: int
     skipped: int
     steal: dict[str, float]
-    pairs: tuple[JudgedPair, ...]
+    verdicts: tuple[MeasuredVerdict, ...]
     breaches: dict[str, int]
-    tasks: dict[str, TaskCycles]
-    phases: dict[str, dict[str, Distribution]]
+    executors: dict[str, ExecutorCycles]
     loads: dict[int, float]
     response: SystemResponse
     mailboxes: tuple[MailboxTraffic, ...]
@@ -125,30 +140,35 @@ def _run(workshop: Workshop) -> NasremRun:
     from rack.tools.timing.analysis.residuals import plot
 
     need_real_time()
-    recording = workshop.run(NAME, workshop.config(NAME), None)
+    result, recording = workshop.run(NAME, workshop.config(NAME), None)
     analysis = Analysis.of(recording)
     analysis = replace(analysis, config=analysis.config.model_copy(update={"name": NAME}))
     stem = workshop.picture("residuals")
     plot(analysis, stem)
-    ended = recording.ended
-    late, left_out = counted(misses(recording))
-    tasks = {
-        name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()
-    }
+    missed, skipped = counted(misses(recording))
+    breaches = Counter(
+        equation
+        for breach in analysis.judged_breaches
+        for equation in {one.equation for one in breach.broken}
+    )
     drawn = workshop.shown([stem.with_suffix(".png"), stem.with_suffix(".svg")])
+    ticks = result.outcome.ticks
     return NasremRun(
-        ticks=ended["outcome"]["ticks"],
-        missed=late,
-        skipped=left_out,
+        ticks=ticks,
+        missed=missed,
+        skipped=skipped,
         steal=steal(recording)["percent"],
-        pairs=tuple(_pairs(analysis)),
-        breaches=_breaches(analysis),
-        tasks=TypeAdapter(dict[str, TaskCycles]).validate_python(tasks),
-        phases={n: _phases(c) for n, c in analysis.cycles.items() if c.task.role == "executor"},
+        verdicts=tuple(_verdicts(analysis)),
+        breaches=dict(breaches),
+        executors={
+            name: _executor(cycles, analysis.predicted)
+            for name, cycles in analysis.cycles.items()
+            if cycles.task.role == "executor"
+        },
         loads=dict(analysis.loads),
         response=TypeAdapter(SystemResponse).validate_python(analysis.response),
-        mailboxes=tuple(_mailbox(recording, name) for name in recording.mailboxes),
-        bus=TypeAdapter(dict[str, BusAccesses]).validate_python(ended["tasks"]),
+        mailboxes=tuple(_mailbox(recording, name, ticks) for name in recording.mailboxes),
+        bus=TypeAdapter(dict[str, BusAccesses]).validate_python(result.tasks),
         pictures={"residuals": drawn},
     )
 
@@ -163,41 +183,37 @@ NASREM = Experiment(
 )
 
 
-def _pairs(analysis: Analysis) -> Iterator[JudgedPair]:
-    """Yield every equation on every subject: measured in the worst cycle, and in most."""
-    mostly = {_key(pair): pair for pair in analysis.mostly}
+def _verdicts(analysis: Analysis) -> Iterator[MeasuredVerdict]:
+    """Yield every equation on every subject, as measured in the worst cycle."""
+    failing = {_key(pair.measured) for pair in analysis.mostly if pair.measured and pair.fails}
     for pair in analysis.pairs:
-        found = mostly.get(_key(pair))
-        holds = found is None or not found.fails
-        yield JudgedPair(pair.equation, pair.subject, pair.measured, holds)
+        if pair.measured:
+            yield MeasuredVerdict(pair.measured, _key(pair.measured) not in failing)
 
 
-def _key(pair: Pair) -> tuple[str, str, str]:
-    shown = pair.measured or pair.predicted
-    return pair.equation, pair.subject, shown.meaning if shown is not None else ""
+def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
+    return verdict.equation, verdict.subject, verdict.meaning
 
 
-def _breaches(analysis: Analysis) -> dict[str, int]:
-    """Return how many cycles broke each equation by their own numbers."""
-    broken = chain(
-        *({one.equation for one in breach.broken} for breach in analysis.judged_breaches)
-    )
-    found = list(broken)
-    return {equation: found.count(equation) for equation in sorted(set(found))}
+def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
+    stamped_ns = {
+        "exchange": cycles.exchange_ns,
+        "read": cycles.read_ns,
+        "process": cycles.process_ns,
+        "write": cycles.write_ns,
+    }
+    phases = {
+        name: distribution(times_ns[cycles.is_judged] * US) for name, times_ns in stamped_ns.items()
+    }
+    document = {**task_document(cycles, rack), "phases": phases}
+    return TypeAdapter(ExecutorCycles).validate_python(document)
 
 
-def _phases(cycles: Cycles) -> dict[str, Distribution]:
-    """Return the parts of an executor's cycle, us."""
-    judged = cycles.is_judged
-    found = {n: distribution(getattr(cycles, f"{n}_ns")[judged] * US) for n in PHASES}
-    return {name: times for name, times in found.items() if times is not None}
-
-
-def _mailbox(recording: Recording, name: str) -> MailboxTraffic:
+def _mailbox(recording: Recording, name: str, ticks: int) -> MailboxTraffic:
     every = recording.layout.mailbox(name).every
     return MailboxTraffic(
         mailbox=name,
         every_ms=every * recording.layout.clock_ns * MS,
-        due=-(-recording.ended["outcome"]["ticks"] // every),
+        due=-(-ticks // every),
         messages=len(np.unique(recording.signal(name, "serial"))),
     )

@@ -57,6 +57,7 @@ TABLES = Experiment(
 
 
 def _task(workshop: Workshop, label: str, settings: Sequence[str]) -> TableRun:
-    recording = workshop.run(label, workshop.config(NAME, ["clock.mode=lockstep", *settings]), None)
-    found = {"rows": fired_rows(recording), "worked": recording.ended["worked"]}
-    return TypeAdapter(TableRun).validate_python(found)
+    config = workshop.config(NAME, ["clock.mode=lockstep", *settings])
+    result, recording = workshop.run(label, config, None)
+    rows = TypeAdapter(dict[str, tuple[FiredRow, ...]]).validate_python(fired_rows(recording))
+    return TableRun(rows, result.worked)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rack.boards.config import RackConfig, load
-from rack.tools.lab.benches.partition import LevelFigures
+from rack.tools.lab.benches.partition import LevelFigures, TaskFigures
 from rack.tools.lab.benches.switch import PAPER_US
 from rack.tools.lab.reproduction.experiments import tables
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
@@ -17,6 +18,7 @@ from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     Columns,
     Plate,
+    Row,
     Ruling,
     Side,
     code,
@@ -33,31 +35,31 @@ FEW = 0.01
 
 def _earlier(workshop: Workshop) -> Side:
     config = load(tables.NAME)
+    planners = [name for name, board in config.board.items() if board.planner]
     rows = [
         (
             name,
             f"{config.every(name) * config.clock_ns * 1e-6:g}",
-            _table_of(config, name),
-            "yes" if board.planner else "no",
+            _tables_of(config, name),
+            "yes" if name in planners else "no",
         )
-        for name, board in config.board.items()
+        for name in config.board
     ]
-    with_table = {config.every(name) for name in config.board if _table_of(config, name) != "-"}
-    same = "one and the same" if len(with_table) == 1 else "different"
-    planners = [name for name, board in config.board.items() if board.planner]
-    return Side.of(
+    cycles = {config.every(name) for name in config.board if _tables_of(config, name)}
+    same = "one and the same" if len(cycles) == 1 else "different"
+    return [
         Columns(("level", "cycle", "its state tables", "planner"), rows),
         f"The levels with state tables have {same} cycle. Levels with a planner:"
         f" {', '.join(planners) or 'none'}; plans are poses and places in the tables. We run the"
         " task twice in lockstep: with what moves in the cell, a pusher that shoves a block along"
         " while the arm reaches for it, and without.",
-    )
+    ]
 
 
-def _table_of(config: RackConfig, board: str) -> str:
-    """Return the files of a board's state tables; "-" where it has none."""
+def _tables_of(config: RackConfig, board: str) -> str | None:
+    """Return the files of a board's state tables; None where it has none."""
     named = config.board[board].params.get("tables", {})
-    return code(", ".join(Path(path).name for path in named.values())) if named else "-"
+    return code(", ".join(Path(path).name for path in named.values())) if named else None
 
 
 def _earlier_tested(findings: Findings) -> Assessment:
@@ -66,24 +68,23 @@ def _earlier_tested(findings: Findings) -> Assessment:
     calm = found.undisturbed
     usual = {(level, row.name) for level, rows in calm.rows.items() for row in rows}
     extra = [
-        (level, row)
+        (level, text(row.name), row.cycles, f"{row.first_s:g}")
         for level, rows in disturbed.rows.items()
         for row in rows
         if (level, row.name) not in usual
     ]
-    fired = [(level, text(row.name), str(row.cycles), f"{row.first_s:g}") for level, row in extra]
     counts = [
-        (level, str(len(rows)), str(sum(row.cycles for row in rows)))
+        (level, len(rows), sum(row.cycles for row in rows))
         for level, rows in disturbed.rows.items()
     ]
-    side = Side.of(
+    side: Side = [
         Columns(("level", "rows that fired", "cycles"), counts),
         Columns(
             ("level", "row", "cycles", "first at, s"),
-            fired,
+            extra,
             "Rows that fired only in the run with the disturbance.",
         ),
-    )
+    ]
     if not (disturbed.worked and calm.worked):
         return Assessment(side, Ruling.FAILS, "A task was not done.")
     if not extra:
@@ -97,27 +98,17 @@ def _earlier_tested(findings: Findings) -> Assessment:
 
 def _levels(workshop: Workshop) -> Side:
     config = load(NAME)
-    rows = [
-        (
-            name,
-            f"{1e9 / (config.every(name) * config.clock_ns):g}",
-            str(board.core),
-            str(board.priority),
-            {"tight": "tightly", "loose": "loosely", "none": "-"}[board.coupling],
-            (
-                "-"
-                if board.planner is None
-                else str(board.core if board.planner_core is None else board.planner_core)
-            ),
-        )
-        for name, board in config.board.items()
-    ]
+    coupled = {"tight": "tightly", "loose": "loosely", "none": "-"}
+    rows = []
+    for name, board in config.board.items():
+        rate = f"{1e9 / (config.every(name) * config.clock_ns):g}"
+        planner_core = board.planner_core
+        if planner_core is None and board.planner:
+            planner_core = board.core
+        rows.append((name, rate, board.core, board.priority, coupled[board.coupling], planner_core))
     head = ("level", "rate, Hz", "processor", "priority", "planner coupled", "planner's processor")
-    return Side.of(
-        Columns(
-            head, rows, f"From the config of {code(NAME)}. The planners have no real-time priority."
-        )
-    )
+    caption = f"From the config of {code(NAME)}. The planners have no real-time priority."
+    return [Columns(head, rows, caption)]
 
 
 def _levels_tested(findings: Findings) -> Assessment:
@@ -126,23 +117,21 @@ def _levels_tested(findings: Findings) -> Assessment:
     lasted_s = found.ticks * config.clock_ns * 1e-9
     rows = []
     off = []
-    for name, task in found.tasks.items():
-        if task.role != "executor":
-            continue
+    for name, task in found.executors.items():
         nominal = 1e9 / (config.every(name) * config.clock_ns)
         done = task.cycles + task.start_up + task.stalled
         due = -(-found.ticks // config.every(name))
-        measured = nominal * done / due
-        off += [name] if done < (1 - NOMINAL) * due else []
-        late = [f"{1e3 * task.lateness_ms[key]:.0f}" for key in ("p50", "p99")]
+        if done < (1 - NOMINAL) * due:
+            off.append(name)
         rows.append(
             (
                 name,
                 f"{nominal:g}",
-                f"{measured:.2f}",
-                *late,
+                f"{nominal * done / due:.2f}",
+                f"{1e3 * task.lateness_ms.p50:.0f}",
+                f"{1e3 * task.lateness_ms.p99:.0f}",
                 f"{task.largest_gap_ms:.2f}",
-                str(task.core),
+                task.core,
             )
         )
     head = (
@@ -157,7 +146,7 @@ def _levels_tested(findings: Findings) -> Assessment:
     accesses = sum(bus.reads + bus.writes for bus in found.bus.values()) / lasted_s
     size = sum(bus.read_bytes + bus.write_bytes for bus in found.bus.values()) / lasted_s
     words = f"Over the backplane go {accesses:.0f} reads and writes a second, {size / 1e6:.2f} MB."
-    side = Side.of(Columns(head, rows), words)
+    side: Side = [Columns(head, rows), words]
     if not off:
         return Assessment(
             side,
@@ -183,34 +172,25 @@ def _switch(workshop: Workshop) -> Side:
         )
         rows.append((f"{1e3 * config.timing.context_switch_ms:g}", text(failing) or "none"))
     head = ("t<sub>cs</sub>, us", f"what fails in {code(NAME)}")
-    return Side.of(
-        Columns(
-            head,
-            rows,
-            "By the budgets of the config; the second row has the paper's task switch"
-            f" ({code(setting)}).",
-        )
+    caption = (
+        "By the budgets of the config; the second row has the paper's task switch"
+        f" ({code(setting)})."
     )
+    return [Columns(head, rows, caption)]
 
 
 def _switch_tested(findings: Findings) -> Assessment:
     found = findings.of(SWITCH)
-    names = {
-        "planner to executor": found.in_us,
-        "executor to planner": found.out_us,
-        "t<sub>cs</sub>, half of both": found.switch_us,
-    }
     rows = [
         (name, *(f"{times[part]:.1f}" for part in ("min", "p50", "p99", "max")))
-        for name, times in names.items()
-    ]
-    side = Side.of(
-        Columns(
-            ("us", "least", "median", "99th percentile", "longest"),
-            rows,
-            f"Of {found.wakes} switches.",
+        for name, times in (
+            ("planner to executor", found.in_us),
+            ("executor to planner", found.out_us),
+            ("t<sub>cs</sub>, half of both", found.switch_us),
         )
-    )
+    ]
+    head = ("us", "least", "median", "99th percentile", "longest")
+    side: Side = [Columns(head, rows, f"Of {found.wakes} switches.")]
     median = found.switch_us["p50"]
     assumed = 1e3 * load(NAME).timing.context_switch_ms
     why = (
@@ -229,10 +209,10 @@ def _figure5(workshop: Workshop) -> Side:
         for one in figure5.placed(config)
     ]
     caption = f"The levels of {code(NAME)} among the paper's regions."
-    return Side.of(
+    return [
         Plate(Path(path), caption),
         Columns(("level", "cycle", "the figure suggests", "planner here"), rows),
-    )
+    ]
 
 
 def _figure5_tested(findings: Findings) -> Assessment:
@@ -244,15 +224,15 @@ def _figure5_tested(findings: Findings) -> Assessment:
         if figure5.region_of(one.cycle_s).name == "multitasking"
     }
     rows = []
-    missed = {kind: [0, 0] for kind in ("slow", "fast", "apart")}
+    slow_tasks: list[TaskFigures] = []
+    sharing: list[TaskFigures] = []
+    apart: list[TaskFigures] = []
     for one in found.partitions:
-        fast = "fast" if one.partition.startswith("tight") else "apart"
+        fast_tasks = sharing if one.partition.startswith("tight") else apart
         for level in one.levels:
             rows.append(_partition_row(one.partition, level))
-            counts = missed["slow" if level.level in slow else fast]
-            for task in filter(None, (level.executor, level.planner)):
-                counts[0] += task.missed + task.skipped
-                counts[1] += task.cycles
+            group = slow_tasks if level.level in slow else fast_tasks
+            group += filter(None, (level.executor, level.planner))
     head = (
         "partition",
         "level",
@@ -264,17 +244,16 @@ def _figure5_tested(findings: Findings) -> Assessment:
         "plan's age, ms, longest",
     )
     words = f"Each partition ran {code(NAME)} for {found.seconds:g} s in real time."
-    side = Side.of(Columns(head, rows, words))
-    shares = {region: bad / all_ if all_ else 0.0 for region, (bad, all_) in missed.items()}
+    side: Side = [Columns(head, rows, words)]
     said = (
         "of the cycles and plans of levels from a quarter of a second up"
-        f" {100 * shares['slow']:.1f} % were missed; of those below, {100 * shares['fast']:.1f} %"
-        f" with planners on the same processor, and {100 * shares['apart']:.1f} % with planners on"
-        " boards of their own."
+        f" {100 * _missed(slow_tasks):.1f} % were missed; of those below,"
+        f" {100 * _missed(sharing):.1f} % with planners on the same processor, and"
+        f" {100 * _missed(apart):.1f} % with planners on boards of their own."
     )
-    if shares["slow"] > FEW:
+    if _missed(slow_tasks) > FEW:
         return Assessment(side, Ruling.FAILS, f"Against the figure, {said}")
-    if shares["fast"] <= shares["apart"] + FEW:
+    if _missed(sharing) <= _missed(apart) + FEW:
         why = (
             "As the figure says, slow levels do with multitasking. On this machine fast ones need"
             " no more either: "
@@ -285,21 +264,30 @@ def _figure5_tested(findings: Findings) -> Assessment:
     )
 
 
-def _partition_row(partition: str, level: LevelFigures) -> tuple[str, ...]:
+def _missed(tasks: Sequence[TaskFigures]) -> float:
+    """Return the part of the cycles and plans of these tasks that were missed or skipped."""
+    due = sum(task.cycles for task in tasks)
+    return sum(task.missed + task.skipped for task in tasks) / due if due else 0.0
+
+
+def _partition_row(partition: str, level: LevelFigures) -> Row:
     executor = level.executor
     planner = level.planner
+    plans = None if planner is None else planner.cycles
+    late = None if planner is None else planner.missed
     age = level.plan_age_ms
+    oldest = None if age is None else f"{age['max']:g}"
     fits = [task.fits for task in filter(None, (executor, planner)) if task.fits is not None]
     verdict = "yes" if all(fits) else "NO"
     return (
         partition,
         level.level,
-        verdict if fits else "-",
-        str(executor.cycles),
-        str(executor.missed + executor.skipped),
-        "-" if planner is None else str(planner.cycles),
-        "-" if planner is None else str(planner.missed),
-        "-" if age is None else f"{age['max']:g}",
+        verdict if fits else None,
+        executor.cycles,
+        executor.missed + executor.skipped,
+        plans,
+        late,
+        oldest,
     )
 
 

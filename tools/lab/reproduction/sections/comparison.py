@@ -11,13 +11,18 @@ from rack.tools.lab.benches.systems.bench import systems
 from rack.tools.lab.benches.systems.figures import SystemFigures
 from rack.tools.lab.benches.systems.prediction import SystemPrediction, prediction
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
-from rack.tools.lab.reproduction.experiments.systems import SYSTEMS, compared
+from rack.tools.lab.reproduction.experiments.measured import (
+    SYSTEMS,
+    compared,
+    system_experiment,
+)
 from rack.tools.lab.reproduction.sections.gantt import DISTURBED
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     Columns,
     Listing,
     Plate,
+    Row,
     Ruling,
     Side,
     code,
@@ -26,7 +31,7 @@ from rack.tools.lab.reproduction.sections.page import (
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
 RCCL = "rccl"
-RCCL_RUN = next(one for one in SYSTEMS if one.name.endswith(f"-{RCCL}"))
+RCCL_RUN = system_experiment(RCCL)
 
 
 @cache
@@ -55,18 +60,21 @@ def _promised(workshop: Workshop) -> Side:
         "Responses by equations 3.2 and 3.3, and on the clock's grid, ms. Hosts are boards without"
         " real time."
     )
-    return Side.of(Columns(head, rows, caption))
+    return [Columns(head, rows, caption)]
 
 
-def _promise_row(name: str, said: SystemPrediction) -> tuple[str, ...]:
-    times = (said.longest_cycle_ms, said.bound_ms, said.sum_ms, said.command_ms, said.status_ms)
+def _promise_row(name: str, said: SystemPrediction) -> Row:
+    times_ms = (said.longest_cycle_ms, said.bound_ms, said.sum_ms, said.command_ms, said.status_ms)
+    times = [f"{time_ms:g}" for time_ms in times_ms]
+    if not said.levels:
+        times = ["-"] * len(times)
     return (
         code(name),
         text(" → ".join(said.levels)) or "-",
         ", ".join(f"{rate:.4g}" for rate in said.rates_hz) or "-",
-        str(said.boards),
-        str(said.hosts),
-        *(f"{time_ms:g}" if said.levels else "-" for time_ms in times),
+        said.boards,
+        said.hosts,
+        *times,
         {True: "yes", False: "NO", None: "-"}[said.fits],
     )
 
@@ -82,13 +90,13 @@ def _compared(findings: Findings) -> Assessment:
         "killed: ticks until a neighbour",
         "missed, %",
     )
-    rows = [_measured_row(one) for one in found.systems]
+    rows = [_measured_row(figures) for figures in found.systems]
     caption = (
         "Responses in ms: longest of a run in real time. A hold is given to the highest level that"
         " takes one."
     )
     drawn = findings.workshop.shown(found.plot(findings.workshop.folder / PICTURES))
-    side = Side.of(
+    side: Side = [
         Columns(head, rows, caption),
         Plate(
             Path(drawn),
@@ -98,7 +106,7 @@ def _compared(findings: Findings) -> Assessment:
             "\n".join(found.lines(None)),
             f"All figures, as {code('rack bench systems')} prints them.",
         ),
-    )
+    ]
     failed = [one for one in found.systems if not one.worked]
     if failed and all(one.realtime.missed > DISTURBED for one in failed):
         missed = ", ".join(
@@ -130,18 +138,17 @@ def _compared(findings: Findings) -> Assessment:
     )
 
 
-def _measured_row(one: SystemFigures) -> tuple[str, ...]:
-    ran = one.realtime
-    hold = one.realtime.hold
-    ticks = sorted(kill.neighbour for kill in one.kills.detections if kill.neighbour is not None)
-    held = (
-        "-"
-        if hold is None or hold.measured_ms is None
-        else f"{hold.measured_ms:g} of {hold.longest_ms:g} ({hold.level})"
-    )
-    killed = f"{ticks[0]} to {ticks[-1]}" if ticks else "-"
+def _measured_row(figures: SystemFigures) -> Row:
+    ran = figures.realtime
+    hold = ran.hold
+    held = None
+    if hold and hold.measured_ms is not None:
+        held = f"{hold.measured_ms:g} of {hold.longest_ms:g} ({hold.level})"
+    neighbours = [kill.neighbour for kill in figures.kills.detections]
+    ticks = sorted(tick for tick in neighbours if tick is not None)
+    killed = f"{ticks[0]} to {ticks[-1]}" if ticks else None
     return (
-        code(one.rack),
+        code(figures.rack),
         _longest(ran.command_ms),
         _longest(ran.status_ms),
         held,
@@ -150,8 +157,8 @@ def _measured_row(one: SystemFigures) -> tuple[str, ...]:
     )
 
 
-def _longest(times: Distribution | None) -> str:
-    return "-" if times is None else f"{times['max']:g}"
+def _longest(times: Distribution | None) -> str | None:
+    return None if times is None else f"{times['max']:g}"
 
 
 def _is_beyond(one: SystemFigures) -> bool:
@@ -159,9 +166,9 @@ def _is_beyond(one: SystemFigures) -> bool:
     ran = one.realtime
     said = one.predicted
     pairs = ((ran.command_ms, said.command_ms), (ran.status_ms, said.status_ms))
-    return any(times is not None and times["max"] > bound + 1e-6 for times, bound in pairs) or bool(
-        ran.hold and ran.hold.beyond
-    )
+    if any(times is not None and times["max"] > bound + 1e-6 for times, bound in pairs):
+        return True
+    return ran.hold is not None and ran.hold.beyond
 
 
 def _layered(workshop: Workshop) -> Side:
@@ -169,10 +176,10 @@ def _layered(workshop: Workshop) -> Side:
     for name in systems():
         said = _promise(name)
         ratio = max(said.rates_hz) / min(said.rates_hz) if said.rates_hz else 1.0
-        rows.append((code(name), str(len(said.levels)), str(said.hosts), f"{ratio:.4g}"))
-    return Side.of(
+        rows.append((code(name), len(said.levels), said.hosts, f"{ratio:.4g}"))
+    return [
         Columns(("rack", "levels", "boards without real time", "fastest rate to slowest"), rows)
-    )
+    ]
 
 
 def _layered_tested(findings: Findings) -> Assessment:
@@ -185,12 +192,12 @@ def _layered_tested(findings: Findings) -> Assessment:
             f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a"
             f" faster level above a slower one: {', '.join(even) or 'none'}."
         )
-        return Assessment(Side(), Ruling.BOUNDED, why)
+        return Assessment([], Ruling.BOUNDED, why)
     why = (
         f"From the configs alone: all {len(promised)} have at least two levels, and no level is"
         " faster than the one below."
     )
-    return Assessment(Side(), Ruling.HOLDS, why)
+    return Assessment([], Ruling.HOLDS, why)
 
 
 def _rccl(workshop: Workshop) -> Side:
@@ -199,8 +206,8 @@ def _rccl(workshop: Workshop) -> Side:
         (
             task.name,
             f"{1e9 / (task.every * layout.clock_ns):g}",
-            str(task.core),
-            str(task.priority or "-"),
+            task.core,
+            task.priority or None,
         )
         for task in layout.tasks
     ]
@@ -209,26 +216,25 @@ def _rccl(workshop: Workshop) -> Side:
         for box in layout.mailboxes
         if box.capacity
     ]
-    return Side.of(
+    return [
         Columns(("task", "rate, Hz", "processor", "priority"), rows),
         f"Queues: {'; '.join(queues)}.",
-    )
+    ]
 
 
 def _rccl_tested(findings: Findings) -> Assessment:
     found = findings.of(RCCL_RUN).systems[0]
     rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
-    layout = wire(load(RCCL))
-    fastest = [
-        task for task in layout.tasks if task.every == min(other.every for other in layout.tasks)
-    ]
-    cores = {task.core for task in layout.tasks}
-    side = Side.of(Columns(("board", "processor time, share of one"), rows))
+    tasks = wire(load(RCCL)).tasks
+    periods = [task.every for task in tasks]
+    cores = {task.core for task in tasks}
+    side: Side = [Columns(("board", "processor time, share of one"), rows)]
     if not found.worked:
         return Assessment(side, Ruling.FAILS, text(found.failure))
+    fastest = periods.count(min(periods))
     why = (
-        f"Joint control has a board a joint, but {len(fastest)} boards of that rate share"
-        f" {len(cores)} processors: each joint its own processor cannot be had here. At 1 kHz"
+        f"Joint control has a board a joint, but {fastest} boards of that rate share {len(cores)}"
+        " processors: each joint its own processor cannot be had here. At 1 kHz"
         f" {100 * found.realtime.missed:.2f} % of their cycles were missed."
     )
     return Assessment(side, Ruling.BOUNDED, why)

@@ -15,27 +15,32 @@ from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, St
 def _predictable(workshop: Workshop) -> Side:
     forecast = forecast_of(load(NAME))
     failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
-    return Side.of(
+    return [
         f"By the budgets of {code(NAME)}, {len(forecast.verdicts) - len(failing)} of"
         f" {len(forecast.verdicts)} judgements of the timing model hold. It then predicts more than"
         " bounds: the tick at which the torque rests on a command that an operator gives at any"
         " tick, to any level."
-    )
+    ]
 
 
 def _predictable_tested(findings: Findings) -> Assessment:
     found = findings.of(RESPONSE)
-    names = ("min", "median", "max", "longest", "sum_eq_3_3", "bound_eq_3_2", "max_from_reading")
     rows = [
         (
             row.level,
-            str(row.commands),
-            *(f"{getattr(row, f'{name}_ms'):g}" for name in names),
-            str(row.off_prediction),
+            row.commands,
+            f"{row.min_ms:g}",
+            f"{row.median_ms:g}",
+            f"{row.max_ms:g}",
+            f"{row.longest_ms:g}",
+            f"{row.sum_eq_3_3_ms:g}",
+            f"{row.bound_eq_3_2_ms:g}",
+            f"{row.max_from_reading_ms:g}",
+            row.off_prediction,
         )
         for row in found.levels
     ]
-    head = [
+    head = (
         "given to",
         "commands",
         "least",
@@ -44,22 +49,21 @@ def _predictable_tested(findings: Findings) -> Assessment:
         "longest on the grid",
         "sum, 3.3",
         "bound, 3.2",
-    ]
-    head += ["longest from its reading", "not at the predicted tick"]
-    twins = [twin for twin in found.twins if not twin.agrees]
-    side = Side.of(
-        Columns(
-            head,
-            rows,
-            "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of"
-            " the cycle that acts.",
-        ),
+        "longest from its reading",
+        "not at the predicted tick",
+    )
+    caption = (
+        "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of the"
+        " cycle that acts."
+    )
+    side: Side = [
+        Columns(head, rows, caption),
         Plate(
             Path(found.pictures["response"]),
             "Responses to commands at each level, with their bounds.",
         ),
-    )
-    if found.held and not twins:
+    ]
+    if found.held and all(twin.agrees for twin in found.twins):
         why = (
             f"All {found.measured} commands took effect at the predicted tick and within the"
             " bounds of equations 3.2 and 3.3. In a run without one of them, the torque is the"

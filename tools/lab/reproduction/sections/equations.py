@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import isfinite
-from typing import NamedTuple
 
 from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.errors import ConfigError
@@ -15,7 +14,7 @@ from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.tables import ms
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, MeasuredVerdict, NasremRun
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     Columns,
@@ -99,49 +98,38 @@ class PaperEquation:
         words = (
             f"{self.reading} For {code(NAME)}, by the budgets of its config: {'; '.join(meanings)}."
         )
-        return Side.of(words, table, *self.biting.side(self.number))
+        return [words, table, *self.biting.side(self.number)]
 
 
 def _row(verdict: EquationVerdict) -> tuple[str, ...]:
     """Return a row of a table: subject, both sides, margin, and whether it holds."""
-    sides = (verdict.left, verdict.right, verdict.margin)
-    left, right, margin = (_shown(side, verdict.unit) for side in sides)
+    holds = "ok" if verdict.holds else "FAILS"
     return (
         text(verdict.subject),
-        left,
+        _side(verdict.left, verdict.unit),
         SIGNS[verdict.sign],
-        right,
-        margin,
-        "ok" if verdict.holds else "FAILS",
+        _side(verdict.right, verdict.unit),
+        _side(verdict.margin, verdict.unit),
+        holds,
     )
 
 
-def _shown(side: float, unit: str) -> str:
-    if not isfinite(side):
+def _side(value: float, unit: str) -> str:
+    if not isfinite(value):
         return "∞"
-    return ms(side) if unit == "ns" else f"{side:.3g}"
-
-
-class MeasuredVerdict(NamedTuple):
-    """A verdict on the worst cycle of a run, and whether the equation holds in most cycles."""
-
-    measured: EquationVerdict
-    mostly: bool
+    return ms(value) if unit == "ns" else f"{value:.3g}"
 
 
 def measured_of(equation: str, found: NasremRun) -> list[MeasuredVerdict]:
     """Return the measured verdicts on one equation."""
-    return [
-        MeasuredVerdict(pair.measured, pair.mostly)
-        for pair in found.pairs
-        if pair.equation == equation and pair.measured is not None
-    ]
+    return [verdict for verdict in found.verdicts if verdict.measured.equation == equation]
 
 
 def table_of(verdicts: list[MeasuredVerdict]) -> Columns:
     """Return the measured verdicts as a table: the worst cycle of the run, and whether most cycles
     are better."""
-    rows = [(*_row(measured), "yes" if mostly else "NO") for measured, mostly in verdicts]
+    mostly = {True: "yes", False: "NO"}
+    rows = [(*_row(verdict.measured), mostly[verdict.mostly]) for verdict in verdicts]
     return Columns((*HEAD[:-1], "worst cycle", "in 99 of 100"), rows)
 
 
@@ -149,40 +137,30 @@ def judged(equation: PaperEquation, findings: Findings) -> Assessment:
     """Judge an equation by the worst cycle of every subject, and by 99 of 100 cycles."""
     found = findings.of(NASREM)
     verdicts = measured_of(equation.number, found)
-    counts = found.breaches.get(equation.number, 0)
     lasted = found.ticks * load(NAME).clock_ns * 1e-9
     words = (
         f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without"
         " those of the start-up."
     )
-    side = Side.of(words, table_of(verdicts))
-    broken = [measured.subject for measured, _ in verdicts if not measured.holds]
+    side: Side = [words, table_of(verdicts)]
+    broken = text(", ".join(v.measured.subject for v in verdicts if not v.measured.holds))
     if not broken:
         return Assessment(
             side,
             Ruling.HOLDS,
             "It holds as predicted for every level, in the worst cycle of the run too.",
         )
-    if all(mostly for _, mostly in verdicts):
-        why = (
-            "It holds as predicted in 99 of 100 cycles; in the worst it fails for"
-            f" {text(', '.join(broken))}. "
-        )
-        why += f"{counts} cycles broke it by their own numbers. " if counts else ""
-        why += stolen(found)
-        return Assessment(side, Ruling.BOUNDED, why)
-    return Assessment(
-        side,
-        Ruling.FAILS,
-        f"It fails for {text(', '.join(broken))}, in more than one of 100 cycles.",
-    )
+    if all(verdict.mostly for verdict in verdicts):
+        why = f"It holds as predicted in 99 of 100 cycles; in the worst it fails for {broken}. "
+        if counts := found.breaches.get(equation.number):
+            why += f"{counts} cycles broke it by their own numbers. "
+        return Assessment(side, Ruling.BOUNDED, why + stolen(found))
+    return Assessment(side, Ruling.FAILS, f"It fails for {broken}, in more than one of 100 cycles.")
 
 
 def stolen(found: NasremRun) -> str:
     """Return how much of its cores the hypervisor took from a run."""
+    if not found.steal:
+        return "The hypervisor's share is not known."
     taken = ", ".join(f"{percent:g} % of core {core}" for core, percent in found.steal.items())
-    return (
-        f"Meanwhile the hypervisor took {taken}."
-        if taken
-        else "The hypervisor's share is not known."
-    )
+    return f"Meanwhile the hypervisor took {taken}."

@@ -4,7 +4,6 @@ in each level."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from html import escape
 
 from rack.backplane.layout import Layout, MailboxSpec
@@ -33,22 +32,9 @@ ARROW = (
 ARROW += '<path d="M0 0 8 4 0 8z" fill="{1}"/></marker>'
 
 
-@dataclass(frozen=True)
-class Flow:
-    """The mailboxes between two levels, down and up, and within a level from planner to
-    executor."""
-
-    down: tuple[MailboxSpec, ...]
-    up: tuple[MailboxSpec, ...]
-
-
-def between(layout: Layout, upper: str, lower: str) -> Flow:
+def between(layout: Layout, writer: str, reader: str) -> list[MailboxSpec]:
     """Return the mailboxes that one level's executor writes and the other's reads."""
-    return Flow(_read(layout, upper, lower), _read(layout, lower, upper))
-
-
-def _read(layout: Layout, writer: str, reader: str) -> tuple[MailboxSpec, ...]:
-    return tuple(box for box in layout.mailboxes if box.writer == writer and reader in box.readers)
+    return [box for box in layout.mailboxes if box.writer == writer and reader in box.readers]
 
 
 def flow_svg(rack: RackTiming, layout: Layout) -> str:
@@ -85,36 +71,37 @@ def _levels(rack: RackTiming, layout: Layout, levels: Sequence[str]) -> Iterator
             yield _line(LEFT + 174, y + 55, LEFT + 230, y + 55, "line", "d")
             yield _text(LEFT + 202, y + 48, "plan", "small", "middle")
         if at + 1 < len(levels):
-            yield from _arrows(between(layout, name, levels[at + 1]), y + HIGH)
+            yield from _arrows(layout, name, levels[at + 1], y + HIGH)
 
 
-def _arrows(flow: Flow, y: int) -> Iterator[str]:
+def _arrows(layout: Layout, upper: str, lower: str, y: int) -> Iterator[str]:
     """Yield the arrows from one level to the next, at the lower edge `y` of the upper one."""
     down = LEFT + 250
     up = LEFT + 382
     yield _line(down, y, down, y + GAP, "line", "d")
     yield _line(up, y + GAP, up, y, "line up", "u")
-    for x, boxes, anchor in ((down - 10, flow.down, "end"), (up + 10, flow.up, "start")):
-        for row, box in enumerate(boxes):
-            yield _text(x, y + 34 + 16 * row, f"{box.name}: {box.message}", "small", anchor)
+    for row, box in enumerate(between(layout, upper, lower)):
+        yield _text(down - 10, y + 34 + 16 * row, f"{box.name}: {box.message}", "small", "end")
+    for row, box in enumerate(between(layout, lower, upper)):
+        yield _text(up + 10, y + 34 + 16 * row, f"{box.name}: {box.message}", "small")
 
 
 def _others(layout: Layout, levels: Sequence[str], others: Sequence[str]) -> Iterator[str]:
     """Yield the boards next to the hierarchy, with the levels that they read and that read them."""
     for number, name in enumerate(others):
         y = TOP + (2 * number + 1) * (HIGH + GAP)
-        sources = [level for level in levels if _read(layout, level, name)]
+        sources = [level for level in levels if between(layout, level, name)]
         own = [box for box in layout.mailboxes if box.writer == name]
         readers = sorted(
             {reader.partition(".")[0] for box in own for reader in box.readers} - {name}
         )
+        middle = y + HIGH // 2
         yield f'<rect class="box" x="14" y="{y}" width="{SIDE}" height="{HIGH}" rx="6"/>'
         yield _text(26, y + 22, name, "name")
         yield _text(26, y + 46, f"reads {', '.join(sources) or 'none of the levels'}", "small")
         yield _text(26, y + 64, f"read by {', '.join(readers) or 'nobody'}", "small")
-        for level in levels:
-            edge = TOP + levels.index(level) * (HIGH + GAP) + HIGH // 2 + 30
-            middle = y + HIGH // 2
+        for at, level in enumerate(levels):
+            edge = TOP + at * (HIGH + GAP) + HIGH // 2 + 30
             if level in readers:
                 yield _line(14 + SIDE, middle, LEFT - 2, edge - 12, "line aside", "a")
             if level in sources:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
-from rack.boards.config import RackConfig
-from rack.boards.config.schema import BudgetConfig
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
     LEVEL,
@@ -16,7 +14,8 @@ from rack.tools.lab.reproduction.experiments.figures import (
     FigureRack,
     FigureRun,
     Planning,
-    column_ns,
+    budget_of,
+    planning,
     sweep,
 )
 from rack.tools.lab.reproduction.sections.page import (
@@ -29,7 +28,7 @@ from rack.tools.lab.reproduction.sections.page import (
     code,
 )
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
-from rack.tools.timing.charts.letters import lines
+from rack.tools.timing.charts.letters import column_for, lines
 
 LEAST_X = 1.0
 MOST_X = 3.0
@@ -62,14 +61,14 @@ def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:
     from rack.tools.timing.charts.picture import save
 
     panel = figure.panel()
-    config = figure.loaded()
     paths = save(
         [panel], f"{figure.label}: the schedule of its budget", workshop.picture(figure.label)
     )
     caption = (
         f"The schedule computed from the budget of {code(figure.label)}, drawn as in the paper."
     )
-    letters = "\n".join(lines(panel, column_ns(config, figure.window_ns(config))))
+    column_ns = column_for(figure.window_ns, figure.schedule().shortest_ns)
+    letters = "\n".join(lines(panel, column_ns))
     return Plate(Path(workshop.shown(paths)), caption), Listing(letters)
 
 
@@ -77,40 +76,27 @@ def ran(figure: FigureRack, found: FigureRun) -> Side:
     """Return the run of a figure: its chart, how many cycles and plans were late, and its
     patterns."""
     steal = ", ".join(f"core {core} {percent:g} %" for core, percent in found.steal.items())
+    names = {LEVEL: "executor: cycles", PLANNER: "planner: plans"}
     rows = [
-        (
-            {LEVEL: "executor: cycles", PLANNER: "planner: plans"}[task],
-            str(count.jobs),
-            str(count.late),
-            str(count.skipped),
-        )
-        for task, count in found.tasks.items()
+        (names[task], count.jobs, count.late, count.skipped) for task, count in found.tasks.items()
     ]
+    patterns = [(one.lane, code(one.pattern), one.times) for one in found.patterns]
     caption = (
         "Late: past its deadline; skipped: of the late ones, those that never began. Taken by the"
         f" hypervisor meanwhile: {steal or 'not measured'}."
     )
-    return Side.of(
+    return [
         Plate(
             Path(found.pictures["measured"]),
             f"A run of {code(figure.label)} by real processes, from its middle.",
         ),
         Columns(("", "all", "late", "skipped"), rows, caption),
-        _patterns(found),
-    )
-
-
-def _patterns(found: FigureRun) -> Columns:
-    rows = [
-        (lane, code(pattern), str(count))
-        for lane, both in found.patterns.items()
-        for pattern, count in chain(*both)
+        Columns(
+            ("processor of", "pattern", "times"),
+            patterns,
+            "The most frequent patterns, over the cycles of a plan.",
+        ),
     ]
-    return Columns(
-        ("processor of", "pattern", "times"),
-        rows,
-        "The most frequent patterns, over the cycles of a plan.",
-    )
 
 
 def fails(found: FigureRun) -> bool:
@@ -121,66 +107,51 @@ def fails(found: FigureRun) -> bool:
 def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
     """Judge a figure of which the paper says that it works, or that it fails."""
     found = findings.of(figure.experiment())
-    counts = [found.tasks[task] for task in (LEVEL, PLANNER)]
-    said = (
-        f"{counts[0].late} of {counts[0].jobs} cycles and {counts[1].late} of {counts[1].jobs}"
-        " plans late"
-    )
+    cycles = found.tasks[LEVEL]
+    plans = found.tasks[PLANNER]
+    said = f"{cycles.late} of {cycles.jobs} cycles and {plans.late} of {plans.jobs} plans late"
+    verb = "works" if works else "fails"
     measured = ran(figure, found)
     if fails(found) == works and DISTURBED < found.late(LEVEL) < MOSTLY:
         why = f"Other programs had the processors too often: {said}. On a quiet machine: {AGAIN}."
         return Assessment(measured, Ruling.UNTESTABLE, why)
     if fails(found) == works:
         return Assessment(
-            measured, Ruling.FAILS, f"The paper says that it {_verb(works)}; the run had {said}."
+            measured, Ruling.FAILS, f"The paper says that it {verb}; the run had {said}."
         )
-    stray = [count for count in counts if count.late and count.late <= MOSTLY * count.jobs]
-    if stray:
-        why = (
-            f"It {_verb(works)}, as the paper says: {said}. The stray ones are this machine's: see"
-            " the time taken away."
-        )
+    why = f"It {verb}, as the paper says: {said}."
+    if any(0 < count.late <= MOSTLY * count.jobs for count in (cycles, plans)):
+        why += " The stray ones are this machine's: see the time taken away."
         return Assessment(measured, Ruling.BOUNDED, why)
-    return Assessment(measured, Ruling.HOLDS, f"It {_verb(works)}, as the paper says: {said}.")
-
-
-def _verb(works: bool) -> str:
-    return "works" if works else "fails"
+    return Assessment(measured, Ruling.HOLDS, why)
 
 
 def _predicted(figure: FigureRack, workshop: Workshop) -> Side:
     plate, letters = drawn(figure, workshop)
-    (found,) = sweep(figure.config, [budget_of(figure.loaded()).process_ms])
-    failing = ", ".join(found.failing)
-    judged = (
-        f"These fail: {failing}."
-        if failing
-        else "Every equation holds, and every cycle and plan is in time."
-    )
+    found = planning(figure.config, budget_of(figure.loaded()).process_ms)
     about = (
-        f"With X = {found.process_ms:g} ms a cycle leaves {found.idle_ms:g} ms after the executor."
-        f" {judged}"
+        f"With X = {found.process_ms:g} ms a cycle leaves {found.idle_ms:g} ms after the executor. "
     )
-    return Side.of(plate, letters, about)
-
-
-def budget_of(config: RackConfig) -> BudgetConfig:
-    """Return the budget of a figure's only level."""
-    budget = config.board[LEVEL].budget
-    assert budget is not None, "every figure has a budget"
-    return budget
+    if found.failing:
+        about += f"These fail: {', '.join(found.failing)}."
+    else:
+        about += "Every equation holds, and every cycle and plan is in time."
+    return [plate, letters, about]
 
 
 def _planning_table(rows: list[Planning]) -> Columns:
-    head = [
+    head = (
         "X",
         "P a cycle, U in each",
         "plan after",
         "P and U a cycle, U once",
         "plan after",
         "permitted",
-    ]
-    head += ["eqs that fail", "schedule", "in time"]
+        "eqs that fail",
+        "schedule",
+        "in time",
+    )
+    in_time = {True: "yes", False: "NO"}
     cells = [
         (
             f"{one.process_ms:g}",
@@ -191,7 +162,7 @@ def _planning_table(rows: list[Planning]) -> Columns:
             _in_cycles(one.permitted),
             ", ".join(one.failing) or "none",
             code(one.pattern),
-            "yes" if one.in_time else "NO",
+            in_time[one.in_time],
         )
         for one in rows
     ]
@@ -245,17 +216,16 @@ def _sweep_side(workshop: Workshop) -> Side:
         " two cycles would do; equation 3.8 demands less than that. Too slow: X ="
         f" {_values(slow) or 'none'}."
     )
-    third = all(
-        count is not None and count <= WORST_CYCLES
-        for count in (worst.cycles_each, worst.cycles_once)
-    )
+    counts = (worst.cycles_each, worst.cycles_once)
+    is_third = all(count is not None and count <= WORST_CYCLES for count in counts)
+    demand = "met" if is_third else "not met"
     follows = (
         f"So the figure is what its text says as long as X is at most {most_each:g} ms, or at most"
         f" {most_once:g} on average over the cycles of a plan, whereas the paper permits"
         f" {MOST_X:g}. Its weaker demand, a plan at worst in every third cycle, is"
-        f" {'met' if third else 'not met'} with X = {worst.process_ms:g} in both readings."
+        f" {demand} with X = {worst.process_ms:g} in both readings."
     )
-    return Side.of(_planning_table(rows), literal, kind, follows)
+    return [_planning_table(rows), literal, kind, follows]
 
 
 def _values(rows: list[Planning]) -> str:
@@ -266,7 +236,7 @@ def _sweep_tested(findings: Findings) -> Assessment:
     rows = sweep(FIG2.config, PAPER_X)
     odd = contradicting(rows)
     short, long = (findings.of(figure.experiment()) for figure in (SHORT_2, LONG_2))
-    measured = Side.of(*ran(SHORT_2, short).items, *ran(LONG_2, long).items)
+    measured = [*ran(SHORT_2, short), *ran(LONG_2, long)]
     said = ", ".join(
         f"X = {x:g}: {100 * found.late(PLANNER):.0f} % of the plans late"
         for x, found in ((LEAST_X, short), (MOST_X, long))
@@ -296,16 +266,16 @@ def _fig3_side(workshop: Workshop) -> Side:
         f"The failure depends on X. With X = {_values(works) or 'none'} three cycles are enough for"
         f" P and U; with X = {_values([one for one in rows if one not in works])} they are not."
     )
-    return Side.of(*_predicted(FIG3, workshop).items, _planning_table(rows), text)
+    return [*_predicted(FIG3, workshop), _planning_table(rows), text]
 
 
 def _fig3_tested(findings: Findings) -> Assessment:
     own = _judged(FIG3, False, findings)
     short = findings.of(SHORT_3.experiment())
     works = [one for one in sweep(FIG3.config, PAPER_X) if not _is_slow(one)]
-    measured = Side.of(*own.measured.items, *ran(SHORT_3, short).items)
+    measured = [*own.measured, *ran(SHORT_3, short)]
     if own.ruling is Ruling.FAILS or not works:
-        return Assessment(measured, own.ruling, own.why)
+        return replace(own, measured=measured)
     in_time = 100 * (1 - short.late(PLANNER))
     why = (
         f"{own.why} With X = {LEAST_X:g}, which the paper permits too, {in_time:.0f} % of the plans"
@@ -326,7 +296,7 @@ def _fig4_side(workshop: Workshop) -> Side:
             f" With X = {_values(full)} the executor fills its cycle: every cycle is still in time,"
             " but equation 3.6, 0 &lt; t<sub>residual</sub>, fails."
         )
-    return Side.of(*_predicted(FIG4, workshop).items, text, _planning_table(rows))
+    return [*_predicted(FIG4, workshop), text, _planning_table(rows)]
 
 
 def _statement(name: str, title: str, quote: str, figure: FigureRack, works: bool) -> Statement:

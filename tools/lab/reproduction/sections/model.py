@@ -4,26 +4,27 @@ waits, pipeline."""
 from __future__ import annotations
 
 import inspect
-from collections import Counter
 from itertools import pairwise
 from textwrap import dedent
 
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.faults.kind import KINDS
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
+from rack.tools.faults.judge import Judgement
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER
+from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, budget_of
 from rack.tools.lab.reproduction.experiments.losses import KILLS, SENSORS, LossesRun
 from rack.tools.lab.reproduction.experiments.measured import LEVELS, PIPELINE, RATE_HZ
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, PHASES, MailboxTraffic
+from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
 from rack.tools.lab.reproduction.sections.equations import stolen
 from rack.tools.lab.reproduction.sections.flow import between, flow_svg
-from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, MOSTLY, budget_of
+from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, MOSTLY
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     Columns,
     Listing,
     Plate,
+    Row,
     Ruling,
     Side,
     code,
@@ -50,13 +51,6 @@ cobegin
     lock; write_plan; unlock;      "update executor plan"
   until forever;
 coend"""
-LETTERS = dict(
-    zip(
-        PHASES,
-        ("read plan (C)", "read command and status (R)", "process (X)", "write (W)"),
-        strict=True,
-    )
-)
 
 
 def _flow(workshop: Workshop) -> Side:
@@ -68,7 +62,7 @@ def _flow(workshop: Workshop) -> Side:
     caption = (
         f"Drawn from the config of {code(NAME)}: levels, mailboxes and their messages, planners."
     )
-    return Side.of(Plate(path.relative_to(workshop.folder), caption))
+    return [Plate(path.relative_to(workshop.folder), caption)]
 
 
 def _flow_tested(findings: Findings) -> Assessment:
@@ -76,47 +70,36 @@ def _flow_tested(findings: Findings) -> Assessment:
     demand."""
     found = findings.of(NASREM)
     config = load(NAME)
-    levels = rack_timing(config, wire(config)).hierarchy.chains[0]
+    layout = wire(config)
     boxes = {box.mailbox: box for box in found.mailboxes}
     rows = []
-    short = []
-    for upper, lower in pairwise(levels):
-        flow = between(wire(config), upper, lower)
-        for way, found_boxes in (("down", flow.down), ("up", flow.up)):
-            for box in (boxes[one.name] for one in found_boxes if one.name in boxes):
-                rows.append(_flow_row(way, upper, lower, box))
-                short += [box] if box.messages < box.due - 1 else []
-    ways = Counter(row[0] for row in rows)
-    table = Columns(("way", "mailbox", "from", "to", "every, ms", "messages due", "messages"), rows)
-    side = Side.of(
+    lacking = 0
+    for upper, lower in pairwise(rack_timing(config, layout).hierarchy.chains[0]):
+        for way, writer, reader in (("down", upper, lower), ("up", lower, upper)):
+            names = [box.name for box in between(layout, writer, reader)]
+            for box in (boxes[name] for name in names if name in boxes):
+                every = f"{box.every_ms:g}"
+                rows.append((way, code(box.mailbox), writer, reader, every, box.due, box.messages))
+                # A run may end before the last one is written.
+                if box.messages < box.due - 1:
+                    lacking += box.due - box.messages
+    head = ("way", "mailbox", "from", "to", "every, ms", "messages due", "messages")
+    side: Side = [
         "In a run of the whole task in real time; a message that its writer skipped is missing.",
-        table,
-    )
-    if not ways["down"] or not ways["up"]:
+        Columns(head, rows),
+    ]
+    if {way for way, *_ in rows} != {"down", "up"}:
         return Assessment(side, Ruling.FAILS, "A way between two levels had no message.")
-    if not short:
+    if not lacking:
         return Assessment(
             side, Ruling.HOLDS, "Commands went down and statuses up in every cycle of every level."
         )
-    lacking = sum(box.due - box.messages for box in short)
     why = (
         f"Commands went down and statuses up; {lacking} of"
         f" {sum(box.due for box in boxes.values())} messages were not written, because their"
         f" cycles were skipped. {stolen(found)}"
     )
     return Assessment(side, Ruling.BOUNDED, why)
-
-
-def _flow_row(way: str, upper: str, lower: str, box: MailboxTraffic) -> tuple[str, ...]:
-    ends = (upper, lower) if way == "down" else (lower, upper)
-    return (
-        way,
-        code(box.mailbox),
-        *ends,
-        f"{box.every_ms:g}",
-        str(box.due),
-        str(box.messages),
-    )
 
 
 def _loop(workshop: Workshop) -> Side:
@@ -126,7 +109,7 @@ def _loop(workshop: Workshop) -> Side:
         for method in (VirtualControlLoop.run, VirtualControlLoop.cycle)
     )
     planner = dedent(inspect.getsource(PlannerLoop.cycle)).rstrip()
-    return Side.of(
+    return [
         Listing(PAPERS_LOOP, "The paper's algorithm."),
         Listing(own, f"The executor section here, {code('VirtualControlLoop')} in {place}."),
         Listing(planner, f"The planner here, {code('PlannerLoop')} in the same file."),
@@ -134,41 +117,41 @@ def _loop(workshop: Workshop) -> Side:
         " mailboxes, since only one of their protocols needs them. The plan is read first, as C of"
         " figure 4; the order of the reads makes no difference, as all of them come before"
         " <i>process</i>. Unlike the paper's planner, this one may find that no plan is wanted.",
-    )
+    ]
 
 
 def _loop_tested(findings: Findings) -> Assessment:
     found = findings.of(NASREM)
-    head = [
+    head = (
         "level",
-        *(f"{words}: median" for words in LETTERS.values()),
+        "read plan (C): median",
+        "read command and status (R): median",
+        "process (X): median",
+        "write (W): median",
         "longest of all parts",
         "cycles",
         "missed",
         "skipped",
-    ]
-    rows = []
-    for level, parts in found.phases.items():
-        task = found.tasks[level]
-        longest = max(part["max"] for part in parts.values())
-        medians = [f"{parts[name]['p50']:.1f}" for name in LETTERS]
+    )
+    rows: list[Row] = []
+    for level, task in found.executors.items():
+        parts = (task.phases.exchange, task.phases.read, task.phases.process, task.phases.write)
         rows.append(
             (
                 level,
-                *medians,
-                f"{longest:.0f}",
-                str(task.cycles),
-                str(task.missed),
-                str(task.skipped),
+                *(f"{part.p50:.1f}" for part in parts),
+                f"{max(part.max for part in parts):.0f}",
+                task.cycles,
+                task.missed,
+                task.skipped,
             )
         )
-    side = Side.of(
+    side: Side = [
         "Phases of the loop in every executor, us of processor time, and its cycles.",
         Columns(head, rows),
-    )
-    executors = [found.tasks[level] for level in found.phases]
-    bad = sum(task.missed + task.skipped for task in executors)
-    due = sum(task.cycles for task in executors)
+    ]
+    bad = sum(task.missed + task.skipped for task in found.executors.values())
+    due = sum(task.cycles for task in found.executors.values())
     if not bad:
         return Assessment(
             side, Ruling.HOLDS, f"All {due} cycles of all levels ended within their bound."
@@ -185,15 +168,15 @@ def _loop_tested(findings: Findings) -> Assessment:
 def _both(workshop: Workshop) -> Side:
     config = FIG2.loaded()
     apart = FIG4.loaded()
-    plan = (budget_of(config).plan_ms, config.every(LEVEL) * config.clock_ns * 1e-6)
-    return Side.of(
-        f"In {code(FIG2.config)} a plan takes {plan[0]:g} ms of computing; the executor's cycle is"
-        f" {plan[1]:g} ms, and it needs part of that. The planner is therefore still computing when"
-        " the next cycle begins: the executor preempts it (tightly coupled). In"
-        f" {code(FIG4.config)} both compute at the same time, on processors"
+    cycle_ms = config.every(LEVEL) * config.clock_ns * 1e-6
+    return [
+        f"In {code(FIG2.config)} a plan takes {budget_of(config).plan_ms:g} ms of computing; the"
+        f" executor's cycle is {cycle_ms:g} ms, and it needs part of that. The planner is therefore"
+        " still computing when the next cycle begins: the executor preempts it (tightly coupled)."
+        f" In {code(FIG4.config)} both compute at the same time, on processors"
         f" {apart.board[LEVEL].planner_core} and {apart.board[LEVEL].core} (loosely coupled). In"
         " neither may the executor wait for the planner."
-    )
+    ]
 
 
 def _both_tested(findings: Findings) -> Assessment:
@@ -203,19 +186,13 @@ def _both_tested(findings: Findings) -> Assessment:
     for figure, coupling in ((FIG2, "tightly"), (FIG4, "loosely")):
         tasks = findings.of(figure.experiment()).tasks
         executor = tasks[LEVEL]
-        planner = tasks[PLANNER]
         rows.append(
-            (
-                code(figure.label),
-                coupling,
-                *(str(n) for n in (planner.jobs, executor.jobs, executor.late)),
-            )
+            (code(figure.label), coupling, tasks[PLANNER].jobs, executor.jobs, executor.late)
         )
-        late = late + executor.late
-        due = due + executor.jobs
-    side = Side.of(
-        Columns(("rack", "coupled", "plans", "executor's cycles", "of these late"), rows)
-    )
+        late += executor.late
+        due += executor.jobs
+    head = ("rack", "coupled", "plans", "executor's cycles", "of these late")
+    side: Side = [Columns(head, rows)]
     if not late:
         return Assessment(
             side,
@@ -235,29 +212,23 @@ def _bounds(workshop: Workshop) -> Side:
         fault.kind for one in (KILLS, SENSORS) for fault in load(NAME, (), one.name).fault
     )
     rows = [(code(name), text(KINDS[name].means)) for name in kinds]
-    return Side.of(
+    return [
         "Every wait has a bound: a level reads what is there, with its age, and never waits for a"
         " neighbour. A script of faults kills every board, the clock's too; another one makes the"
         " sensors fail. Each kind has a bound, in cycles of the board concerned, within which it"
         " must be detected.",
         Columns(("fault", "what it does"), rows),
-    )
+    ]
 
 
 def _bounds_tested(findings: Findings) -> Assessment:
-    items = []
-    count = 0
-    late = 0
-    unexplained = 0
-    undone = []
-    for experiment in (KILLS, SENSORS):
-        found = findings.of(experiment)
-        items.append(_losses(found, experiment.name))
-        count += len(found.faults)
-        late += sum(not (one.is_within and one.is_recovered) for one in found.faults)
-        unexplained += found.unexplained
-        undone += [] if found.worked else [experiment.name]
-    side = Side.of(*items)
+    runs = {one.name: findings.of(one) for one in (KILLS, SENSORS)}
+    side: Side = [_losses(run, script) for script, run in runs.items()]
+    faults = [fault for run in runs.values() for fault in run.faults]
+    count = len(faults)
+    late = sum(not (fault.is_within and fault.is_recovered) for fault in faults)
+    unexplained = sum(run.unexplained for run in runs.values())
+    undone = [script for script, run in runs.items() if not run.worked]
     if late or undone:
         why = (
             f"{late} of {count} faults were not detected, or not recovered from, within their"
@@ -285,56 +256,53 @@ def _losses(found: LossesRun, script: str) -> Columns:
         "reaction",
         "recovered after, ms",
     )
-    rows = [
-        (
-            str(one.struck),
-            one.kind,
-            text(" ".join(filter(None, (one.board, one.joint)))),
-            text(one.found_by),
-            text(one.found_as),
-            str(one.delay),
-            "-" if one.bound is None else str(one.bound),
-            text(", ".join(one.reactions)) or "none needed",
-            "-" if one.recovery_ms is None else f"{one.recovery_ms:g}",
-        )
-        for one in found.faults
-    ]
     ended = f"{found.cause} after {found.ticks} ticks of {found.clock_ms:g} ms"
     return Columns(
         head,
-        rows,
+        [_loss_row(fault, found.clock_ms) for fault in found.faults],
         f"{code(f'rack run {NAME} --lockstep --faults {script}')}: {text(ended)}.",
     )
 
 
+def _loss_row(fault: Judgement, clock_ms: float) -> Row:
+    recovery = None if fault.recovery is None else f"{fault.recovery * clock_ms:g}"
+    return (
+        fault.struck,
+        fault.kind,
+        text(f"{fault.board} {fault.joint}".strip()),
+        text(fault.found_by),
+        text(fault.found_as),
+        fault.delay,
+        fault.bound,
+        text(", ".join(fault.reactions)) or "none needed",
+        recovery,
+    )
+
+
 def _pipeline(workshop: Workshop) -> Side:
-    return Side.of(
+    return [
         f"{LEVELS} boards at {RATE_HZ} Hz, one below the other, each passing on in every cycle what"
         " it has read. A message becomes visible at the end of the cycle in which it was written,"
         f" so that {LEVELS} levels take exactly {LEVELS} cycles, however fast the boards are."
-    )
+    ]
 
 
 def _pipeline_tested(findings: Findings) -> Assessment:
     found = findings.of(PIPELINE)
     rows = [
-        (mode, str(took), str(found.predicted), str(count))
-        for mode, cycles in found.cycles.items()
+        (mode, took, found.predicted, count)
+        for mode, cycles in (("lockstep", found.lockstep), ("realtime", found.realtime))
         for took, count in cycles.items()
     ]
-    side = Side.of(Columns(("run", "cycles taken", "predicted", "messages"), rows))
-    others = {
-        mode: sum(n for took, n in c.items() if took != found.predicted)
-        for mode, c in found.cycles.items()
-    }
-    if not any(others.values()):
+    side: Side = [Columns(("run", "cycles taken", "predicted", "messages"), rows)]
+    is_exact = set(found.lockstep) <= {found.predicted}
+    late = sum(count for took, count in found.realtime.items() if took != found.predicted)
+    if is_exact and not late:
         return Assessment(side, Ruling.HOLDS, f"Every message took {found.predicted} cycles.")
-    if not others["lockstep"] and all(
-        took >= found.predicted for c in found.cycles.values() for took in c
-    ):
+    if is_exact and min(found.realtime) >= found.predicted:
         why = (
             f"In lockstep every message took {found.predicted} cycles; in real time"
-            f" {others['realtime']} took longer, after missed cycles."
+            f" {late} took longer, after missed cycles."
         )
         return Assessment(side, Ruling.BOUNDED, why)
     return Assessment(

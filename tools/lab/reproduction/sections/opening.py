@@ -12,7 +12,15 @@ from rack.tools.lab.reproduction.experiments.determinism import (
 )
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Ruling, Side, code, text
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Columns,
+    Row,
+    Ruling,
+    Side,
+    code,
+    text,
+)
 from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
 REAL = "realtime"
@@ -22,7 +30,7 @@ LOCKSTEP = "lockstep"
 def _determined(workshop: Workshop) -> Side:
     layout = wire(load(NAME))
     by_ticks = sum(box.is_by_ticks for box in layout.mailboxes)
-    return Side.of(
+    return [
         f"{by_ticks} of the {len(layout.mailboxes)} mailboxes of {code(NAME)} show a message at a"
         " tick that is fixed in advance: at the end of the cycle in which it was written, however"
         " early that was. What a level reads then depends on ticks alone. We predict equal"
@@ -30,7 +38,7 @@ def _determined(workshop: Workshop) -> Side:
         " as long as no deadline is missed; and no difference before the first miss. Each run"
         f" simulates {SECONDS:g} s; there are at most {ATTEMPTS} in real time, until one is without"
         " a miss."
-    )
+    ]
 
 
 def _determined_tested(findings: Findings) -> Assessment:
@@ -46,26 +54,24 @@ def _determined_tested(findings: Findings) -> Assessment:
         "first in",
         "digest",
     )
-    side = Side.of(Columns(head, [_run_row(run) for run in runs]))
-    reference = next(run.digest for run in runs if run.mode == LOCKSTEP)
-    if any(run.digest != reference for run in runs if run.mode == LOCKSTEP):
-        return Assessment(side, Ruling.FAILS, "Two runs in lockstep differ.")
+    side: Side = [Columns(head, [_run_row(run) for run in runs])]
+    lockstep = [run for run in runs if run.mode == LOCKSTEP]
     real = [run for run in runs if run.mode == REAL]
-    if any(not _is_explained(run) for run in real):
+    reference = lockstep[0].digest
+    if any(run.digest != reference for run in lockstep):
+        return Assessment(side, Ruling.FAILS, "Two runs in lockstep differ.")
+    if not all(_is_explained(run) for run in real):
         return Assessment(
             side, Ruling.FAILS, "A run in real time diverged before it had missed a deadline."
         )
     if any(run.first_miss is None and run.digest == reference for run in real):
         why = (
             "Lockstep twice and a run in real time without a miss wrote the same messages, bit"
-            " for bit"
+            " for bit."
         )
-        missed = (
-            " Runs that missed deadlines diverged no earlier than at the first miss."
-            if len(real) > 1
-            else ""
-        )
-        return Assessment(side, Ruling.HOLDS, f"{why}.{missed}")
+        if len(real) > 1:
+            why += " Runs that missed deadlines diverged no earlier than at the first miss."
+        return Assessment(side, Ruling.HOLDS, why)
     why = (
         "Lockstep twice wrote the same messages. This machine kept no run in real time free of"
         " misses; none diverged before its first miss, and every miss is on record."
@@ -80,17 +86,19 @@ def _is_explained(run: ComparedRun) -> bool:
     return run.first_miss is not None and run.first_miss <= run.difference.tick
 
 
-def _run_row(run: ComparedRun) -> tuple[str, ...]:
+def _run_row(run: ComparedRun) -> Row:
     difference = run.difference
+    differs_at = None if difference is None else difference.tick
+    differs_in = None if difference is None else code(difference.mailbox)
     return (
         text(run.run),
         run.mode,
         f"{run.wall_s:.2f}",
-        str(run.messages),
-        str(run.missed),
-        "-" if run.first_miss is None else str(run.first_miss),
-        "-" if difference is None else str(difference.tick),
-        "-" if difference is None else code(difference.mailbox),
+        run.messages,
+        run.missed,
+        run.first_miss,
+        differs_at,
+        differs_in,
         code(run.digest[:12]),
     )
 
@@ -111,13 +119,8 @@ def _costs(workshop: Workshop) -> Side:
         )
     head = ("level", "t<sub>exec</sub>", "t<sub>comm</sub>", "communication, % of both")
     loads = ", ".join(f"core {core}: {100 * load_:.0f} %" for core, load_ in rack.loads.items())
-    return Side.of(
-        Columns(
-            head,
-            rows,
-            f"Worst case, by the budgets. Loads of the processors, planners included: {loads}.",
-        )
-    )
+    caption = f"Worst case, by the budgets. Loads of the processors, planners included: {loads}."
+    return [Columns(head, rows, caption)]
 
 
 def _costs_tested(findings: Findings) -> Assessment:
@@ -126,21 +129,21 @@ def _costs_tested(findings: Findings) -> Assessment:
     found = findings.of(NASREM)
     rows = []
     communicates = 0.0
-    for level, parts in found.phases.items():
-        comm_us = sum(parts[name]["p50"] for name in ("exchange", "read", "write"))
-        rate_hz = 1e3 / found.tasks[level].slice_ms
+    for level, task in found.executors.items():
+        parts = task.phases
+        exec_us = parts.process.p50
+        comm_us = parts.exchange.p50 + parts.read.p50 + parts.write.p50
+        rate_hz = 1e3 / task.slice_ms
         communicates += comm_us * rate_hz * 1e-6
-        both = comm_us + parts["process"]["p50"]
         rows.append(
             (
                 level,
-                f"{parts['process']['p50']:.0f}",
+                f"{exec_us:.0f}",
                 f"{comm_us:.0f}",
-                f"{100 * comm_us / both:.0f}",
+                f"{100 * comm_us / (comm_us + exec_us):.0f}",
                 f"{comm_us * rate_hz * 1e-3:.1f}",
             )
         )
-    saved = min(found.loads.values()) if len(found.loads) > 1 else 0.0
     head = (
         "level",
         "t<sub>exec</sub>, us",
@@ -149,18 +152,19 @@ def _costs_tested(findings: Findings) -> Assessment:
         "communication, ms a second",
     )
     loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found.loads.items())
-    side = Side.of(
-        Columns(head, rows, f"Medians of a run. Processor time of all tasks, ms a second: {loads}.")
-    )
-    if not saved:
+    caption = f"Medians of a run. Processor time of all tasks, ms a second: {loads}."
+    side: Side = [Columns(head, rows, caption)]
+    if len(found.loads) < 2:
         return Assessment(
             side, Ruling.UNTESTABLE, "All boards ran on one processor: there is nothing to save."
         )
+    saved = min(found.loads.values())
     words = (
         f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second"
         f" processor takes {1e3 * saved:.0f} ms a second off the first."
     )
-    return Assessment(side, Ruling.HOLDS if communicates < saved else Ruling.BOUNDED, words)
+    ruling = Ruling.HOLDS if communicates < saved else Ruling.BOUNDED
+    return Assessment(side, ruling, words)
 
 
 ABSTRACT = Chapter(

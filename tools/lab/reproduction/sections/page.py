@@ -31,20 +31,22 @@ class Ruling(StrEnum):
         return self in (Ruling.FAILS, Ruling.UNMADE)
 
 
-@dataclass(frozen=True)
-class Prose:
-    """A paragraph."""
-
-    text: str
+Row = Sequence[str | int | None]
+"""Cells of a table: texts and counts; None shows as "-"."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """A table; cells are texts. The cells of numbers are aligned to the right."""
+    """A table. Columns of numbers are aligned to the right."""
 
     head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Row]
     caption: str = ""
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """The rows as texts of the page."""
+        return [["-" if cell is None else str(cell) for cell in row] for row in self.rows]
 
 
 @dataclass(frozen=True)
@@ -63,23 +65,10 @@ class Listing:
     caption: str = ""
 
 
-Item = Prose | Columns | Plate | Listing
-
-
-@dataclass(frozen=True)
-class Side:
-    """What is said of a claim from one side: predicted, or measured."""
-
-    items: tuple[Item, ...] = ()
-
-    @classmethod
-    def of(cls, *items: Item | str | None) -> Side:
-        """Return the side of these items; a bare text is a paragraph, None is nothing."""
-        return cls(
-            tuple(
-                Prose(item) if isinstance(item, str) else item for item in items if item is not None
-            )
-        )
+Item = str | Columns | Plate | Listing
+"""What stands below each other on the page; a text is a paragraph."""
+Side = list[Item]
+"""What is said of a claim from one side: predicted, or measured."""
 
 
 @dataclass(frozen=True)
@@ -178,13 +167,13 @@ def plain(value: str) -> str:
 
 
 def _plain_items(side: Side) -> Iterator[Any]:
-    for item in side.items:
+    for item in side:
         match item:
-            case Prose(words):
-                yield plain(words)
-            case Columns(head, rows):
+            case str():
+                yield plain(item)
+            case Columns(head):
                 names = [plain(name) for name in head]
-                yield [dict(zip(names, map(plain, row), strict=True)) for row in rows]
+                yield [dict(zip(names, map(plain, row), strict=True)) for row in item.cells]
             case Plate(path):
                 yield {"picture": str(path)}
             case Listing(lines):

@@ -53,30 +53,28 @@ class Statement:
 
     def claim(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageClaim:
         """Return the claim with its ruling; a text among the `results` says why there is none."""
-        needed = {one.name: results.get(one.name, "") for one in self.experiments}
         return PageClaim(
             name=self.name,
             title=self.title,
             quote=self.quote,
             predicted=self.predicted(workshop),
-            tested=self._tested(needed, workshop),
+            tested=self._tested(workshop, results),
             equation=self.equation,
         )
 
-    def _tested(self, needed: Mapping[str, Kept | str], workshop: Workshop) -> Assessment:
+    def _tested(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> Assessment:
         found: dict[str, Document] = {}
-        for name, result in needed.items():
+        for experiment in self.experiments:
+            name = experiment.name
+            result = results.get(name, "")
             if isinstance(result, str):
-                reason = (
-                    f": {text(result)}"
-                    if result
-                    else "; <code>rack reproduce</code> with the same folder goes on"
-                )
-                return Assessment(
-                    Side(), Ruling.UNMADE, f"The experiment {text(name)} has not been made{reason}."
-                )
+                reason = "; <code>rack reproduce</code> with the same folder goes on"
+                if result:
+                    reason = f": {text(result)}"
+                words = f"The experiment {text(name)} has not been made{reason}."
+                return Assessment([], Ruling.UNMADE, words)
             if result.lacking:
-                return Assessment(Side(), Ruling.UNTESTABLE, f"{text(result.lacking)}.")
+                return Assessment([], Ruling.UNTESTABLE, f"{text(result.lacking)}.")
             found[name] = result.found
         return self.tested(Findings(found, workshop))
 
@@ -89,15 +87,6 @@ class Chapter:
     title: str
     intro: str
     statements: tuple[Statement, ...]
-
-    @property
-    def experiments(self) -> tuple[Experiment[Any], ...]:
-        """All experiments that it needs, each once."""
-        return tuple(
-            {
-                one.name: one for statement in self.statements for one in statement.experiments
-            }.values()
-        )
 
     def section(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageSection:
         """Return the section with every claim judged."""

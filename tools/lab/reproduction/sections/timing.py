@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from rack.tools.lab.reproduction.experiments.figures import FigureRack
+from rack.tools.lab.reproduction.experiments.figures import settings_of
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM
 from rack.tools.lab.reproduction.sections.equations import (
     Biting,
@@ -73,7 +74,7 @@ EXECUTES = PaperEquation(
     " demand on the fast levels, for which equation 3.1 is the sharper one.",
     Biting(
         "fig4-overload",
-        tuple(FigureRack("fig4-overload", 1, 6.0).settings),
+        settings_of("fig4-overload", 6.0),
         "its executor takes 6 ms of 6 ms",
     ),
 )
@@ -101,7 +102,7 @@ RESIDUAL = PaperEquation(
     " left. We read &alpha; as what a planner can count on.",
     Biting(
         "fig4",
-        tuple(FigureRack("fig4", 1, 3.0).settings),
+        settings_of("fig4", 3.0),
         "figure 4 with the longest X that the paper permits",
     ),
 )
@@ -139,7 +140,7 @@ WITH_PLANNER = PaperEquation(
     "t<sup>i</sup><sub>il-comm</sub> + t<sup>i</sup><sub>e,p-comm</sub>",
     "The margin is t<sub>plan+residual</sub>: what a cycle has left for planning, in a cycle with"
     " an update.",
-    Biting("fig3", tuple(FigureRack("fig3", 1, 3.0).settings), "figure 3 with X = 3 ms"),
+    Biting("fig3", settings_of("fig3", 3.0), "figure 3 with X = 3 ms"),
 )
 SMALL = PaperEquation(
     "3.10",
@@ -169,8 +170,8 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
             name,
             f"{sum_ms:g}",
             f"{way.bound_ms:g}",
-            f"{way.measured_ms['p50']:g}",
-            f"{way.measured_ms['max']:g}",
+            f"{way.measured_ms.p50:g}",
+            f"{way.measured_ms.max:g}",
             f"{response.bound_eq_3_2_ms:g}",
         )
         for name, way in (("command, down", response.command), ("status, up", response.status))
@@ -183,11 +184,12 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         "longest",
         "n R<sub>max</sub>",
     )
-    side = Side.of(
-        f"Along {' → '.join(response.levels)}, ms:", Columns(head, rows), table_of(verdicts)
-    )
-    longest = max(way.measured_ms["max"] for way in (response.command, response.status))
-    if not all(pair.measured.holds for pair in verdicts):
+    side: Side = [
+        f"Along {' → '.join(response.levels)}, ms:",
+        Columns(head, rows),
+        table_of(verdicts),
+    ]
+    if not all(verdict.measured.holds for verdict in verdicts):
         late = len(response.command.beyond) + len(response.status.beyond)
         if late and found.missed + found.skipped:
             why = (
@@ -200,6 +202,7 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
             Ruling.FAILS,
             f"{late} responses exceeded the sum with its waits, without a missed cycle.",
         )
+    longest = max(response.command.measured_ms.max, response.status.measured_ms.max)
     if longest <= sum_ms:
         return Assessment(side, Ruling.HOLDS, "No response was longer than the sum.")
     why = (
@@ -218,12 +221,11 @@ def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         (
             name,
             f"{task.slice_ms:g}",
-            f"{task.used_ms['p50']:.3f}",
-            f"{task.used_ms['max']:.3f}",
+            f"{task.used_ms.p50:.3f}",
+            f"{task.used_ms.max:.3f}",
             f"{task.deviation_ms:.3f}",
         )
-        for name, task in found.tasks.items()
-        if task.role == "executor"
+        for name, task in found.executors.items()
     ]
     head = (
         "level",
@@ -236,7 +238,7 @@ def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         Path(found.pictures["residuals"]),
         "What the cycles of each level used of R<sub>i</sub>, and &alpha;.",
     )
-    return Assessment(Side.of(*own.measured.items, Columns(head, rows), plate), own.ruling, own.why)
+    return replace(own, measured=[*own.measured, Columns(head, rows), plate])
 
 
 RESPONSE = Chapter(
