@@ -93,18 +93,18 @@ class RackViews:
         """Return all views."""
         doing = lanes_view("levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)])
         below = rrb.Horizontal(doing, self._graph(), column_shares=[3, 2])
-        cell = self._cell
-        left = (
-            below
-            if cell is None
-            else rrb.Vertical(self._scene(cell, "cell"), below, row_shares=[11, 9])
-        )
+        left: rrb.Container = below
+        if self._cell is not None:
+            left = rrb.Vertical(self._scene(self._cell, "cell"), below, row_shares=[11, 9])
+        curves: rrb.Container | rrb.View
+        if self._hand is not None:
+            curves = self._fingers(self._hand)
+        elif self._joints:
+            curves = self._arm()
+        else:
+            curves = self._signals()
         right = rrb.Vertical(
-            self._fingers(self._hand)
-            if self._hand is not None
-            else self._arm()
-            if self._joints
-            else self._signals(),
+            curves,
             lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
             rrb.Horizontal(self._load(), self._ages(), self._log(), column_shares=[3, 3, 4]),
             row_shares=[4, 5, 3],
@@ -114,18 +114,18 @@ class RackViews:
     def column(self, name: str) -> rrb.Container | rrb.View:
         """Return the cell, if there is one, above what the levels do."""
         levels = lanes_view(f"{name}: levels", [self.all(LEVELS)])
-        return (
-            levels
-            if self._cell is None
-            else rrb.Vertical(self._scene(self._cell, name), levels, row_shares=[5, 4])
-        )
+        if self._cell is None:
+            return levels
+        return rrb.Vertical(self._scene(self._cell, name), levels, row_shares=[5, 4])
 
     def _scene(self, cell: Cell, name: str) -> rrb.View:
         """Return the view of the cell."""
-        shown = [self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)]
-        eye = eye_on(cell)
         return rrb.Spatial3DView(
-            origin=self.path(CELL), contents=shown, name=name, eye_controls=eye, line_grid=False
+            origin=self.path(CELL),
+            contents=[self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)],
+            name=name,
+            eye_controls=eye_on(cell),
+            line_grid=False,
         )
 
     def _arm(self) -> rrb.Container:
@@ -151,18 +151,16 @@ class RackViews:
 
     def _forces(self) -> list[rrb.View]:
         """Return the views of forces, of an arm or hand that senses them."""
-        cell = self._cell
-        if cell is None or cell.wrist is None:
+        if self._cell is None or self._cell.wrist is None:
             return []
-        task = [
-            [self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit]
-            for unit in ("N", "N m")
+        views = [
+            _curves(
+                f"{what} wanted and exerted, {unit}",
+                [self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit],
+            )
+            for what, unit in (("force", "N"), ("torque", "N m"))
         ]
-        return [
-            _curves("force wanted and exerted, N", task[0]),
-            _curves("torque wanted and exerted, N m", task[1]),
-            _curves("contact, with limits", [self.all(FORCES, CONTACT)]),
-        ]
+        return [*views, _curves("contact, with limits", [self.all(FORCES, CONTACT)])]
 
     def _fingers(self, hand: Hand) -> rrb.Container:
         """Return a view of every finger for tensions, joints and forces, each kind in a tab, and
@@ -252,13 +250,14 @@ def eye_on(cell: Cell) -> rrb.EyeControls3D:
 def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout) -> None:
     """Log the resolved config, and the properties of the run."""
     stream.static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
+    robot = config.robot.model.stem if config.robot else "none"
     values = rr.AnyValues(
         rack=layout.rack,
         mode=config.clock.mode,
         speed=config.clock.speed,
         clock_ms=layout.clock_ns * 1e-6,
         tasks=[task.name for task in layout.tasks],
-        robot=str(config.robot.model.stem) if config.robot else "none",
+        robot=robot,
         machine=platform.platform(),
     )
     stream.property("run", values)

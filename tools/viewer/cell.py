@@ -58,35 +58,41 @@ def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
 def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Log all geoms, and the frames that never move with their poses in `data`."""
     stream.static((CELL,), stream.within(WORLD))
-    shown = {geom: bool(model.geom_group[geom] < SHOWN_GROUPS) for geom in range(model.ngeom)}
-    for geom in shown:
+    is_shown = model.geom_group < SHOWN_GROUPS
+    if not is_shown.any():
+        is_shown[:] = True
+    for geom in range(model.ngeom):
         shape = shape_of(model, geom)
         if shape is not None:
-            entity = _entity(model, geom, shown[geom] or not any(shown.values()))
-            stream.static(
-                entity, shape, stream.within(frame_of(model, int(model.geom_bodyid[geom])))
-            )
+            frame = stream.within(frame_of(model, int(model.geom_bodyid[geom])))
+            stream.static(_entity(model, geom, is_shown[geom]), shape, frame)
     for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
+        name = frame_of(model, body)
         pose = rr.Transform3D(
             translation=data.xpos[body],
             quaternion=rr.Quaternion(xyzw=xyzw(data.xquat[body])),
             parent_frame=stream.frame(WORLD),
-            child_frame=stream.frame(frame_of(model, body)),
+            child_frame=stream.frame(name),
         )
-        stream.static((FRAMES, frame_of(model, body)), pose)
+        stream.static((FRAMES, name), pose)
 
 
 def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
     body = model.body(int(model.geom_bodyid[geom])).name or f"body {model.geom_bodyid[geom]}"
     name = model.geom(geom).name or f"geom {geom}"
-    return (CELL, *(() if shown else (COLLISION,)), body, name)
+    return (CELL, body, name) if shown else (CELL, COLLISION, body, name)
+
+
+def set_state(cell: Cell, data: mujoco.MjData, state: np.ndarray) -> None:
+    """Set `data` to the state in an `ARM_STATE`."""
+    mujoco.mj_setState(cell.model, data, np.ascontiguousarray(state), STATE)
 
 
 class Poses:
     """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path
     of the tool."""
 
-    def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
+    def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream = stream
         self._cell = cell
         self._data = cell.start()
@@ -95,30 +101,25 @@ class Poses:
         self._world = stream.frame(WORLD)
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
-        self._sampled = Sampled(clock_ns)
+        self._sampled = Sampled(stream.times.clock_ns)
         stream.static(
             TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD)
         )
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
-        if not len(self._bodies):
-            return
         chosen = self._sampled.rows(block.ticks)
-        if len(chosen):
-            self._write(block, chosen)
-
-    def _write(self, block: RowBlock, chosen: np.ndarray) -> None:
-        model = self._cell.model
         data = self._data
         bodies = self._bodies
+        if not len(bodies) or not len(chosen):
+            return
         count = len(self._frames)
         positions = np.empty((len(chosen), count, 3))
         quaternions = np.empty((len(chosen), count, 4))
         tool = np.empty((len(chosen), 3))
         for row, state in enumerate(block.messages["state"][chosen]):
-            mujoco.mj_setState(model, data, np.ascontiguousarray(state), STATE)
-            mujoco.mj_kinematics(model, data)
+            set_state(self._cell, data, state)
+            mujoco.mj_kinematics(self._cell.model, data)
             positions[row, : len(bodies)] = data.xpos[bodies]
             quaternions[row, : len(bodies)] = data.xquat[bodies]
             for at, contact in enumerate(self._contacts, len(bodies)):
@@ -137,36 +138,33 @@ class Poses:
 class Pushes:
     """Writes the forces that the scene exerts on its objects, as `ARM_STATE`s have them."""
 
-    def __init__(self, stream: Stream, cell: Cell, clock_ns: int) -> None:
+    def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream = stream
         self._cell = cell
         self._data = cell.start()
-        self._sampled = Sampled(clock_ns)
+        self._sampled = Sampled(stream.times.clock_ns)
         self._is_empty = True
         stream.static(PUSHES, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the newest pushes, one set every 20 ms of simulated time."""
-        model = self._cell.model
         data = self._data
         bodies = self._cell.bodies
         for row in self._sampled.rows(block.ticks):
-            mujoco.mj_setState(
-                model, data, np.ascontiguousarray(block.messages["state"][row]), STATE
-            )
+            set_state(self._cell, data, block.messages["state"][row])
             forces = data.xfrc_applied[bodies, :3]
             pushed = forces.any(axis=1)
             if self._is_empty and not pushed.any():
                 continue
             self._is_empty = not pushed.any()
-            mujoco.mj_kinematics(model, data)
+            mujoco.mj_kinematics(self._cell.model, data)
             arrows = rr.Arrows3D(
                 origins=data.xipos[bodies][pushed],
                 vectors=PUSH_M * forces[pushed],
                 radii=PUSH_RADIUS_M,
                 colors=[FORCE],
             )
-            self._stream.at(*block.when(row), PUSHES, arrows)
+            self._stream.at(block.when(row), PUSHES, arrows)
 
 
 class PlannedPath:
@@ -182,21 +180,17 @@ class PlannedPath:
 
     def write(self, block: RowBlock) -> None:
         """Write every plan; a plan for the gripper clears the path."""
-        for row in range(len(block.rows)):
-            plan = block.messages[row]
-            tick = int(block.rows["visible_at"][row])
-            moves = plan["kind"] == SegmentKind.PATH and not plan["error"]
-            corners = (
-                plan["waypoints"][: plan["count"]] if moves else np.empty((0, len(self._cell.qpos)))
-            )
-            line = [self._tool(joints) for joints in in_pieces(corners)]
+        for row, plan in enumerate(block.messages):
+            corners = plan["waypoints"][: plan["count"]]
+            if plan["kind"] != SegmentKind.PATH or plan["error"]:
+                corners = corners[:0]
             points = [self._tool(joints) for joints in corners]
-            stamp_ns = int(block.stamps_ns[row])
-            strips = rr.LineStrips3D([line] if line else [], radii=LINE_M, colors=[PLANNED])
-            self._stream.at(tick, stamp_ns, PATH, strips)
-            self._stream.at(
-                tick, stamp_ns, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED])
-            )
+            lines = [[self._tool(joints) for joints in in_pieces(corners)]] if points else []
+            when = block.visible(row)
+            strips = rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED])
+            self._stream.at(when, PATH, strips)
+            marks = rr.Points3D(points, radii=POINT_M, colors=[PLANNED])
+            self._stream.at(when, WAYPOINTS, marks)
 
     def _tool(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the position of the tool at joint positions, (3,), m."""
@@ -226,7 +220,7 @@ class Goals:
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream
         self._objects = objects
-        self._moves: dict[int, tuple[list[float], str]] = {}
+        self._goals: dict[int, tuple[list[float], str]] = {}  # place and label, by move
         self._plans = Changes()
         self._current = Changes()
         for entity in (GOALS, CURRENT_GOAL):
@@ -237,7 +231,7 @@ class Goals:
         for row in self._plans.rows(block.messages["id"]):
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
-            self._moves |= {
+            self._goals |= {
                 int(move["id"]): (move["position"].tolist(), self._name(move)) for move in moves
             }
             ends = [move for move in moves if move["verb"] == Verb.RELEASE]
@@ -248,17 +242,20 @@ class Goals:
                 labels=[self._object(move) for move in ends],
                 show_labels=False,
             )
-            self._stream.at(
-                int(block.rows["visible_at"][row]), int(block.stamps_ns[row]), GOALS, points
-            )
+            self._stream.at(block.visible(row), GOALS, points)
 
     def write_status(self, block: RowBlock) -> None:
         """Write the goal of the move that each `MOVE_STATUS` names."""
         for row in self._current.rows(block.messages["current"]):
-            move = self._moves.get(int(block.messages["current"][row]))
-            positions, labels = ([move[0]], [move[1]]) if move else ([], [])
-            point = rr.Points3D(positions, radii=1.5 * POINT_M, colors=[CURRENT], labels=labels)
-            self._stream.at(*block.when(row), CURRENT_GOAL, point)
+            current = int(block.messages["current"][row])
+            goals = [self._goals[current]] if current in self._goals else []
+            point = rr.Points3D(
+                [place for place, _ in goals],
+                radii=1.5 * POINT_M,
+                colors=[CURRENT],
+                labels=[label for _, label in goals],
+            )
+            self._stream.at(block.when(row), CURRENT_GOAL, point)
 
     def _name(self, move: np.void) -> str:
         return f"{verb_name(int(move['verb']))} {self._object(move)}".strip()

@@ -19,7 +19,12 @@ ERROR = "tracking_error"
 GRIPPER = "gripper"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
 """Curves of a joint and their units; the torque is the one applied, after the limit gate."""
-_COMMANDED = {"position": "target", "velocity": "target_velocity"}
+FIELDS = {
+    "position": ("target", "position"),
+    "velocity": ("target_velocity", "velocity"),
+    "torque": ("torque",),
+}
+"""Fields of the curves: commanded, where it is, and measured."""
 
 
 class Joints:
@@ -40,11 +45,15 @@ class Joints:
         }
         for at, name in enumerate(names):
             for quantity, unit in QUANTITIES.items():
-                _style(stream, (JOINTS, name, quantity), at, unit)
-                limits = (JOINTS, name, quantity, "limits")
-                style_curves(
-                    stream, limits, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0]
-                )
+                entity = (JOINTS, name, quantity)
+                limits = ["lower limit", "upper limit"]
+                style_curves(stream, (*entity, "limits"), limits, [LIMIT, LIMIT], [1.0, 1.0])
+                if quantity == "torque":
+                    style_curves(stream, entity, [f"{name} applied, {unit}"], [of_joint(at)])
+                else:
+                    both = [f"{name} commanded, {unit}", f"{name} measured, {unit}"]
+                    # The lower one is wider: it shows on both sides where the two agree.
+                    style_curves(stream, entity, both, [COMMANDED, of_joint(at)], [2.5, 1.0])
         labels = [f"{name}, mrad" for name in names]
         style_curves(stream, (ERROR,), labels, [of_joint(at) for at in range(len(names))])
         if has_gripper:
@@ -55,40 +64,19 @@ class Joints:
         """Write every cycle of that level."""
         messages = block.messages
         times = block.times
-        for quantity in QUANTITIES:
-            measured = messages[quantity]
-            commanded = messages[_COMMANDED[quantity]] if quantity in _COMMANDED else None
+        # A straight line needs only its ends.
+        ends = block.times_of([0, -1])
+        for quantity, fields in FIELDS.items():
+            curves = np.stack([messages[field] for field in fields], axis=-1)
+            limits = self._limits[quantity]
             for at, name in enumerate(self._names):
-                curves = (
-                    measured[:, at]
-                    if commanded is None
-                    else np.column_stack((commanded[:, at], measured[:, at]))
-                )
-                self._stream.scalars((JOINTS, name, quantity), times, curves)
-        self._write_limits(block)
+                entity = (JOINTS, name, quantity)
+                self._stream.scalars(entity, times, curves[:, at])
+                self._stream.scalars((*entity, "limits"), ends, np.tile(limits[at], (2, 1)))
         self._stream.scalars((ERROR,), times, (messages["position"] - messages["target"]) * 1e3)
         if self._has_gripper:
             self._stream.scalars((GRIPPER, "opening"), times, messages["opening"] * 1e3)
             self._stream.scalars((GRIPPER, "force"), times, messages["grip_force"])
-
-    def _write_limits(self, block: RowBlock) -> None:
-        # A straight line needs only its ends.
-        times = block.times_of([0, -1])
-        for quantity, limits in self._limits.items():
-            for at, name in enumerate(self._names):
-                self._stream.scalars(
-                    (JOINTS, name, quantity, "limits"), times, np.tile(limits[at], (2, 1))
-                )
-
-
-def _style(stream: Stream, entity: tuple[str, str, str], at: int, unit: str) -> None:
-    _, name, quantity = entity
-    if quantity not in _COMMANDED:
-        style_curves(stream, entity, [f"{name} applied, {unit}"], [of_joint(at)])
-        return
-    names = [f"{name} commanded, {unit}", f"{name} measured, {unit}"]
-    # The lower one is wider: it shows on both sides where the two agree.
-    style_curves(stream, entity, names, [COMMANDED, of_joint(at)], [2.5, 1.0])
 
 
 class Fields:

@@ -9,13 +9,12 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import rerun as rr
 
+from rack.boards.events import Event
 from rack.tools.viewer.levels import Hierarchy
-from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.stream import Moment, Stream
 from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
 
 EVENTS = "events"
@@ -56,35 +55,36 @@ class Events:
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
-            self._write(json.loads(line))
+            event = json.loads(line)
+            # The last line, the outcome of the run, is no event.
+            if "tick" in event:
+                self._write(Event(**event))
 
-    def _write(self, event: dict[str, Any]) -> None:
-        kind = event["kind"]
-        if "tick" not in event:
-            return
-        board = event.get("board") or RACK
-        code = event.get("code", "")
-        tick = max(0, event["tick"])
-        stamp_ns = self._stream.times.monotonic(event["time_ns"])
-        text = f"{kind}: {board}: {event['text']}"
-        self._stream.say(tick, stamp_ns, "events", text, LEVELS.get(kind, "INFO"))
-        if kind not in UNSHOWN:
-            self._show(tick, stamp_ns, board, kind, code)
-        if kind == "died":
-            self._hierarchy.lose(tick, stamp_ns, board)
-        elif code == "hang":
-            self._hierarchy.lose(tick, stamp_ns, event["subject"])
-        elif code == "rejoined":
-            self._hierarchy.recover(tick, stamp_ns, board)
+    def _write(self, event: Event) -> None:
+        board = event.board or RACK
+        when = Moment(max(0, event.tick), self._stream.times.monotonic(event.time_ns))
+        text = f"{event.kind}: {board}: {event.text}"
+        self._stream.say(when, "events", text, LEVELS.get(event.kind, "INFO"))
+        if event.kind not in UNSHOWN:
+            self._show(when, board, event)
+        if event.kind == "died":
+            self._hierarchy.lose(when, board)
+        elif event.code == "hang":
+            self._hierarchy.lose(when, event.subject)
+        elif event.code == "rejoined":
+            self._hierarchy.recover(when, board)
 
-    def _show(self, tick: int, stamp_ns: int, board: str, kind: str, code: str) -> None:
+    def _show(self, when: Moment, board: str, event: Event) -> None:
         if board not in self._lanes:
             style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
-        # The end of a fault ends its own span only, not that of a later event.
-        if code == "ends" and self._lanes.get(board) != kind:
-            return
-        self._lanes[board] = "" if code == "ends" else kind
-        write_span(self._stream, tick, stamp_ns, (EVENTS, board), self._lanes[board])
+        state: str = event.kind
+        if event.code == "ends":
+            # The end of a fault ends its own span only, not that of a later event.
+            if self._lanes.get(board) != state:
+                return
+            state = ""
+        self._lanes[board] = state
+        write_span(self._stream, when, (EVENTS, board), state)
 
 
 class Losses:
@@ -97,13 +97,12 @@ class Losses:
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write the losses since the last call."""
-        stamp_ns = int(self._stream.times.stamps_of(np.array([tick]))[0])
+        when = self._stream.times.moment_of(tick)
         for ring, count in lost.items():
-            if count > self._logged.get(ring, 0):
-                text = f"recorder: {count - self._logged.get(ring, 0)} rows of {ring} lost"
-                self._stream.say(tick, stamp_ns, "recorder", text, "ERROR")
+            if (more := count - self._logged.get(ring, 0)) > 0:
+                self._stream.say(when, "recorder", f"recorder: {more} rows of {ring} lost", "ERROR")
         self._logged = dict(lost)
-        self._stream.at(tick, stamp_ns, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
+        self._stream.at(when, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
 
 
 class RecorderLoad:
@@ -122,5 +121,5 @@ class RecorderLoad:
         share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
         self._cpu_s = cpu_s
         self._wall_s = wall_s
-        stamp_ns = int(self._stream.times.stamps_of(np.array([tick]))[0])
-        self._stream.at(tick, stamp_ns, (RECORDER, "load"), rr.Scalars(100.0 * share))
+        when = self._stream.times.moment_of(tick)
+        self._stream.at(when, (RECORDER, "load"), rr.Scalars(100.0 * share))

@@ -64,7 +64,7 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
 class ContactArrows:
     """Writes the forces of the surroundings on tool or fingertips as arrows."""
 
-    def __init__(self, stream: Stream, cell: Cell, field: str, clock_ns: int) -> None:
+    def __init__(self, stream: Stream, cell: Cell, field: str) -> None:
         """Take the forces from `field`, whose numbers begin with three for each place."""
         self._stream = stream
         self._field = field
@@ -74,7 +74,7 @@ class ContactArrows:
         if cell.wrist is not None:
             self._scale = LONGEST_M / cell.wrist.most[0]
             shaft = TOOL_SHAFT_M
-        self._sampled = Sampled(clock_ns)
+        self._sampled = Sampled(stream.times.clock_ns)
         for place in self._places:
             arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
             stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))

@@ -31,22 +31,15 @@ class HandCurves:
         for finger, joints in self._fingers.items():
             own = [names[joint] for joint in joints]
             colours = [of_joint(at) for at in range(len(own))]
-            rows = ("flexor", "extensor")
-            pairs = [
-                f"{name} {row}{what}, N"
-                for what in (" commanded", "")
-                for row in rows
-                for name in own
-            ]
             style_curves(stream, (HAND, finger, JOINTS), [f"{name}, rad" for name in own], colours)
+            tendons = [f"{name} {row}" for row in ("flexor", "extensor") for name in own]
+            count = len(tendons)
+            labels = [f"{tendon} commanded, N" for tendon in tendons]
+            labels += [f"{tendon}, N" for tendon in tendons]
+            shades = [COMMANDED] * count + colours + [dimmed(colour) for colour in colours]
             # The lower ones are wider: they show on both sides where the two agree.
-            shades = [
-                *[COMMANDED] * (2 * len(own)),
-                *colours,
-                *(dimmed(colour) for colour in colours),
-            ]
-            widths = [2.5] * (2 * len(own)) + [1.0] * (2 * len(own))
-            style_curves(stream, (HAND, finger, TENSIONS), pairs, shades, widths)
+            widths = [2.5] * count + [1.0] * count
+            style_curves(stream, (HAND, finger, TENSIONS), labels, shades, widths)
             axes = [f"{axis}, N" for axis in "xyz"]
             style_curves(stream, (HAND, finger, FORCES), axes, [of_joint(at) for at in range(3)])
         labels = [f"{finger}, N" for finger in self._fingers]

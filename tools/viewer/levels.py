@@ -3,7 +3,7 @@ graph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from rack.levels.messages import Verb
 from rack.levels.systems.force.messages import Mode
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
-from rack.tools.viewer.stream import Changes, RowBlock, Stream
+from rack.tools.viewer.stream import Changes, Moment, RowBlock, Stream
 from rack.tools.viewer.style import STATES, style_lane, write_spans
 
 LEVELS = "levels"
@@ -99,10 +99,10 @@ class Activity:
         messages = block.messages
         self._states.write(block)
         for row in self._errors.rows(messages["error"]):
-            if messages["error"][row]:
+            if error := messages["error"][row]:
                 reason = messages["reason"][row].decode("ascii", "replace")
-                text = f"{self._board}: {reason or 'error ' + str(messages['error'][row])}"
-                self._stream.say(*block.when(row), "levels", text, "ERROR")
+                text = f"{self._board}: {reason or f'error {error}'}"
+                self._stream.say(block.when(row), "levels", text, "ERROR")
 
 
 class FiredRows:
@@ -111,25 +111,26 @@ class FiredRows:
     def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
         self._stream = stream
         self._board = mailbox.name.partition(".")[0]
-        self._lane = ValueLane(
-            stream,
-            (self._board, "row"),
-            FIRED,
-            lambda row: f"{row[1]} {row[2].decode('ascii', 'replace')}",
-        )
         self._changes = Changes()
 
     def write(self, block: RowBlock) -> None:
         """Write what changed."""
-        self._lane.write(block)
-        rows = block.messages[FIRED]
-        for at in self._changes.rows(rows):
-            table, row, fired, state = (
-                part.decode() if isinstance(part, bytes) else part for part in rows[at].item()
+        messages = block.messages
+        changed = self._changes.rows(messages[FIRED])
+        names = []
+        for at in changed:
+            table, fired, state = (
+                messages[field][at].decode("ascii", "replace")
+                for field in ("table", "fired", "in_state")
             )
+            row = messages["row"][at]
             text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"
             level = "INFO" if row else "ERROR"
-            self._stream.say(*block.when(at), "rows", text, level)
+            self._stream.say(block.when(at), "rows", text, level)
+            names.append(f"{row} {fired}")
+        if names:
+            lane = (LEVELS, self._board, "row")
+            write_spans(self._stream, lane, block.times_of(changed), names)
 
 
 class Hierarchy:
@@ -142,46 +143,44 @@ class Hierarchy:
     def __init__(self, stream: Stream, layout: Layout, rack: RackTiming) -> None:
         self._stream = stream
         self._tasks = [task.name for task in layout.tasks]
-        self._states = dict.fromkeys(self._tasks, "idle")
+        self._states = dict.fromkeys(self._tasks, "idle")  # the newest ones
+        self._shown = dict(self._states)  # those that the graph shows
         self._positions = positions(layout, rack)
-        self._changes: list[tuple[int, int, str, str]] = []
+        self._changes: list[tuple[Moment, str, str]] = []
         downward = [(board.name, below) for board in rack.boards.values() for below in board.below]
         plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
         stream.static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
-        self._log(0, int(stream.times.stamps_of(np.zeros(1, dtype=np.int64))[0]))
+        self._log(stream.times.moment_of(0))
 
     def write(self, task: str, block: RowBlock) -> None:
         """Note where a task's state changes."""
         names = _names(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero(names != before):
-            self._changes.append((*block.when(row), task, str(names[row])))
-        self._states[task] = str(names[-1])
+            self._note(block.when(row), task, str(names[row]))
 
-    def lose(self, tick: int, stamp_ns: int, board: str) -> None:
+    def lose(self, when: Moment, board: str) -> None:
         """Note that a board died or does not respond."""
         if board in self._states:
-            self._changes.append((tick, stamp_ns, board, "lost"))
-            self._states[board] = "lost"
+            self._note(when, board, "lost")
 
-    def recover(self, tick: int, stamp_ns: int, board: str) -> None:
+    def recover(self, when: Moment, board: str) -> None:
         """Note that a lost board is back; its state follows from its cycles."""
         if self._states.get(board) == "lost":
-            self._changes.append((tick, stamp_ns, board, "idle"))
-            self._states[board] = "idle"
+            self._note(when, board, "idle")
+
+    def _note(self, when: Moment, task: str, state: str) -> None:
+        self._changes.append((when, task, state))
+        self._states[task] = state
 
     def advance(self) -> None:
         """Write what was noted, in the order of time."""
-        if not self._changes:
-            return
-        shown = dict(self._shown)
-        for tick, stamp_ns, task, state in sorted(self._changes):
-            shown[task] = state
-            self._log(tick, stamp_ns, shown)
+        for when, task, state in sorted(self._changes):
+            self._shown[task] = state
+            self._log(when)
         self._changes.clear()
 
-    def _log(self, tick: int, stamp_ns: int, states: Mapping[str, str] | None = None) -> None:
-        self._shown = dict(states or self._states)
+    def _log(self, when: Moment) -> None:
         nodes = rr.GraphNodes(
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
@@ -189,7 +188,7 @@ class Hierarchy:
             # A planner's node is next to its board's.
             labels=[task.partition(".")[2] or task for task in self._tasks],
         )
-        self._stream.at(tick, stamp_ns, (HIERARCHY,), nodes)
+        self._stream.at(when, (HIERARCHY,), nodes)
 
 
 def _names(rows: np.ndarray) -> np.ndarray:

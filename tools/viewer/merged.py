@@ -12,7 +12,7 @@ from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackPlace
 from rack.tools.viewer.blueprint import RackViews, blueprint, together
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
-from rack.tools.viewer.stream import Stream, Timelines, new_recording
+from rack.tools.viewer.stream import Moment, Stream, Timelines, new_recording
 
 
 def write_merged(
@@ -25,29 +25,32 @@ def write_merged(
     written.
     """
     ran = {}
+    roots: dict[str, tuple[str, ...]] = {}
+    views = {}
     for place in placed:
         run = place.own.recording
-        ran[place.own.rack] = Ran.of(run.whole_layout, run.config, run.folder)
+        rack = place.own.rack
+        ran[rack] = of = Ran.of(run.whole_layout, run.config, run.folder)
+        roots[rack] = (rack,) if len(placed) > 1 else ()
+        views[rack] = RackViews(of.layout, of.config, of.cell, roots[rack])
     name = ", ".join(ran)
-    roots: dict[str, tuple[str, ...]] = {rack: (rack,) if len(ran) > 1 else () for rack in ran}
-    views = {
-        rack: RackViews(of.layout, of.config, of.cell, roots[rack]) for rack, of in ran.items()
-    }
-    view = blueprint(together(views) if len(views) > 1 else views[name].everything())
+    root = together(views) if len(placed) > 1 else views[name].everything()
     launches = "-".join(str(place.own.launch.created_ns) for place in placed)
-    recording = new_recording(name, f"{name}-{launches}", file, view)
-    log = Stream(recording, Timelines(placed[0].own.clock_ns, placed[0].own.launch))
+    recording = new_recording(name, f"{name}-{launches}", file, blueprint(root))
+    first = placed[0].own
+    log = Stream(recording, Timelines(first.clock_ns, first.launch))
     for place in placed[1:]:
-        log.say(0, place.line.epoch_ns, "time line", place.note, "INFO")
+        log.say(Moment(0, place.line.epoch_ns), "time line", place.note, "INFO")
     for at, place in enumerate(placed):
-        times = Timelines(place.own.clock_ns, place.own.launch, place)
-        stream = Stream(recording, times, roots[place.own.rack])
-        writer = RackWriter(stream, ran[place.own.rack])
-        last = place.own.ticks[1] + 1
-        for tick, taken in _blocks(place.own.recording, last, block_of(place.own.recording.layout)):
-            writer.write(taken, tick, place.own.recording.lost if tick >= last else {})
+        own = place.own
+        stream = Stream(recording, Timelines(own.clock_ns, own.launch, place), roots[own.rack])
+        writer = RackWriter(stream, ran[own.rack])
+        last = own.ticks[1] + 1
+        for tick, taken in _blocks(own.recording, last, block_of(own.recording.layout)):
+            lost = own.recording.lost if tick == last else {}
+            writer.write(taken, tick, lost)
             stream.flush()
-            show((at + min(1.0, tick / last)) / len(placed))
+            show((at + tick / last) / len(placed))
     recording.disconnect()
 
 
@@ -57,23 +60,16 @@ def _blocks(
     """Yield the rows of all rings, by ring, up to a tick, and that tick, block by block."""
     layout = recording.whole_layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
-    rings = {name: rows for name in names if len(rows := _rows(recording, name))}
+    recorded = {*recording.cycles, *recording.mailboxes}
+    rings = {name: recording.rows(name) for name in names if name in recorded}
     done = dict.fromkeys(rings, 0)
     for begin in range(0, last, block):
         tick = min(last, begin + block)
-        # The last block has all that is left: what clock and operator wrote after the last cycle,
-        # too.
-        ends = {
-            name: int(np.searchsorted(rows["tick"], tick)) if tick < last else len(rows)
-            for name, rows in rings.items()
-        }
-        yield (
-            tick,
-            {name: rings[name][done[name] : end] for name, end in ends.items() if end > done[name]},
-        )
+        if tick < last:
+            ends = {name: int(np.searchsorted(rows["tick"], tick)) for name, rows in rings.items()}
+        else:
+            # All that is left: what clock and operator wrote after the last cycle, too.
+            ends = {name: len(rows) for name, rows in rings.items()}
+        taken = {name: rings[name][done[name] : end] for name, end in ends.items()}
+        yield tick, {name: rows for name, rows in taken.items() if len(rows)}
         done = ends
-
-
-def _rows(recording: Recording, name: str) -> np.ndarray:
-    is_there = name in recording.cycles or name in recording.mailboxes
-    return recording.rows(name) if is_there else np.empty(0)

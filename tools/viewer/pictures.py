@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,15 +31,16 @@ QUIET_LEVELS = ("INFO", "DEBUG", "TRACE")
 SOFTWARE = "Software rasterizer"
 """The viewer's remark where there is no graphics card; it draws all the same."""
 PACKAGES = (
-    *(
-        "mesa-vulkan-drivers",
-        "libvulkan1",
-        "libgl1-mesa-dri",
-        "libegl1",
-        "libxkbcommon0",
-        "libxkbcommon-x11-0",
-    ),
-    *("libx11-xcb1", "libxcursor1", "libxi6", "libxrandr2"),
+    "mesa-vulkan-drivers",
+    "libvulkan1",
+    "libgl1-mesa-dri",
+    "libegl1",
+    "libxkbcommon0",
+    "libxkbcommon-x11-0",
+    "libx11-xcb1",
+    "libxcursor1",
+    "libxi6",
+    "libxrandr2",
 )
 """Debian's packages for drawing without a graphics card; .ci/run installs them."""
 
@@ -124,9 +125,8 @@ def _connected(window: ViewerWindow, port: int) -> ViewerClient:
 
 def _why(window: ViewerWindow, otherwise: object) -> str:
     """Return why there is no picture, and what to install."""
-    with suppress(TimeoutError):
-        window.await_end(DYING_S)
-    return f"{otherwise if window.is_open else window.wait()}; {packages_text()}"
+    reason = window.wait() if window.ends_within(DYING_S) else otherwise
+    return f"{reason}; {packages_text()}"
 
 
 def packages_text() -> str:
@@ -136,11 +136,9 @@ def packages_text() -> str:
     asked = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
     found = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
     missing = [name for name in PACKAGES if f"{name} install ok installed" not in found]
-    return (
-        f"missing packages: apt-get install {' '.join(missing)}"
-        if missing
-        else "no package for it is missing"
-    )
+    if not missing:
+        return "no package for it is missing"
+    return f"missing packages: apt-get install {' '.join(missing)}"
 
 
 def main() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -86,18 +87,24 @@ class RackWriter:
     def __init__(self, stream: Stream, ran: Ran) -> None:
         layout = ran.layout
         config = ran.config
-        cell = ran.cell
         self._times = stream.times
         write_document(stream, ran.text, config, layout)
-        if cell is not None:
-            write_geometry(stream, cell.model, cell.start())
-        of_mailbox = _parts_of(stream, layout, config, cell)
+        of_mailbox: dict[str, list[ViewPart]] = {
+            box.name: _of_any(stream, box) for box in layout.mailboxes
+        }
+        if ran.cell is not None:
+            write_geometry(stream, ran.cell.model, ran.cell.start())
+            goals = Goals(stream, config.scene.bodies)
+            for box in layout.mailboxes:
+                of_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
         period_ns = tick_ns(config)
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         slice_ns = layout.clock_ns if lockstep else period_ns
+        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
         self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
+                partial(self._hierarchy.write, task.name),
                 CycleLanes(stream, task, speed, lockstep).write,
                 Load(stream, task, slice_ns, lockstep).write,
                 Misses(stream, task).write,
@@ -111,7 +118,6 @@ class RackWriter:
         for mailbox, age in self._ages.items():
             of_mailbox[mailbox].append(age.write)
         self._parts = self._of_task | of_mailbox
-        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
         self._events = Events(stream, ran.events, self._hierarchy)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
@@ -122,11 +128,8 @@ class RackWriter:
         if (fastest := taken.get(self._fastest)) is not None:
             self._times.learn(fastest["tick"], fastest["start_ns"])
         for ring, rows in taken.items():
-            if ring in self._of_task:
-                block = RowBlock(rows, "start_ns", self._times)
-                self._hierarchy.write(ring, block)
-            else:
-                block = RowBlock(rows, "stamp_ns", self._times)
+            stamp = "start_ns" if ring in self._of_task else "stamp_ns"
+            block = RowBlock(rows, stamp, self._times)
             for write in self._parts[ring]:
                 write(block)
         for age in self._ages.values():
@@ -201,22 +204,9 @@ def block_of(layout: Layout) -> int:
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
-def _parts_of(
-    stream: Stream, layout: Layout, config: RackConfig, cell: Cell | None
-) -> dict[str, list[ViewPart]]:
-    """Return the parts of the view by mailbox: chosen by message types, so that any rack has a
-    view."""
-    parts: dict[str, list[ViewPart]] = defaultdict(list)
-    for mailbox in layout.mailboxes:
-        parts[mailbox.name] += _of_any(stream, mailbox)
-    if cell is not None and config.robot is not None:
-        goals = Goals(stream, config.scene.bodies)
-        for mailbox in layout.mailboxes:
-            parts[mailbox.name] += _of_arm(stream, mailbox, config, cell, goals)
-    return parts
-
-
 def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
+    """Return the parts of the view for a mailbox, by its message type, so that any rack has a
+    view."""
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
     parts: list[ViewPart] = []
@@ -250,19 +240,20 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
 def _of_arm(
     stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals
 ) -> list[ViewPart]:
+    """Return the parts that show a mailbox in the cell, or as curves of the arm."""
     robot = config.robot
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ARM_STATE.name:
-            pushes = [Pushes(stream, cell, config.clock_ns).write] if config.scene.push else []
-            return [Poses(stream, cell, config.clock_ns).write, *pushes]
+            pushes = [Pushes(stream, cell).write] if config.scene.push else []
+            return [Poses(stream, cell).write, *pushes]
         case HAND_STATUS.name if cell.hand is not None:
-            arrows = ContactArrows(stream, cell, "force", config.clock_ns)
+            arrows = ContactArrows(stream, cell, "force")
             return [HandCurves(stream, robot.joints, cell.hand).write, arrows.write]
         case driving if driving in DRIVING:
             return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
         case WRENCH.name if cell.wrist is not None:
-            arrows = ContactArrows(stream, cell, "wrench", config.clock_ns)
+            arrows = ContactArrows(stream, cell, "wrench")
             return [arrows.write, ContactForces(stream, cell.wrist.most).write]
         case FORCE_STATUS.name:
             return [TaskForces(stream).write]

@@ -35,8 +35,15 @@ SERVER_MEMORY = "200MB"
 """What the server keeps for a viewer that joins later."""
 
 
+class Moment(NamedTuple):
+    """When something happened: a tick, and a stamp of CLOCK_MONOTONIC."""
+
+    tick: int
+    stamp_ns: int
+
+
 class RowTimes(NamedTuple):
-    """RowTimes of rows, each (rows,): simulated, ns; tick; wall clock, ns."""
+    """Times of rows, each (rows,): simulated, ns; tick; wall clock, ns."""
 
     simulated_ns: Ints
     ticks: Ints
@@ -89,6 +96,10 @@ class Timelines:
             last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64)
         )
 
+    def moment_of(self, tick: int) -> Moment:
+        """Return approximately when a tick happened."""
+        return Moment(tick, int(self.stamps_of(np.array([tick]))[0]))
+
     def monotonic(self, time_ns: int) -> int:
         """Return a CLOCK_REALTIME stamp as CLOCK_MONOTONIC."""
         return time_ns - self._offset_ns
@@ -116,9 +127,13 @@ class RowBlock:
         """Return the time columns of some rows, by their indices."""
         return self._timelines.columns(self.ticks[rows], self.stamps_ns[rows])
 
-    def when(self, row: SupportsIndex) -> tuple[int, int]:
-        """Return tick and time stamp of one row."""
-        return int(self.ticks[row]), int(self.stamps_ns[row])
+    def when(self, row: SupportsIndex) -> Moment:
+        """Return when a row was written."""
+        return Moment(int(self.ticks[row]), int(self.stamps_ns[row]))
+
+    def visible(self, row: SupportsIndex) -> Moment:
+        """Return the same for a mailbox's row, at the tick at which it is visible."""
+        return Moment(int(self.rows["visible_at"][row]), int(self.stamps_ns[row]))
 
     @property
     def messages(self) -> np.ndarray:
@@ -229,11 +244,9 @@ class Stream:
         """Send a block of curves, shape (rows,) or (rows, curves)."""
         self.columns(entity, times, rr.Scalars.columns(scalars=values))
 
-    def at(
-        self, tick: int, stamp_ns: int, entity: Sequence[str], archetype: rr.AsComponents
-    ) -> None:
-        """Log a single item, at a tick and a time of CLOCK_MONOTONIC."""
-        found = self.times.times(np.array([tick]), np.array([stamp_ns]))
+    def at(self, when: Moment, entity: Sequence[str], archetype: rr.AsComponents) -> None:
+        """Log a single item."""
+        found = self.times.times(np.array([when.tick]), np.array([when.stamp_ns]))
         self._recording.set_time(
             SIM_TIME, duration=np.timedelta64(int(found.simulated_ns[0]), "ns")
         )
@@ -241,11 +254,11 @@ class Stream:
         self._recording.set_time(WALL, timestamp=np.datetime64(int(found.wall_ns[0]), "ns"))
         self._recording.log(self._path(entity), archetype)
 
-    def say(self, tick: int, stamp_ns: int, source: str, text: str, level: str) -> None:
+    def say(self, when: Moment, source: str, text: str, level: str) -> None:
         """Write a line to the log, under its source; of a rack among several it begins with the
         rack's name."""
         line = rr.TextLog(": ".join((*self._root, text)), level=level)
-        self.at(tick, stamp_ns, (LOG, source), line)
+        self.at(when, (LOG, source), line)
 
     def property(self, name: str, values: rr.AsComponents) -> None:
         """Log a property of the run."""

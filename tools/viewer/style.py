@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import rerun as rr
 import rerun.blueprint as rrb
 
-from rack.tools.viewer.stream import Stream
+from rack.tools.viewer.stream import Moment, Stream
 
 Colour = tuple[int, int, int, int]
 """Red, green, blue, alpha, 0 to 255."""
@@ -114,9 +114,9 @@ def write_spans(
     stream.columns(entity, times, rr.StateChange.columns(state=states))
 
 
-def write_span(stream: Stream, tick: int, stamp_ns: int, entity: Sequence[str], state: str) -> None:
-    """Write one state that begins now."""
-    stream.at(tick, stamp_ns, entity, rr.StateChange(state=state))
+def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) -> None:
+    """Write one state that begins then."""
+    stream.at(when, entity, rr.StateChange(state=state))
 
 
 def lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:

@@ -119,8 +119,12 @@ class Misses:
         if not self._is_styled:
             style_lane(self._stream, self._lane, {MISSED: PHASES[MISSED]})
             self._is_styled = True
-        self._mark(np.unique(block.ticks[missed] // self._span))
-        self._log(block.ticks[missed], int(block.stamps_ns[missed[0]]))
+        ticks = block.ticks[missed]
+        self._mark(np.unique(ticks // self._span))
+        which = f"tick {ticks[0]}"
+        if len(ticks) > 1:
+            which = f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
+        self._stream.say(block.when(missed[0]), "misses", f"missed: {self._task}: {which}", "WARN")
 
     def _mark(self, spans: np.ndarray) -> None:
         ends = np.setdiff1d(spans + 1, spans)
@@ -129,19 +133,8 @@ class Misses:
         ticks = moments[order] * self._span
         states = np.array([MISSED] * len(spans) + [""] * len(ends))[order]
         times = self._stream.times
-        write_spans(
-            self._stream, self._lane, times.columns(ticks, times.stamps_of(ticks)), states.tolist()
-        )
-
-    def _log(self, ticks: np.ndarray, stamp_ns: int) -> None:
-        which = (
-            f"tick {ticks[0]}"
-            if len(ticks) == 1
-            else f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
-        )
-        self._stream.say(
-            int(ticks[0]), stamp_ns, "misses", f"missed: {self._task}: {which}", "WARN"
-        )
+        columns = times.columns(ticks, times.stamps_of(ticks))
+        write_spans(self._stream, self._lane, columns, states.tolist())
 
 
 class Age:

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
@@ -31,15 +32,16 @@ class ViewerWindow:
                 "no screen: DISPLAY and WAYLAND_DISPLAY are not set; on a machine with one: rerun"
                 f" {' '.join(sources)}"
             )
+        # By default the viewer would listen on every network.
+        command = [executable(), "--bind", HOST, *sources]
+        if headless:
+            command += ["--headless", "--hide-welcome-screen"]
+        if port is not None:
+            command += ["--port", str(port)]
         # A file, not a pipe: nobody reads it while the viewer is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(
-            # By default the viewer would listen on every network.
-            [
-                *(executable(), "--bind", HOST, *sources),
-                *(["--headless", "--hide-welcome-screen"] if headless else []),
-                *([] if port is None else ["--port", str(port)]),
-            ],
+            command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._said,
@@ -50,7 +52,7 @@ class ViewerWindow:
 
     def news(self) -> list[str]:
         """Return how the window ended, once; nothing while it is open."""
-        if self._is_reported or self._process.poll() is None:
+        if self._is_reported or self.is_open:
             return []
         self._is_reported = True
         return [self.wait() or "the viewer was closed"]
@@ -65,12 +67,11 @@ class ViewerWindow:
         panic = [line.partition(PANIC)[2] for line in said if PANIC in line]
         return ": ".join([f"the viewer ended with status {status}", *(panic or said[-1:])[:1]])
 
-    def await_end(self, bound_s: float) -> None:
-        """Wait for its end. Raises `TimeoutError`."""
-        try:
+    def ends_within(self, bound_s: float) -> bool:
+        """Wait for its end, at most so long; return whether it came."""
+        with suppress(subprocess.TimeoutExpired):
             self._process.wait(bound_s)
-        except subprocess.TimeoutExpired:
-            raise TimeoutError from None
+        return not self.is_open
 
     @property
     def is_open(self) -> bool:
@@ -80,7 +81,7 @@ class ViewerWindow:
     def close(self) -> None:
         """Close it."""
         self._is_reported = True
-        if self._process.poll() is None:
+        if self.is_open:
             # The command is a script that starts the viewer: both are in its process group.
             os.killpg(self._process.pid, signal.SIGTERM)
             self._process.wait()

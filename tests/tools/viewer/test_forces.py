@@ -53,9 +53,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
     written = Written(tmp_path)
-    written.write(
-        WRENCH, cell, ContactArrows(written.stream, cell, "wrench", CLOCK_NS).write, wrench=force
-    )
+    written.write(WRENCH, cell, ContactArrows(written.stream, cell, "wrench").write, wrench=force)
     arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
     assert arrows.ticks.tolist() == [0, 20, 40]
     assert arrows.values[:, 0] == pytest.approx(
@@ -72,7 +70,7 @@ def test_the_arrows_frame_is_at_the_tool_and_turns_with_the_world(
     written.write(
         ARM_STATE,
         cell,
-        Poses(written.stream, cell, CLOCK_NS).write,
+        Poses(written.stream, cell).write,
         state=np.tile(state, (ROWS, 1)),
     )
     frames = read(written.file, "/frames", "Transform3D:child_frame").values.ravel()
