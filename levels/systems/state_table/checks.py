@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, TableText
+from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, StateTable
 from rack.levels.systems.state_table.vocabulary import Lexicon, Vocabulary, objection
 
 Box = dict[str, frozenset[str]]
@@ -21,19 +21,19 @@ MAX_HOLES = 3
 """Holes of one state that are reported one by one."""
 
 
-def flaws(text: TableText, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
+def flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
     """Return every mistake in a table, a line each, with the number and name of the row.
 
     Without a lexicon, since the plan has mistakes, actions are not checked.
     """
-    found = [*text.flaws]
-    for number, row in text.rows.items():
+    found = [*table.flaws]
+    for number, row in table.configs.items():
         found += [f"{_named(number, row)}: {why}" for why in _words(row, vocabulary, lexicon)]
-    found += _states(text)
+    found += _states(table)
     # Cases can be counted only once every condition and value is known, and every row is readable.
-    if not text.flaws and not any(_conditions(row, vocabulary) for row in text.rows.values()):
-        for state in _names(text):
-            found += _cases(state, _rows_of(state, text), vocabulary)
+    if not table.flaws and not any(_conditions(row, vocabulary) for row in table.configs.values()):
+        for state in table.rows:
+            found += _cases(state, _rows_of(state, table), vocabulary)
     return found
 
 
@@ -41,13 +41,8 @@ def _named(number: int, row: RowConfig) -> str:
     return f"row {number} '{row.name}'"
 
 
-def _rows_of(state: str, text: TableText) -> dict[int, RowConfig]:
-    return {number: row for number, row in text.rows.items() if state in row.state}
-
-
-def _names(text: TableText) -> list[str]:
-    """Return the states that have rows, in their order."""
-    return list(dict.fromkeys(state for row in text.rows.values() for state in row.state))
+def _rows_of(state: str, table: StateTable) -> dict[int, RowConfig]:
+    return {row.number: table.configs[row.number] for row in table.rows[state]}
 
 
 def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> Iterator[str]:
@@ -71,50 +66,41 @@ def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
     """Return the unknown conditions and values of a row."""
     found = []
     for condition, values in row.when.items():
-        known = vocabulary.conditions.get(condition)
-        if known is None:
-            found.append(
-                f"when: unknown condition '{condition}'; known: {', '.join(vocabulary.conditions)}"
-            )
+        if condition not in vocabulary.conditions:
+            known = ", ".join(vocabulary.conditions)
+            found.append(f"when: unknown condition '{condition}'; known: {known}")
             continue
-        found += [
-            f"when: {condition} is never '{value}'; its values: {', '.join(known.values)}"
-            for value in values
-            if value not in known.values
-        ]
+        permitted = vocabulary.conditions[condition].values
+        unknown = [f"is never '{value}'" for value in values if value not in permitted]
         if not values:
-            found.append(
-                f"when: {condition} has an empty list; its values: {', '.join(known.values)}"
-            )
+            unknown = ["has an empty list"]
+        its_values = ", ".join(permitted)
+        found += [f"when: {condition} {why}; its values: {its_values}" for why in unknown]
     return found
 
 
-def _states(text: TableText) -> Iterator[str]:
+def _states(table: StateTable) -> Iterator[str]:
     """Yield next states that do not exist, and states that no row leads to."""
-    names = _names(text)
+    names = [*table.rows]
     known = ", ".join(names)
     if SAME in names:
         yield f"state: '{SAME}' is no name of a state: `next = \"{SAME}\"` stays in a state"
-    if text.start not in names:
-        yield f"start: no row has the state '{text.start}'; states: {known}"
-    for number, row in text.rows.items():
+    if table.start not in names:
+        yield f"start: no row has the state '{table.start}'; states: {known}"
+    for number, row in table.configs.items():
         if row.next is not None and row.next not in (*names, SAME):
             yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
-    reached = set[str]()
-    ahead = [text.start]
-    while ahead:
-        state = ahead.pop()
+    if table.start not in names:
+        return
+    reached = [table.start]
+    for state in reached:  # grows on the way
+        nexts = {row.next for row in _rows_of(state, table).values()} - {SAME}
+        reached += [name for name in names if name in nexts and name not in reached]
+    for state in names:
         if state not in reached:
-            reached.add(state)
-            ahead += [
-                row.next for row in _rows_of(state, text).values() if row.next not in (None, SAME)
-            ]
-    # If the start is unknown, nothing is reached.
-    for state in names if text.start in names else ():
-        if state not in reached:
-            numbers = ", ".join(map(str, _rows_of(state, text)))
+            numbers = ", ".join(map(str, _rows_of(state, table)))
             yield (
-                f"row {numbers}: unreachable: no row leads from '{text.start}' to the state"
+                f"row {numbers}: unreachable: no row leads from '{table.start}' to the state"
                 f" '{state}'"
             )
 
@@ -126,50 +112,31 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
         name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
     ]
     every: Box = {name: frozenset(vocabulary.conditions[name].values) for name in named}
-    boxes = {number: {**every, **_box(row)} for number, row in rows.items()}
+    boxes: dict[int, Box] = {}  # of the rows above, by number
     left = [every]
     for number, row in rows.items():
-        earlier = [other for other in rows if other < number]
-        if not row.otherwise:
-            yield from _overlaps(state, (number, row), {n: rows[n] for n in earlier}, boxes)
-        rest = [piece for box in left for piece in without(box, boxes[number])]
+        here = _named(number, row)
+        box = {**every, **{name: frozenset(values) for name, values in row.when.items()}}
+        for other, above in boxes.items():
+            both = {name: values & above[name] for name, values in box.items()}
+            if not row.otherwise and all(both.values()):
+                before = rows[other]
+                shared = {n: both[n] for n in named if n in row.when or n in before.when}
+                yield (
+                    f"{here}: overlaps {_named(other, before)} in '{state}' when"
+                    f" {_listed(shared)}; let them exclude each other, or give the later one else ="
+                    " true"
+                )
+        rest = [piece for whole in left for piece in without(whole, box)]
         if row.otherwise and rest == left:
-            yield (
-                f"{_named(number, row)}: never fires in '{state}': the rows above it take every"
-                " case of it"
-            )
+            yield f"{here}: never fires in '{state}': the rows above it take every case of it"
         left = rest
+        boxes[number] = box
     left = joined(left)
     for box in left[:MAX_HOLES]:
         yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
     if len(left) > MAX_HOLES:
         yield f"hole: '{state}' has {len(left) - MAX_HOLES} more"
-
-
-def _overlaps(
-    state: str,
-    new: tuple[int, RowConfig],
-    earlier: Mapping[int, RowConfig],
-    boxes: Mapping[int, Box],
-) -> Iterator[str]:
-    number, row = new
-    for other, before in earlier.items():
-        both = {name: values & boxes[other][name] for name, values in boxes[number].items()}
-        if all(both.values()):
-            shared = {
-                name: values
-                for name, values in both.items()
-                if name in row.when or name in before.when
-            }
-            yield (
-                f"{_named(number, row)}: overlaps {_named(other, before)} in '{state}' when"
-                f" {_listed(shared)}; let them exclude each other, or give the later one else ="
-                " true"
-            )
-
-
-def _box(row: RowConfig) -> Box:
-    return {condition: frozenset(values) for condition, values in row.when.items()}
 
 
 def without(box: Box, taken: Box) -> Sequence[Box]:

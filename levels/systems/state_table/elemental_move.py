@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from pydantic import Field as Key
 
 from rack.backplane.message import Field, Message, status
@@ -116,24 +115,21 @@ class MoveTable(StateTableExecutor):
         },
         plan=MovePlanConfig,
     )
+    _below: Message
+    _world: Message
+    """As of this cycle."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._ik = InverseKinematics(self._cell, context.seed)
-        self._sent = 0
+        # The newest command sent down: it aims at a place, unless `object` is a row.
+        self._command = Message(JOINT_MOVE.dtype(context.sizes))
+        self._command.joints = self._cell.home
+        self._command.speed = 1.0
+        self._command.object = -1
         self._reached = True
-        self._what, self._speed = "", 1.0  # the newest command sent down
-        self._joints = self._cell.home.copy()  # (joints,), rad: where it ends
-        self._aim = np.zeros(3)  # m: where the object, or the place, was for it
-        self._yaw = 0.0  # rad: likewise
-        self._holds = False  # the gripper holds something
-        self._carried = (
-            self._put
-        ) = -1  # rows of the object in it, and of the one put down last; -1: none
-        self._row = -1  # of that object in the world model; -1: it was a place
-        self._positions: Array = np.zeros((context.sizes["bodies"], 3))  # m, as sensed
-        self._quaternions: Array = np.zeros((context.sizes["bodies"], 4))
+        self._put = -1  # row of the object put down last; -1: none
 
     @classmethod
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
@@ -144,120 +140,107 @@ class MoveTable(StateTableExecutor):
         """Continue with the command sent down last."""
         super().recall(read, write)
         if read.last_status.is_there and read.last_command.is_there:
-            last = read.last_command.value
-            write.command.copy_from(last)
-            self._sent = read.last_status.value.sent
-            self._reached = bool(read.last_status.value.reached)
-            self._put = read.last_status.value.put
-            self._what = last.words
-            self._speed = last.speed
-            self._row = last.object
-            self._joints[:] = last.joints
-            self._aim[:] = last.aim
-            self._yaw = last.yaw
+            last = read.last_status.value
+            self._command.copy_from(read.last_command.value)
+            self._command.id = last.sent
+            self._reached = bool(last.reached)
+            self._put = last.put
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
         """Return where the level below, the object and the gripper are."""
-        below = read.status.value
-        world = read.world.value
-        self.detail = below.reason
-        self.resting = not below.moving
-        self._holds = below.held > 0
-        self._carried = below.object if below.held else -1
-        self._positions = world.position
-        self._quaternions = world.quaternion
-        is_seen = not read.world.is_lost and world.revision > 0
+        self._below = read.status.value
+        self._world = read.world.value
+        self.detail = self._below.reason
+        self.resting = not self._below.moving
+        is_seen = not read.world.is_lost and self._world.revision > 0
+        target = "moving"
+        is_elsewhere = False
+        if is_seen:
+            target = self._target(self._command.object)
+            is_elsewhere = self._put >= 0 and not self._is_at(self._put)
         return {
-            "below": answer_of(read.status, self._sent),
-            "world": "seen" if is_seen else "unseen",
-            "target": self._target(world) if is_seen else "moving",
-            "support": (
-                "there"
-                if not is_seen or self._put < 0 or self._is_at(world, self._put)
-                else "elsewhere"
-            ),
-            "gripper": ("free", "holds")[self._holds],
+            "below": answer_of(read.status, self._command.id),
+            "world": ("unseen", "seen")[is_seen],
+            "target": target,
+            "support": ("there", "elsewhere")[is_elsewhere],
+            "gripper": ("free", "holds")[self._below.held > 0],
             "reach": YES_NO[self._reached],
         }
 
-    def _target(self, world: Message) -> str:
-        if self._row < 0:
+    def _target(self, row: int) -> str:
+        if row < 0:
             return "there"
-        if norm(world.velocity[self._row]) > STILL_M_S:
+        if norm(self._world.velocity[row]) > STILL_M_S:
             return "moving"
-        return "there" if self._is_at(world, self._row) else "displaced"
+        return "there" if self._is_at(row) else "displaced"
 
-    def _is_at(self, world: Message, row: int) -> bool:
+    def _is_at(self, row: int) -> bool:
         """Return whether an object is where the newest motion aims."""
-        return bool(norm(world.position[row] - self._aim) <= self.table.plan.moved)
+        distance = norm(self._world.position[row] - self._command.aim)
+        return bool(distance <= self.table.plan.moved)
 
     def do_move(self, pose: str) -> None:
         """Send the arm to a pose."""
         if pose == HOME:
             self._send("move", self._cell.home, self.table.plan.home_speed)
-            self._row = -1
+            self._command.object = -1
             return
         taught = self.table.plan.pose[pose]
-        goal = self._tool_at(taught.height)
-        found = self._solve(goal)
-        self._reached = found is not None
-        if found is not None:
-            self._send("move", found, taught.speed)
+        joints = self._solve(self._tool_at(taught.height))
+        self._reached = joints is not None
+        if joints is not None:
+            self._send("move", joints, taught.speed)
 
     def do_open(self) -> None:
         """Open the gripper."""
-        self._put = self._carried
-        self._send("open", self._joints, 1.0)
+        self._put = self._below.object if self._below.held else -1
+        self._send("open", self._command.joints, 1.0)
 
     def do_close(self) -> None:
         """Close the gripper."""
-        self._send("close", self._joints, 1.0)
+        self._send("close", self._command.joints, 1.0)
 
     def _tool_at(self, height: float) -> Pose:
         """Return the pose of the tool, pointing down, at a height above the object or place of the
         command."""
-        verb, *names = self.words
-        now = self._ik.tool_at(self._joints)
-        self._row = self.context.scene.objects.index(names[0]) if verb == "pick" else -1
-        if self._row < 0:
-            self._aim[:] = self.table.plan.place[names[0]]
-            self._yaw = 0.0
-        elif not self._holds:
+        verb, name = self.words
+        command = self._command
+        if verb == "place":
+            command.object = -1
+            command.aim = self.table.plan.place[name]
+            command.yaw = 0.0
+        else:
+            row = command.object = self.context.scene.objects.index(name)
             # In the gripper it moves with the arm: it is raised from where it was.
-            self._aim[:] = self._positions[self._row]
-            self._yaw = yaw_of(self._quaternions[self._row])
-        above = self._aim + np.array([0.0, 0.0, height])
+            if not self._below.held:
+                command.aim = self._world.position[row]
+                command.yaw = yaw_of(self._world.quaternion[row])
+        now = self._ik.tool_at(command.joints)
         # Across the object's faces, whichever quarter turn is nearest to the tool now.
-        turns = [pointing(DOWN, -(self._yaw + quarter * 0.5 * math.pi)) for quarter in range(4)]
-        return min((Pose(above, turn) for turn in turns), key=now.angle_to)
+        turns = [pointing(DOWN, -(command.yaw + quarter * 0.5 * math.pi)) for quarter in range(4)]
+        goals = [Pose(command.aim, turn).raised(height) for turn in turns]
+        return min(goals, key=now.angle_to)
 
     def _solve(self, goal: Pose) -> Array | None:
         """Return joint positions, rad, at a pose: on the branch of the arm, else from home; at most
         three descents."""
-        found = self._ik.nearby(goal, self._joints)
-        if found is None:
-            found = self._ik.reach(goal, self._cell.home)
-        return found if found is not None else self._ik.reach(goal, self._joints)
+        joints = self._ik.nearby(goal, self._command.joints)
+        if joints is None:
+            joints = self._ik.reach(goal, self._cell.home)
+        return joints if joints is not None else self._ik.reach(goal, self._command.joints)
 
     def _send(self, what: str, joints: Array, speed: float) -> None:
-        self._sent += 1
-        self._what = what
-        self._speed = speed
-        self._joints[:] = joints
+        self._command.id += 1
+        self._command.words = what
+        self._command.speed = speed
+        self._command.joints = joints
 
     def give(self, write: Ports, tick: int) -> None:
         """Write the command, and what a restarted board needs."""
-        command = write.command
         shown = write.status
-        command.id = self._sent
-        command.words = self._what
-        command.hold = self.holds
-        command.joints[:] = self._joints
-        command.speed = self._speed
-        command.object = self._row
-        command.aim = self._aim
-        command.yaw = self._yaw
-        shown.sent = self._sent
+        self._command.hold = self.holds
+        write.command.copy_from(self._command)
+        shown.sent = self._command.id
         shown.reached = self._reached
         shown.resting = self.resting
         shown.put = self._put

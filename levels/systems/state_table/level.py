@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
@@ -24,6 +24,7 @@ from rack.levels.operator import (
     HELD_FROM_ABOVE,
     OPERATOR_COMMAND,
     RESTS_ON,
+    Commands,
     Operation,
     Orders,
 )
@@ -36,7 +37,7 @@ from rack.levels.systems.state_table.table import (
     Row,
     StateTable,
     TableError,
-    read_text,
+    read_table,
 )
 from rack.levels.systems.state_table.vocabulary import (
     NAME_BYTES,
@@ -44,6 +45,7 @@ from rack.levels.systems.state_table.vocabulary import (
     TAKE,
     Condition,
     Lexicon,
+    NoPlan,
     Phrase,
     Vocabulary,
     objection,
@@ -101,38 +103,45 @@ def vocabulary(
     conditions: Mapping[str, Condition],
     actions: Mapping[str, Phrase],
     commands: Mapping[str, Phrase] | None = None,
-    plan: type[Table] | None = None,
+    plan: type[Table] = NoPlan,
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
     with them."""
     late = Condition(YES_NO, "whether the state has lasted longer than the table's patience")
-    found = {**conditions, LATE: late}
-    acts = dict(actions)
+    known = {**conditions, LATE: late}
+    possible = dict(actions)
     if commands:
-        found["command"] = Condition(
+        known["command"] = Condition(
             ("none", UNKNOWN, *commands),
             f"the newest command, of an operator or the level above; {UNKNOWN}: the level does not"
             " know its words",
         )
-        found["new"] = Condition(
+        known["new"] = Condition(
             YES_NO, f"whether no row has done '{TAKE}' since that command came"
         )
-        acts[TAKE] = Phrase(
+        possible[TAKE] = Phrase(
             (), "let the newest command be the one in force: the status answers it from now on"
         )
-    return Vocabulary(found, commands or {}, acts, *([plan] if plan is not None else []))
+    return Vocabulary(known, commands or {}, possible, plan)
+
+
+class WordCommand(NamedTuple):
+    """A command to the level, of an operator or of the level above."""
+
+    is_operators: bool
+    serial: int  # 0: none
+    words: str
+
+
+OPERATIONS: Commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: ()}
+"""An operator's commands to every level of this kind."""
 
 
 class StateTableExecutor(Executor):
     """Base of the levels: a class declares its `vocabulary`, and has `look`, and `do_<action>` for
     each action."""
 
-    commands = {
-        Operation.HOLD: (),
-        Operation.RESUME: (),
-        Operation.TABLE: (),
-        Operation.DO: (),
-    }
+    commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
     inputs = {
         "command": Input(WORD_COMMAND, "above.command", many=True, optional=True),
         "last_status": Input(TABLE_STATUS, "own.status"),
@@ -154,31 +163,25 @@ class StateTableExecutor(Executor):
         self.orders = Orders(self.commands)
         self.detail = ""  # why, from below: added to the reason of a row
         self.resting = True  # nothing moves on this level's behalf
-        self._words = ""  # command in force
-        self._taken: tuple[bool, int] = (False, 0)  # whether it is an operator's, and its serial
+        self._newest = WordCommand(False, 0, "")
+        self._taken = self._newest  # the one in force
         self._done = 0  # newest command of the level above that is done
-        self._newest: tuple[bool, int, str] = (
-            False,
-            0,
-            "",
-        )  # the newest command likewise, and its words
         self._kept = ""  # why this level, or the one above, is held; empty: it is not
-        self._recalled = (
-            0  # newest command of an operator that the last status before a restart had answered
-        )
+        # Newest command of an operator that the last status before a restart had answered.
+        self._recalled = 0
         self._started = False
 
     @classmethod
     def read(cls, path: Path, scene: SceneConfig) -> StateTable:
         """Return the table in a file. Raises `TableError` with every mistake in it."""
-        text = read_text(path, cls.vocabulary)
-        lexicon = None if text.plan is None else cls.lexicon(scene, text.plan)
-        found = flaws(text, cls.vocabulary, lexicon)
-        if text.plan is not None:
-            found += cls.plan_flaws(scene, text.plan)
+        table = read_table(path, cls.vocabulary)
+        lexicon = None if table.plan is None else cls.lexicon(scene, table.plan)
+        found = flaws(table, cls.vocabulary, lexicon)
+        if table.plan is not None:
+            found += cls.plan_flaws(scene, table.plan)
         if found:
             raise TableError(found)
-        return text.table()
+        return table
 
     @classmethod
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
@@ -212,25 +215,24 @@ class StateTableExecutor(Executor):
     ) -> Iterator[tuple[str, str]]:
         """Yield tables that do not know a command that another one does, and why: the one in force
         outlives a swap."""
-        known = {
-            name: [*phrases(cls.vocabulary.commands, cls.lexicon(scene, t.plan))]
-            for name, t in tables.items()
-        }
-        for name in tables:
+        known = {name: cls._known(scene, table) for name, table in tables.items()}
+        for name, mine in known.items():
             lacking = {
                 phrase: other
-                for other in tables
-                for phrase in known[other]
-                if phrase not in known[name]
+                for other, theirs in known.items()
+                for phrase in theirs
+                if phrase not in mine
             }
             for phrase, other in lacking.items():
                 yield (
                     name,
-                    (
-                        f"does not know '{phrase}', as '{other}' does; all tables of a level know"
-                        " the same commands"
-                    ),
+                    f"does not know '{phrase}', as '{other}' does; all tables of a level know the"
+                    " same commands",
                 )
+
+    @classmethod
+    def _known(cls, scene: SceneConfig, table: StateTable) -> Sequence[str]:
+        return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, table.plan)))
 
     @classmethod
     def wording(
@@ -240,8 +242,7 @@ class StateTableExecutor(Executor):
         tables = read_params(StateTableParams, params).tables
         if what is Operation.TABLE:
             return tuple(tables)
-        plan = cls.read(next(iter(tables.values())), scene).plan
-        return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, plan)))
+        return cls._known(scene, cls.read(next(iter(tables.values())), scene))
 
     def use(self, name: str) -> None:
         """Put a table in force. It goes on in the state of the same name; without one, in the state
@@ -262,19 +263,19 @@ class StateTableExecutor(Executor):
         self._since = tick if self._since is None else self._since
         values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
         if self.vocabulary.commands:
-            is_new = self._newest[:2] != self._taken and self._newest[1] > 0
-            words = self._newest[2] if is_new else self._words
-            values["command"] = words.partition(" ")[0] or "none"
+            # Without the words: of one command they differ only where an edited table knows others.
+            is_new = self._newest[:2] != self._taken[:2] and self._newest.serial > 0
+            command = self._newest if is_new else self._taken
+            values["command"] = command.words.partition(" ")[0] or "none"
             values["new"] = YES_NO[is_new]
         row = self.table.decide(self.state, values)
-        if row is not None:
-            for verb, *parameters in row.do:
-                getattr(self, f"do_{verb}")(*parameters)
-            if row.next not in (SAME, self.state):
-                self.state = row.next
-                self._since = tick
+        for verb, *parameters in row.do:
+            getattr(self, f"do_{verb}")(*parameters)
+        if row.next not in (SAME, self.state):
+            self.state = row.next
+            self._since = tick
         self.give(write, tick)
-        self._report(write, row, values)
+        self._report(write, row)
 
     @abstractmethod
     def look(self, read: Ports, tick: int) -> dict[str, str]:
@@ -285,13 +286,12 @@ class StateTableExecutor(Executor):
 
     def do_take(self) -> None:
         """Let the newest command be the one in force."""
-        is_operators, serial, self._words = self._newest
-        self._taken = is_operators, serial
+        self._taken = self._newest
 
     @property
     def words(self) -> list[str]:
         """The command in force, or the newest one if it was just taken, word by word."""
-        return self._words.split()
+        return self._taken.words.split()
 
     @property
     def holds(self) -> bool:
@@ -306,42 +306,48 @@ class StateTableExecutor(Executor):
         last = read.last_status.value
         write.status.copy_from(last)
         self.state = last.in_state
-        self.use(last.table if last.table in self.tables else self.table_name)
+        table = last.table if last.table in self.tables else self.table_name
+        self.use(table)
         self._recalled = last.order
-        self._words = last.words
         self._done = last.done
-        self._taken = (True, last.ordered) if last.ordered else (False, last.echo)
+        self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
     def _preprocess(self, read: Ports) -> None:
-        self.orders.take(read.operator, self._judge)
-        above: Reading | None = (
-            next(iter(read.command.values()), None) if "command" in self.inputs else None
-        )
-        ordered = self.orders.standing is Operation.DO
-        if not ordered and above is not None and above.value.id != self._done:
-            self._newest = False, above.value.id, self._understood(above.value)
-        elif not ordered:
-            self._newest = (*self._taken, self._words)
+        """Take up what the operator and the level above command."""
+        orders = self.orders
+        orders.take(read.operator, self._judge)
         self._kept = ""
-        if self.orders.standing is Operation.HOLD:
-            self._kept = self.orders.keeps(self.context.board)
-        elif above is not None and not ordered:
-            self._kept = (
-                ABOVE_LOST if above.is_lost else HELD_FROM_ABOVE if above.value.hold else ""
-            )
-        self._rests_on = self.orders.rests_on(above.value.operator if above is not None else 0)
+        self._rests_on = orders.rests_on(0)
+        above: Reading | None = None
+        if "command" in self.inputs:
+            above = next(iter(read.command.values()), None)
+        if above is not None:
+            self._hear(above)
+        elif orders.standing is not Operation.DO:
+            self._newest = self._taken
+        if orders.standing is Operation.HOLD:
+            self._kept = orders.keeps(self.context.board)
 
-    def _understood(self, command: Message) -> str:
-        """Return the words of a command from above; `UNKNOWN` if the level does not know them."""
-        serial, words = self._newest[1:]
-        if command.id == serial and not self._newest[0]:
-            return words
+    def _hear(self, above: Reading) -> None:
+        """Take up what the level above commands, unless an operator commands instead."""
+        command: Message = above.value
+        self._rests_on = self.orders.rests_on(command.operator)
+        if self.orders.standing is Operation.DO:
+            return
+        if command.id == self._done:
+            self._newest = self._taken
+        elif self._newest[:2] != (False, command.id):
+            words = UNKNOWN if self._objection(command.words) else command.words
+            self._newest = WordCommand(False, command.id, words)
+        if above.is_lost:
+            self._kept = ABOVE_LOST
+        elif command.hold:
+            self._kept = HELD_FROM_ABOVE
+
+    def _objection(self, words: str) -> str:
+        """Return why the level does not know a command; empty: it does."""
         lexicon = self.lexicon(self.context.scene, self.table.plan)
-        return (
-            UNKNOWN
-            if objection(command.words, self.vocabulary.commands, lexicon)
-            else command.words
-        )
+        return objection(words, self.vocabulary.commands, lexicon)
 
     def _judge(self, order: Message) -> None:
         """Take up an operator's command for this kind of level."""
@@ -351,56 +357,51 @@ class StateTableExecutor(Executor):
             elif order.id > self._recalled:
                 self.use(order.name)
         elif order.what == Operation.DO:
-            lexicon = self.lexicon(self.context.scene, self.table.plan)
-            if why := objection(order.name, self.vocabulary.commands, lexicon):
+            if why := self._objection(order.name):
                 self.orders.refuse(why)
             else:
-                self._newest = True, order.id, order.name
+                self._newest = WordCommand(True, order.id, order.name)
 
-    def _report(self, write: Ports, row: Row | None, values: Mapping[str, str]) -> None:
+    def _report(self, write: Ports, row: Row) -> None:
         """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""
         shown: Message = write.status
-        state, reason = (
-            (row.status, row.reason) if row is not None else (State.ERROR, self._no_row(values))
-        )
+        orders = self.orders
+        state = row.status
+        reason = row.reason
         if self._kept and state is State.EXECUTING:
             state = State.HOLDING
             reason = self._kept
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
-        if row is not None and row.next == SAME and state is State.ERROR and shown.state == state:
+        if row.next == SAME and state is State.ERROR and shown.state == state:
             reason = shown.reason  # the first one, from below too: the row only stays with it
-        is_operators, serial = self._taken
-        if state is State.DONE and not is_operators:
-            self._done = serial
+        is_operators, serial, words = self._taken
+        shown.ordered = 0
+        if is_operators:
+            shown.ordered = serial
+            shown.echo = 0 if orders.standing is Operation.DO else self._done
+        else:
+            shown.echo = serial
+            if state is State.DONE:
+                self._done = serial
         shown.state = state
         shown.error = Error.TABLE if state is State.ERROR else Error.NONE
         shown.reason = reason
-        shown.echo = (
-            serial
-            if not is_operators
-            else 0
-            if self.orders.standing is Operation.DO
-            else self._done
-        )
         shown.table = self.table_name
         shown.checksum = self.table.checksum
         shown.in_state = self.state
-        shown.row, shown.fired = (row.number, row.name) if row is not None else (0, "")
-        shown.words = self._words
-        shown.ordered = serial * is_operators
+        shown.row = row.number
+        shown.fired = row.name
+        shown.words = words
         shown.done = self._done
-        if is_operators and serial == self.orders.serial and state is State.ERROR:
-            self.orders.fail(reason)
-        elif self.resting if self.orders.standing is Operation.HOLD else state is State.DONE:
-            self.orders.done()
-        if "command" in write.__dict__:
+        is_done = self.resting if orders.standing is Operation.HOLD else state is State.DONE
+        if is_operators and serial == orders.serial and state is State.ERROR:
+            orders.fail(reason)
+        elif is_done:
+            orders.done()
+        if "command" in self.outputs:
             write.command.operator = self._rests_on
-        self.orders.report(shown, self._rests_on)
-
-    def _no_row(self, values: Mapping[str, str]) -> str:
-        case = ", ".join(f"{name} = {value}" for name, value in values.items())
-        return f"no row of '{self.state}' takes {case}"
+        orders.report(shown, self._rests_on)
 
 
 def answer_of(reading: Reading, serial: int) -> str:

@@ -14,7 +14,7 @@ from rack.backplane.message import Field, Message, command, status
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.level import Input, LevelContext, Output, Ports
-from rack.levels.operator import OPERATOR_COMMAND, Operation
+from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
@@ -22,6 +22,7 @@ from rack.levels.servo.curves import Curve, Passage, Ramp
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.state_table.level import (
     COMMAND_HEAD,
+    OPERATIONS,
     STATUS_HEAD,
     YES_NO,
     StateTableExecutor,
@@ -87,11 +88,7 @@ class PrimitiveTable(StateTableExecutor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
-    commands = {
-        what: goals
-        for what, goals in StateTableExecutor.commands.items()
-        if what is not Operation.DO
-    }
+    commands = OPERATIONS
     vocabulary = vocabulary(
         conditions={
             "hold": Condition(
@@ -133,10 +130,8 @@ class PrimitiveTable(StateTableExecutor):
         self._masses = cell.model.body_subtreemass[cell.bodies].copy()  # kg
         self._point = np.zeros((3, len(cell.home)))  # the newest set point: rad, rad/s, rad/s2
         self._point[0] = cell.home
-        self._goal, self._speed = (
-            cell.home.copy(),
-            1.0,
-        )  # rad, part of the limits: of the newest command
+        self._goal = cell.home.copy()  # (joints,), rad: of the newest command
+        self._speed = 1.0  # part of the limits: likewise
         self._end = cell.home.copy()  # (joints,), rad: where the newest motion ends
         self._curve: Curve | None = None  # None: at rest
         self._from = 0  # tick at which it began
@@ -145,7 +140,7 @@ class PrimitiveTable(StateTableExecutor):
         self._held = False
         self._object = -1
         self._target = -1  # row of the object that the newest command concerns
-        self._last_due = 0  # tick at which the set point before the next one is due
+        self._due = 0  # tick at which the set point of this cycle is due
         self._grips = 0  # cycles until the gripper's motion must show
 
     @classmethod
@@ -173,20 +168,21 @@ class PrimitiveTable(StateTableExecutor):
             self._speed = reading.value.speed
             self._target = reading.value.object
         position = self._follow(read)
-        due = self._due(tick)
-        if (
-            self._curve is not None
-            and (due - self._from) * self.context.tick_s >= self._curve.ends_s
-        ):
+        self._due = tick + LEAD_CYCLES * self.context.every
+        if self._curve is not None and self._passed_s >= self._curve.ends_s:
             self._point[0] = self._curve.table[curves.REST]
             self._point[1:] = 0.0
             self._curve = None
         away = np.abs(position - self._point[0]).max() > self.table.plan.settled
         self.resting = self._curve is None and not away
         there = np.abs(self._end - self._point[0]).max() <= self.table.plan.settled
-        arm = "moving" if not self.resting else "arrived" if there else "resting"
+        arm = "away"
+        if self._follows and not self.resting:
+            arm = "moving"
+        elif self._follows:
+            arm = "arrived" if there else "resting"
         return {
-            "arm": arm if self._follows else "away",
+            "arm": arm,
             "gripper": self._grip(read.arm.value),
             "hold": YES_NO[self.holds],
         }
@@ -198,9 +194,9 @@ class PrimitiveTable(StateTableExecutor):
         position: Array = statuses[0].position
         gone = any(reading.is_lost or not reading.is_there for reading in readings)
         stopped = gone or any(below.stopped for below in statuses)
-        self.detail = (
-            "its board is lost" if gone else next((s.reason for s in statuses if s.reason), "")
-        )
+        self.detail = next((below.reason for below in statuses if below.reason), "")
+        if gone:
+            self.detail = "its board is lost"
         idle = any(below.holding for below in statuses) and self._follows > HANDOVER_CYCLES
         if stopped or idle:
             self._follows = 0
@@ -229,7 +225,8 @@ class PrimitiveTable(StateTableExecutor):
     def do_begin(self) -> None:
         """Begin the motion to the joints of the command in force, from rest."""
         if self._curve is not None:
-            return self.do_halt()
+            self.do_halt()
+            return
         start = self._point[0]
         limits = self._limits
         goal = np.clip(self._goal, limits.position[:, 0], limits.position[:, 1])
@@ -237,18 +234,21 @@ class PrimitiveTable(StateTableExecutor):
         speed = min(max(self._speed, MIN_SPEED), 1.0)
         if np.abs(goal - start).max() > NOWHERE_RAD:
             self._start(Passage(start, goal, speed * limits.velocity, speed * limits.acceleration))
-        return None
 
     def do_halt(self) -> None:
         """Ramp to rest."""
         if self._curve is not None:
-            self._start(
-                Ramp(self._point[0].copy(), self._point[1].copy(), self._limits.acceleration)
-            )
+            self._start(Ramp(self._point[0], self._point[1], self._limits.acceleration))
 
     def _start(self, curve: Curve) -> None:
+        """Begin a curve where the set point before this cycle's ends."""
         self._curve = curve
-        self._from = self._last_due
+        self._from = self._due - self.context.every
+
+    @property
+    def _passed_s(self) -> float:
+        """Time since the curve began at which the set point of this cycle is due."""
+        return (self._due - self._from) * self.context.tick_s
 
     def do_open(self) -> None:
         """Open the gripper."""
@@ -262,30 +262,25 @@ class PrimitiveTable(StateTableExecutor):
         self._grips = GRIP_CYCLES
         self._object = self._target
 
-    def _due(self, tick: int) -> int:
-        """Return the tick at which the set point of the cycle released at `tick` is due."""
-        self._last_due = tick + (LEAD_CYCLES - 1) * self.context.every
-        return tick + LEAD_CYCLES * self.context.every
-
     def give(self, write: Ports, tick: int) -> None:
         """Write the set point, with inertia and load there, and what a restarted board needs."""
         command = write.command
         shown = write.status
-        due = self._due(tick)
         if self._curve is not None:
-            self._point[:] = self._curve.at((due - self._from) * self.context.tick_s).table
+            self._point[:] = self._curve.at(self._passed_s).table
         command.id = tick // self.context.every + 1
-        command.due = due if self._follows else 0
+        command.due = self._due if self._follows else 0
         command.position, command.velocity, command.acceleration = self._point
-        load = Payload(
-            self._masses[self._object] if self._held and self._object >= 0 else 0.0, np.zeros(3)
-        )
+        mass = 0.0
+        if self._held and self._object >= 0:
+            mass = self._masses[self._object]
+        load = Payload(mass, np.zeros(3))
         inertia, bias = self._dynamics.terms(self._point[0], self._point[1], load)
         command.inertia = np.diagonal(inertia)
         command.load = bias
         command.opening = self._gripper.closed if self._closed else self._gripper.open
         command.force = self._gripper.force
-        command.payload_mass = load.mass
+        command.payload_mass = mass
         shown.position = self._point[0]
         shown.end = self._end
         shown.moving = not self.resting

@@ -29,6 +29,7 @@ import tomllib
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,9 +51,9 @@ Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$
 
 def _listed(value: Any) -> Any:
     """Return one word as a list of one, and TOML's lists as tuples, which are frozen."""
-    return (
-        (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
-    )
+    if isinstance(value, str):
+        return (value,)
+    return tuple(value) if isinstance(value, list) else value
 
 
 Words = Annotated[tuple[str, ...], BeforeValidator(_listed)]
@@ -112,10 +113,8 @@ class Row:
 
     number: int
     name: str
-    when: Mapping[
-        str, frozenset[str]
-    ]  # values permitted, by condition; one left out may have any value
-    is_else: bool
+    # Values permitted, by condition; one left out may have any value.
+    when: Mapping[str, frozenset[str]]
     next: str
     do: tuple[tuple[str, ...], ...]  # actions: verb and parameters
     status: State
@@ -128,100 +127,87 @@ class Row:
 
 @dataclass(frozen=True)
 class StateTable:
-    """The rows of a file by state, each state's in their order; `plan` is the level's record of
-    `[plan]`."""
+    """A state table as read. `flaws` are the mistakes in the form of the file.
 
-    start: str
-    patience_s: float
-    rows: Mapping[str, tuple[Row, ...]]
-    plan: Any
-    checksum: int  # CRC-32 of the file
-
-    def decide(self, state: str, values: Mapping[str, str]) -> Row | None:
-        """Return the row that fires; None: no row takes the case, which cannot happen in a table
-        that was checked."""
-        for row in self.rows.get(state, ()):
-            if row.matches(values):
-                return row
-        return None
-
-
-@dataclass(frozen=True)
-class TableText:
-    """A state table as read, before its check. `flaws` are the mistakes in the form of the file.
-
-    `rows` holds the readable rows by number; rows with a mistake in their form are missing.
+    `configs` holds the readable rows by number; rows with a mistake in their form are missing.
     """
 
     start: str
     patience_s: float
-    rows: Mapping[int, RowConfig]
+    configs: Mapping[int, RowConfig]
     plan: Any  # the level's record of `[plan]`; None: it has mistakes
     checksum: int  # CRC-32 of the file
     flaws: tuple[str, ...]
 
-    def table(self) -> StateTable:
-        """Return the table, whose check has found nothing."""
-        found: dict[str, list[Row]] = {}
-        for number, config in self.rows.items():
+    @cached_property
+    def rows(self) -> Mapping[str, tuple[Row, ...]]:
+        """The rows by state, each state's in their order."""
+        rows: dict[str, tuple[Row, ...]] = {}
+        for number, config in self.configs.items():
+            # A row may lack these, until its check says so.
             row = Row(
                 number=number,
                 name=config.name,
                 when={condition: frozenset(values) for condition, values in config.when.items()},
-                is_else=config.otherwise,
                 next=config.next or SAME,
                 do=tuple(tuple(phrase.split()) for phrase in config.do or ()),
                 status=STATES.get(config.status or "", State.ERROR),
                 reason=config.reason or "",
             )
             for state in config.state:
-                found.setdefault(state, []).append(row)
-        rows = {state: tuple(rows) for state, rows in found.items()}
-        return StateTable(self.start, self.patience_s, rows, self.plan, self.checksum)
+                rows[state] = (*rows.get(state, ()), row)
+        return rows
+
+    def decide(self, state: str, values: Mapping[str, str]) -> Row:
+        """Return the row that fires; number 0, an error: no row takes the case, which cannot happen
+        in a table that was checked."""
+        for row in self.rows.get(state, ()):
+            if row.matches(values):
+                return row
+        case = ", ".join(f"{name} = {value}" for name, value in values.items())
+        reason = f"no row of '{state}' takes {case}"
+        return Row(0, "", {}, state, (), State.ERROR, reason)
 
 
-def read_text(path: Path, vocabulary: Vocabulary) -> TableText:
+def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:
     """Return the table in a file, unchecked. Raises `TableError` when it cannot be read at all."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise TableError([f"{path.stat().st_size} bytes; permitted: {MAX_FILE_BYTES}"])
         data = path.read_bytes()
-        config = TableConfig(**tomllib.loads(data.decode()))
+        config = TableConfig.model_validate(tomllib.loads(data.decode()))
     except OSError as error:
         raise TableError([f"cannot be read: {error.strerror}"]) from error
     except ValidationError as error:
         raise TableError(_flaws(error, "", TableConfig)) from error
-    except (ValueError, TypeError, RecursionError) as error:  # ValueError: TOML, UTF-8
+    except (ValueError, RecursionError) as error:  # ValueError: TOML, UTF-8
         raise TableError([f"not TOML: {error}"]) from error
-    rows = {}
+    configs = {}
     flaws = list[str]()
     plan = None
     for number, row in enumerate(config.row, 1):
         try:
-            rows[number] = RowConfig(**row)
-        except (ValidationError, TypeError) as error:
+            configs[number] = RowConfig.model_validate(row)
+        except ValidationError as error:
             flaws += _flaws(error, f"row {number}: ", RowConfig)
     try:
-        plan = vocabulary.plan(**config.plan)
-    except (ValidationError, TypeError) as error:
+        plan = vocabulary.plan.model_validate(config.plan)
+    except ValidationError as error:
         flaws += _flaws(error, "plan: ", vocabulary.plan)
-    return TableText(config.start, config.patience, rows, plan, zlib.crc32(data), tuple(flaws))
+    return StateTable(config.start, config.patience, configs, plan, zlib.crc32(data), tuple(flaws))
 
 
-def _flaws(error: ValidationError | TypeError, place: str, kind: type[Table]) -> list[str]:
+def _flaws(error: ValidationError, place: str, kind: type[Table]) -> list[str]:
     """Return what is wrong with one table of a file, a line each."""
-    if isinstance(error, TypeError):
-        return [f"{place}{error}"]
     known = ", ".join(field.alias or key for key, field in kind.model_fields.items())
     lines = []
     for entry in error.errors(include_url=False):
         key = ".".join(str(part) for part in entry["loc"])
-        why = {"missing": "missing", "extra_forbidden": f"unknown key; known: {known}"}.get(
-            entry["type"]
-        )
-        lines.append(f"{place}{key}: {why or _wrong(entry['msg'], entry['input'])}")
+        message = entry["msg"]
+        why = f"{str(entry['input'])[:40]!r}: {message[0].lower()}{message[1:]}"
+        if entry["type"] == "missing":
+            why = "missing"
+        elif entry["type"] == "extra_forbidden":
+            why = f"unknown key; known: {known}"
+        lines.append(f"{place}{key}: {why}")
     return lines
-
-
-def _wrong(message: str, value: Any) -> str:
-    return f"{str(value)[:40]!r}: {message[0].lower()}{message[1:]}"

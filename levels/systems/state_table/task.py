@@ -8,12 +8,13 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Field, status
+from rack.backplane.message import Field, Message, status
 from rack.levels.level import Input, LevelContext, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Operation
 from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
 from rack.levels.systems.state_table.level import (
     BELOW,
+    OPERATIONS,
     STATUS_HEAD,
     WORD_COMMAND,
     StateTableExecutor,
@@ -63,7 +64,7 @@ class TaskTable(StateTableExecutor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": WORD_COMMAND, "status": TASK_TABLE_STATUS}
-    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: ()}
+    commands = OPERATIONS
     vocabulary = vocabulary(
         conditions={
             "below": BELOW,
@@ -81,19 +82,18 @@ class TaskTable(StateTableExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._step = self._sent = self._answered = 0
-        self._command = ""
+        self._step = 0  # steps done
+        self._command = Message(WORD_COMMAND.dtype({}))  # the newest command sent down
 
     @classmethod
     def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
         """Return steps with unknown objects."""
         known = ", ".join(scene.objects) or "none"
-        steps = [
-            (at, step.object)
+        return [
+            f"plan.step[{at}].object: unknown '{step.object}'; objects: {known}"
             for at, step in enumerate(plan.step)
             if step.object not in scene.objects
         ]
-        return [f"plan.step[{at}].object: unknown '{name}'; objects: {known}" for at, name in steps]
 
     @classmethod
     def misfits(
@@ -102,10 +102,12 @@ class TaskTable(StateTableExecutor):
         """Yield every mistake in every table, and steps that the level below does not know."""
         found = [*super().misfits(context, above, below)]
         yield from found
-        others = [other for other in below if not found and not [*MoveTable.misfits(other, (), ())]]
-        for other in others:
+        tables = read_params(StateTableParams, context.params).tables
+        for other in below:
+            if found or [*MoveTable.misfits(other, (), ())]:
+                continue
             known = MoveTable.wording(Operation.DO, other.params, context.scene)
-            for name, path in read_params(StateTableParams, context.params).tables.items():
+            for name, path in tables.items():
                 for at, step in enumerate(cls.read(path, context.scene).plan.step):
                     if f"place {step.place}" not in known:
                         why = (
@@ -118,32 +120,27 @@ class TaskTable(StateTableExecutor):
         """Continue with the step under way."""
         super().recall(read, write)
         if read.last_status.is_there and read.last_command.is_there:
-            last = read.last_status.value
-            self._step = last.action
-            self._sent = last.sent
-            self._answered = last.moves_done
-            write.command.copy_from(read.last_command.value)
-            self._command = read.last_command.value.words
+            self._step = read.last_status.value.action
+            self._command.copy_from(read.last_command.value)
+            self._command.id = read.last_status.value.sent
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
         """Return where the level below is, and whether a step is left."""
-        below = answer_of(read.status, self._sent)
         self.detail = read.status.value.reason
         self.resting = bool(read.status.value.resting)
+        is_left = self._step < len(self.table.plan.step)
         return {
-            "below": below,
-            "step": "more" if self._step < len(self.table.plan.step) else "none",
+            "below": answer_of(read.status, self._command.id),
+            "step": ("none", "more")[is_left],
         }
 
     def do_send(self, what: str) -> None:
         """Command the level below."""
-        self._sent += 1
         steps = self.table.plan.step
-        if what == "home":
-            self._command = what
-        else:
-            step = steps[min(self._step, len(steps) - 1)]
-            self._command = f"{what} {step.object if what == 'pick' else step.place}"
+        step = steps[min(self._step, len(steps) - 1)]
+        words = {"pick": f"pick {step.object}", "place": f"place {step.place}", "home": "home"}
+        self._command.id += 1
+        self._command.words = words[what]
 
     def do_next(self) -> None:
         """Go on to the next step."""
@@ -151,14 +148,12 @@ class TaskTable(StateTableExecutor):
 
     def give(self, write: Ports, tick: int) -> None:
         """Write the command, and the progress."""
-        command = write.command
+        self._command.hold = self.holds
+        write.command.copy_from(self._command)
         shown = write.status
-        command.id = self._sent
-        command.words = self._command
-        command.hold = self.holds
         steps = len(self.table.plan.step)
         shown.action = min(self._step, steps)
         shown.actions = steps
-        shown.sent = self._sent
+        shown.sent = self._command.id
         shown.moves = steps * COMMANDS_A_STEP
-        shown.moves_done = min(self._step, steps) * COMMANDS_A_STEP
+        shown.moves_done = shown.action * COMMANDS_A_STEP

@@ -72,7 +72,7 @@ def objection(phrase: str, verbs: Mapping[str, Phrase], lexicon: Lexicon) -> str
     """Return why `phrase` is none of the commands or actions; empty: it is one."""
     if len(phrase) > PHRASE_BYTES:
         return f"'{phrase}' has {len(phrase)} characters; permitted: {PHRASE_BYTES}"
-    word, *given = phrase.split()[:PHRASE_BYTES] or [""]
+    word, *given = phrase.split() or [""]
     if word not in verbs:
         return f"unknown '{word}'; known: {', '.join(verbs) or 'none'}"
     wanted = verbs[word].parameters

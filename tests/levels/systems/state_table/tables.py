@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.level import vocabulary
-from rack.levels.systems.state_table.table import StateTable, read_text
+from rack.levels.systems.state_table.table import StateTable, read_table
 from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 from rack.levels.tables import Positive, Table
 
@@ -88,12 +88,12 @@ LEXICON = {"colour": ("red", "green")}
 
 def found(folder: Path, text: str) -> list[str]:
     """Return the mistakes in the text of a table."""
-    return flaws(read_text(written(folder, text), DOORS), DOORS, LEXICON)
+    return flaws(read_table(written(folder, text), DOORS), DOORS, LEXICON)
 
 
 def table(folder: Path, text: str = DOOR) -> StateTable:
     """Return the table in a text, unchecked."""
-    return read_text(written(folder, text), DOORS).table()
+    return read_table(written(folder, text), DOORS)
 
 
 def written(folder: Path, text: str) -> Path:

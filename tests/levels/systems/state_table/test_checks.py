@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rack.backplane.message import State
 from rack.levels.systems.state_table.checks import flaws, without
-from rack.levels.systems.state_table.table import RowConfig, TableError, TableText, read_text
+from rack.levels.systems.state_table.table import RowConfig, StateTable, TableError, read_table
 from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, table, written
 
 MISTAKES = {
@@ -163,12 +164,12 @@ def test_all_mistakes_of_a_table_are_reported_together(tmp_path: Path) -> None:
 )
 def test_a_file_that_is_no_table_is_one_error(tmp_path: Path, text: str) -> None:
     with pytest.raises(TableError):
-        read_text(written(tmp_path, text), DOORS)
+        read_table(written(tmp_path, text), DOORS)
 
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(TableError, match="cannot be read: No such file"):
-        read_text(tmp_path / "none.toml", DOORS)
+        read_table(tmp_path / "none.toml", DOORS)
 
 
 def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
@@ -183,13 +184,15 @@ def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
             ("moving", {}),
         ]
     ]
-    assert [row.name for row in names if row is not None] == [
+    assert [row.name for row in names] == [
         "open it",
         "stay shut",
         "locked",
         "arrived",
     ]
-    assert door.decide("nowhere", case) is None
+    none = door.decide("nowhere", case)
+    assert (none.number, none.name, none.status) == (0, "", State.ERROR)
+    assert none.reason.startswith("no row of 'nowhere' takes command = open, new = yes")
 
 
 NAMES = tuple(DOORS.conditions)
@@ -223,9 +226,8 @@ def test_a_table_passes_exactly_if_one_row_fires_in_every_case(
     rows: list[tuple[dict[str, set[str]], bool]],
 ) -> None:
     configs = {number: row_config(number, *row) for number, row in enumerate(rows, 1)}
-    text = TableText("on", 1.0, configs, DOORS.plan(), 0, ())
-    complaints = flaws(text, DOORS, LEXICON)
-    table = text.table()
+    table = StateTable("on", 1.0, configs, DOORS.plan(), 0, ())
+    complaints = flaws(table, DOORS, LEXICON)
     cases = [
         dict(zip(NAMES, values, strict=True))
         for values in product(*(DOORS.conditions[name].values for name in NAMES))
@@ -233,10 +235,10 @@ def test_a_table_passes_exactly_if_one_row_fires_in_every_case(
     fires = [[row for row in table.rows["on"] if row.matches(case)] for case in cases]
     assert any("hole" in line for line in complaints) == any(not rows for rows in fires)
     assert any("overlaps" in line for line in complaints) == any(
-        not row.is_else for rows in fires for row in rows[1:]
+        not configs[row.number].otherwise for rows in fires for row in rows[1:]
     )
     if not complaints:
-        assert all(table.decide("on", case) is not None for case in cases)
+        assert all(table.decide("on", case).number for case in cases)
 
 
 BOXES = st.fixed_dictionaries(

@@ -19,6 +19,7 @@ from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.run.control_loop import VirtualControlLoop
 from rack.levels.level import Executor
 from rack.levels.systems.state_table.elemental_move import STILL_M_S, MoveTable
+from rack.levels.systems.state_table.level import WordCommand
 
 LEVEL = "elemental_move"
 LAST = {"words": "pick block1", "in_state": "reaching", "sent": 7, "reached": 1, "put": -1}
@@ -49,6 +50,7 @@ class Bench:
         assert isinstance(level, MoveTable)
         task.inputs.read(50)
         level.recall(task.inputs.values, task.outputs.messages)
+        level.give(task.outputs.messages, 50)
         return level, task.outputs.messages.command
 
 
@@ -77,16 +79,11 @@ def test_it_goes_on_with_the_command_that_it_sent_down_last(bench: Bench) -> Non
     )
     level, command = bench.restarted()
     assert (level.state, level.words) == ("reaching", ["pick", "block1"])
-    assert (level._sent, level._reached, level._speed, level._row, level._yaw) == (
-        7,
-        True,
-        0.5,
-        1,
-        0.25,
-    )
-    np.testing.assert_array_equal(level._joints, joints)
-    np.testing.assert_array_equal(level._aim, (1.0, 2.0, 3.0))
-    assert (command.words, command.object) == ("pose above", 1)
+    assert level._reached
+    assert (command.id, command.words, command.object) == (7, "pose above", 1)
+    assert (command.speed, command.yaw) == (0.5, 0.25)
+    np.testing.assert_array_equal(command.joints, joints)
+    np.testing.assert_array_equal(command.aim, (1.0, 2.0, 3.0))
 
 
 def test_without_a_command_of_its_own_it_starts_where_the_arm_is(bench: Bench) -> None:
@@ -95,15 +92,15 @@ def test_without_a_command_of_its_own_it_starts_where_the_arm_is(bench: Bench) -
     home = level._cell.home
     # It knows its own state, and nothing of a command: no joints are taken from a mailbox that is
     # still empty.
-    assert (level.state, level._sent, level._reached, level._speed) == ("reaching", 0, True, 1.0)
-    np.testing.assert_array_equal(level._joints, home)
-    assert (level._row, command.words) == (-1, "")
+    assert (level.state, level._reached) == ("reaching", True)
+    assert (command.id, command.words, command.speed, command.object) == (0, "", 1.0, -1)
+    np.testing.assert_array_equal(command.joints, home)
 
 
 def test_a_board_that_starts_for_the_first_time_recalls_nothing(bench: Bench) -> None:
     level, command = bench.restarted()
-    assert (level.state, level._sent, level.words, command.words) == ("idle", 0, [], "")
-    np.testing.assert_array_equal(level._joints, level._cell.home)
+    assert (level.state, level.words, command.id, command.words) == ("idle", [], 0, "")
+    np.testing.assert_array_equal(command.joints, level._cell.home)
 
 
 def test_it_recalls_its_last_messages_in_its_first_cycle_only(
@@ -163,8 +160,8 @@ def test_it_sees_the_world_once_it_is_sensed(arm: Arm) -> None:
 
 def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
     assert arm.look()["target"] == "there"
-    arm.level._row = 0
-    arm.level._aim[:] = arm.place
+    arm.level._command.object = 0
+    arm.level._command.aim = arm.place
     moved = arm.level.table.plan.moved
     for offset, speed, seen in (
         (0.0, 0.0, "there"),
@@ -183,7 +180,7 @@ def test_what_was_put_down_is_its_support_until_it_is_elsewhere(arm: Arm) -> Non
     assert arm.look()["gripper"] == "holds"
     arm.level.do_open()
     arm.below.held = 0
-    arm.level._aim[:] = arm.place
+    arm.level._command.aim = arm.place
     found = arm.look()
     assert (found["gripper"], found["support"]) == ("free", "there")
     arm.world.position[0] = arm.place + 1.0
@@ -214,7 +211,7 @@ def test_gripper_and_home_are_commands_of_their_own(arm: Arm) -> None:
 def test_a_pose_over_an_object_is_above_where_it_rests(arm: Arm) -> None:
     arm.look()
     name = arm.level.context.scene.objects[0]
-    arm.level._words = f"pick {name}"
+    arm.level._taken = WordCommand(False, 1, f"pick {name}")
     pose, taught = next(iter(arm.level.table.plan.pose.items()))
     arm.level.do_move(pose)
     arm.level.give(arm.messages, 50)
@@ -229,12 +226,13 @@ def test_a_pose_over_an_object_is_above_where_it_rests(arm: Arm) -> None:
     arm.world.position[0] = arm.place + np.array([0.0, 0.0, 0.05])
     arm.look()
     arm.level.do_move(pose)
-    np.testing.assert_array_equal(arm.level._aim, arm.place)
+    np.testing.assert_array_equal(arm.level._command.aim, arm.place)
 
 
 def test_a_pose_out_of_reach_sends_nothing(arm: Arm) -> None:
     arm.world.position[0] = (9.0, 0.0, 0.0)
     arm.look()
-    arm.level._words = f"pick {arm.level.context.scene.objects[0]}"
+    name = arm.level.context.scene.objects[0]
+    arm.level._taken = WordCommand(False, 1, f"pick {name}")
     arm.level.do_move(next(iter(arm.level.table.plan.pose)))
-    assert (arm.level._sent, arm.look()["reach"]) == (0, "no")
+    assert (arm.level._command.id, arm.look()["reach"]) == (0, "no")

@@ -361,13 +361,13 @@ def test_a_set_point_is_due_two_cycles_after_its_release_and_carries_the_load_th
 ) -> None:
     level = bench.level
     every = level.context.every
-    assert level._due(10 * every) == 12 * every
-    # A new curve begins where the set point before ends.
-    assert level._last_due == 11 * every
     bench.follow()
     bench.command(bench.home + 0.3)
     bench.look()
+    assert level._due == bench.tick + 2 * every
     level.do_begin()
+    # A new curve begins where the set point before ends.
+    assert level._from == bench.tick + every
     for _ in range(12):
         bench.follow()
     command = bench.write.command
