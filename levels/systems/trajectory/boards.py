@@ -38,11 +38,10 @@ class JointBoards:
         for board, reading in statuses.items():
             heard = reading.is_new and not reading.is_lost
             self._silent[board] = 0 if heard else self._silent.get(board, 0) + 1
-        why = self._kept(statuses)
-        if why:
-            self.in_step = False
-            self.awaited = f"waiting for {why}"
-        if self.in_step or why or not self._hold(statuses):
+        if why := self._kept(statuses):
+            self.leave(f"waiting for {why}")
+            return False
+        if self.in_step or not self._hold(statuses):
             return False
         self.in_step = True
         self._cycles = 0

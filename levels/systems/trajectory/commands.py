@@ -31,7 +31,7 @@ from rack.levels.systems.trajectory.messages import (
     MotionKind,
     RequestEnd,
 )
-from rack.levels.tables import RobotConfig, SceneConfig, Table, read_params
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, Table, read_params
 
 DOWN = (0.0, 1.0, 0.0, 0.0)
 """Orientation of a tool that points straight down, w, x, y, z."""
@@ -68,9 +68,8 @@ class Motions:
         # No request of a former process has a greater number than it has sent messages.
         self._newest = bus.sent("requests")
         self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
-        self._idle_since: float | None = (
-            None  # time since when nothing is under way, though requests are open
-        )
+        # Time since when nothing is under way, though requests are open.
+        self._idle_since: float | None = None
         if self._newest:
             self.cancel()
 
@@ -98,10 +97,14 @@ class Motions:
             raise LevelError(
                 f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}"
             )
-        row = self._bodies.index(body) if body else WORLD
-        pose = {"position": position, "quaternion": quaternion}
         return self._request(
-            kind=MotionKind.POSE, body=row, live=live, touch=guard, **pose, **times
+            kind=MotionKind.POSE,
+            position=position,
+            quaternion=quaternion,
+            body=self._bodies.index(body) if body else WORLD,
+            live=live,
+            touch=guard,
+            **times,
         )
 
     def stay(self, seconds: float) -> int:
@@ -110,18 +113,22 @@ class Motions:
 
     def grip(self, opening: float | None = None, force: float | None = None) -> int:
         """Bring the gripper to an opening, m, with at most `force`, N; default: close it."""
-        gripper = self._robot.gripper
-        if gripper is None:
-            raise LevelError("grip: the arm has no gripper")
-        wanted = gripper.closed if opening is None else opening
+        gripper = self._gripper
         return self._request(
-            kind=MotionKind.GRIP, opening=wanted, force=gripper.force if force is None else force
+            kind=MotionKind.GRIP,
+            opening=gripper.closed if opening is None else opening,
+            force=gripper.force if force is None else force,
         )
 
     def release(self) -> int:
         """Open the gripper."""
-        gripper = self._robot.gripper
-        return self.grip(None if gripper is None else gripper.open)
+        return self.grip(self._gripper.open)
+
+    @property
+    def _gripper(self) -> GripperConfig:
+        if self._robot.gripper is None:
+            raise LevelError("grip: the arm has no gripper")
+        return self._robot.gripper
 
     def cancel(self) -> int:
         """End the motion under way and drop all others; the arm ramps to rest."""
@@ -135,9 +142,8 @@ class Motions:
 
     def done(self, request: int | None = None) -> bool:
         """Return whether a request, by default the newest, has ended."""
-        return bool(
-            self._bus.read("motion").value.done >= (self._newest if request is None else request)
-        )
+        number = self._newest if request is None else request
+        return bool(self._bus.read("motion").value.done >= number)
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
         """Wait until a request, by default the newest, has ended; False if `until` holds before, or
@@ -201,12 +207,11 @@ class CommandEnvironment(HostProgram):
 
     def run(self, bus: Bus) -> None:
         """Run the script; raises `LevelError` if there is no such file."""
-        found = next(
-            (path for folder in sys.path if (path := Path(folder) / self._script).is_file()), None
-        )
-        if found is None:
+        paths = [Path(folder) / self._script for folder in sys.path]
+        script = next(filter(Path.is_file, paths), None)
+        if script is None:
             raise LevelError(f"params.script = {self._script}: not in a folder of python_path")
-        runpy.run_path(str(found), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
+        runpy.run_path(str(script), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the calls, by name."""

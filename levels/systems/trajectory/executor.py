@@ -72,8 +72,7 @@ class TrajectoryExecutor(Executor):
         self._sight = WorldSight(context.scene.bodies, params.blind, context.tick_s)
         tools = MotionTools(self._ik, cell.limits, self._sight, params, context.period_s)
         self._agenda = Agenda()
-        self._motion = SampledMotion(cell.limits, robot.joints, context.period_s)
-        self._motion.rest_at(cell.home)
+        self._motion = SampledMotion(cell.limits, robot.joints, context.period_s, cell.home)
         self._work = self.work(self._agenda, self._motion, tools)
         self._boards = JointBoards(robot.joints)
         self._guard = TouchGuard(context.period_s)
@@ -113,9 +112,8 @@ class TrajectoryExecutor(Executor):
         # boards hold.
         for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
             if self._boards.in_step:
-                self._work.step(
-                    (self._due(tick) - late * self.context.every) * self.context.tick_s, hold
-                )
+                due = self._due(tick) - late * self.context.every
+                self._work.step(due * self.context.tick_s, hold)
         self._write_reference(write.command, tick)
         self._write_status(write.status)
         self._save(write.state)
@@ -125,8 +123,9 @@ class TrajectoryExecutor(Executor):
         if read.last_state.is_there and read.last_status.is_there:
             self._agenda.recall(read.last_state.value, read.last_status.value)
             self._work.recall(read.last_state.value.passed, read.last_status.value.progress)
-        if read.last_command.is_there and read.last_command.value.id:
-            self._work.grip = read.last_command.value.opening, read.last_command.value.force
+        command = read.last_command.value
+        if read.last_command.is_there and command.id:
+            self._work.grip = command.opening, command.force
 
     def _follow_boards(self, read: Ports) -> None:
         """Fall out of step with the boards below, or begin anew from where they hold the arm."""
@@ -152,16 +151,14 @@ class TrajectoryExecutor(Executor):
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_reference(self, command: Message, tick: int) -> None:
-        position, velocity, acceleration = self._motion.state
+        state = self._motion.state
         command.id = tick // self.context.every + 1
         # Out of step the arm's position is not certain: no set point is better than a wrong one.
         command.due = self._due(tick) if self._boards.in_step else 0
-        command.position[:] = position
-        command.velocity[:] = velocity
-        command.acceleration[:] = acceleration
-        terms = self._dynamics.terms(position, velocity)
-        command.inertia[:] = terms.inertia.diagonal()
-        command.load[:] = terms.bias
+        command.position, command.velocity, command.acceleration = state
+        terms = self._dynamics.terms(state.position, state.velocity)
+        command.inertia = terms.inertia.diagonal()
+        command.load = terms.bias
         command.opening, command.force = self._work.grip
         command.operator = self._orders.rests_on(self._agenda.rests_on)
 
@@ -182,15 +179,14 @@ class TrajectoryExecutor(Executor):
         status.reason = agenda.reason or reason
         status.progress = self._work.progress
         status.resting = motion.resting
-        position, velocity, _ = motion.state
-        status.position[:] = position
-        status.velocity[:] = velocity
-        tool = self._ik.tool_at(position)
-        status.tool[:] = tool.position
-        reached = goal is not None and goal.live and motion.leg is not None and motion.settled
-        status.astray = (
-            goal.astray(tool.position, motion.time_s) if goal is not None and reached else 0.0
-        )
+        state = motion.state
+        status.position = state.position
+        status.velocity = state.velocity
+        tool = self._ik.tool_at(state.position).position
+        status.tool = tool
+        status.astray = 0.0
+        if goal is not None and goal.live and motion.leg is not None and motion.settled:
+            status.astray = goal.astray(tool, motion.time_s)
         if motion.resting:
             self._orders.done()
         self._orders.report(status, agenda.rests_on)
@@ -205,21 +201,15 @@ class TrajectoryExecutor(Executor):
                 f"request {self._agenda.taken + 1} is missing: send all again from there, or a"
                 " cancel"
             )
-        return (
-            ""
-            if self._sight.knows or self._agenda.current is not None
-            else "waiting for the world model"
-        )
+        if not self._sight.knows and self._agenda.current is None:
+            return "waiting for the world model"
+        return ""
 
     def _save(self, state: Message) -> None:
         agenda = self._agenda
         state.passed = self._work.passed_s
-        newest = (
-            agenda.taken,
-            agenda.done,
-            agenda.begun,
-            agenda.goal.id if agenda.goal is not None else 0,
-        )
+        goal = 0 if agenda.goal is None else agenda.goal.id
+        newest = (agenda.taken, agenda.done, agenda.begun, goal)
         if newest != self._saved:
             self._saved = newest
             agenda.save(state)

@@ -15,7 +15,11 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Reading
 from rack.levels.planning.pose import Pose, pose
-from rack.levels.systems.trajectory.legs import Unfit
+from rack.levels.systems.trajectory.requests import MotionRequest
+
+
+class Unfit(Exception):
+    """A motion that the arm cannot make; its text says why."""
 
 
 class WorldSight:
@@ -62,22 +66,18 @@ class WorldSight:
 class ToolGoal:
     """The goal of one request."""
 
-    def __init__(
-        self, goal: Pose, body: int, live: bool, sight: WorldSight, follow_s: float
-    ) -> None:
-        """Follow a live goal with the time constant `follow_s`; `goal` is in the frame of `body`,
-        -1: the world."""
-        self._goal = goal
-        self._body = body
-        self.live = live and body >= 0
+    def __init__(self, request: MotionRequest, sight: WorldSight, follow_s: float) -> None:
+        """Follow a live goal with the time constant `follow_s`."""
+        self._goal = request.goal  # in the frame of the body
+        self._body = request.body  # row in the world model; -1: the world
+        self.live = request.live and request.body >= 0
         self._sight = sight
         self._follow_s = follow_s
         self._stamp_s = -1.0  # of the sample for which `pose` was evaluated
         self._frame: Pose | None = None
         self._velocity = np.zeros(3)
         self._turning = np.zeros(3)
-        self._pose = goal
-        self.evaluations = 0
+        self.pose = request.goal  # of the tool, for that sample
 
     def update(self, time_s: float) -> None:
         """Evaluate the goal for the sample at `time_s`; again for the same one does nothing. Raises
@@ -85,29 +85,23 @@ class ToolGoal:
         if self._body < 0 or time_s == self._stamp_s or (self._frame is not None and not self.live):
             return
         seen, velocity = self._sight.frame(self._body, time_s)
-        self.evaluations += 1
         if self._frame is None:
             self._frame = seen
             self._velocity = velocity
         else:
-            self._follow(seen, velocity, time_s - self._stamp_s)
+            self._frame = self._followed(self._frame, seen, velocity, time_s - self._stamp_s)
         self._stamp_s = time_s
-        self._pose = self._frame @ self._goal
-
-    def pose(self) -> Pose:
-        """Return the goal of the tool for that sample."""
-        return self._pose
+        self.pose = self._frame @ self._goal
 
     def astray(self, position: Array, time_s: float) -> float:
         """Return the distance, m, of a tool position at `time_s` from the goal on the body,
         unsmoothed."""
         return norm((self._sight.frame(self._body, time_s)[0] @ self._goal).position - position)
 
-    def _follow(self, seen: Pose, velocity: Array, passed_s: float) -> None:
-        """Go after the body, critically damped; its turning is followed with a lag."""
-        frame = self._frame
+    def _followed(self, frame: Pose, seen: Pose, velocity: Array, passed_s: float) -> Pose:
+        """Return the frame that goes after the body, critically damped; its turning is followed
+        with a lag."""
         pace = 1.0 / self._follow_s
-        assert frame is not None
         turn = np.zeros(3)
         quaternion = frame.quaternion.copy()
         mujoco.mju_subQuat(turn, seen.quaternion, quaternion)
@@ -118,4 +112,4 @@ class ToolGoal:
         )
         self._turning = self._turning + passed_s * pace * (pace * turn - 2.0 * self._turning)
         mujoco.mju_quatIntegrate(quaternion, self._turning, passed_s)
-        self._frame = pose(frame.position + passed_s * self._velocity, quaternion)
+        return pose(frame.position + passed_s * self._velocity, quaternion)

@@ -9,9 +9,8 @@ one motion with matched position, velocity and acceleration.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import ceil
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from rack.levels.algebra import Array, norm
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.limits import Limits
+from rack.levels.systems.trajectory.goal import ToolGoal, Unfit
 
 BLEND_PART = 0.5
 """Part of the acceleration limits that one leg takes: two blended ones take all."""
@@ -33,10 +33,6 @@ SAMPLED = 1.15
 may be greater."""
 
 
-class Unfit(Exception):
-    """A motion that the arm cannot make; its text says why."""
-
-
 class Times(NamedTuple):
     """Times that a request wants, s."""
 
@@ -47,9 +43,10 @@ class Times(NamedTuple):
 class TimeLaw:
     """The part of the way done, 0 to 1, by the time since the begin."""
 
-    def __init__(self, segment_s: float, half_blend_s: float) -> None:
+    def __init__(self, segment_s: float, half_blend_s: float, least_s: float = 0.0) -> None:
         self.segment_s = segment_s
         self.half_blend_s = half_blend_s
+        self.least_s = least_s  # least half blend time in which it may slow down
         self.leaving_s = half_blend_s  # half the time in which the speed falls at the end
 
     @property
@@ -72,13 +69,14 @@ class TimeLaw:
         """Return the part done after `time_s`."""
         if time_s <= 0.0:
             return 0.0
-        a = self.half_blend_s
         left = self.ends_s - time_s
         if left <= 0.0:
             return 1.0
         if left < 2.0 * self.leaving_s:
             return 1.0 - _ramp(left, self.leaving_s) / self.segment_s
-        return (_ramp(time_s, a) if time_s < 2.0 * a else time_s - a) / self.segment_s
+        half_s = self.half_blend_s
+        way = _ramp(time_s, half_s) if time_s < 2.0 * half_s else time_s - half_s
+        return way / self.segment_s
 
 
 def _ramp(time_s: float, half_s: float) -> float:
@@ -87,26 +85,15 @@ def _ramp(time_s: float, half_s: float) -> float:
     return 2.0 * half_s * h * h * h * (1.0 - 0.5 * h)
 
 
-class Leg(Protocol):
-    """One motion."""
-
-    law: TimeLaw
-    least_s: float  # least half blend time in which the leg may slow down
-    live: bool  # the goal moves
-
-    def at(self, time_s: float) -> Array:
-        """Return joint positions (joints,), rad, `time_s` after the begin. Raises `Unfit`."""
-
-
 class JointLeg:
     """A straight line in joint space."""
 
-    live = False
+    live = False  # the goal does not move
 
     def __init__(self, start: Array, goal: Array, times: Times, limits: Limits) -> None:
         self._start = start.copy()
         self._way = goal - start
-        self.law, self.least_s = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
+        self.law = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
 
     def at(self, time_s: float) -> Array:
         """Return joint positions (joints,), rad, `time_s` after the begin."""
@@ -116,31 +103,30 @@ class JointLeg:
 class ToolLeg:
     """A straight line of the tool that turns at a constant rate, to a goal that may move.
 
-    The goal is asked for its pose once for every sample. Inverse kinematics stays on the branch of
-    the start.
+    Inverse kinematics stays on the branch of the start.
     """
 
     def __init__(
         self,
         start: Array,
-        goal: Callable[[], Pose],
-        live: bool,
+        goal: ToolGoal,
         times: Times,
-        solver: tuple[InverseKinematics, Limits],
+        ik: InverseKinematics,
+        limits: Limits,
     ) -> None:
         """Prepare the way from the joint positions `start`. Raises `Unfit`."""
-        self._ik, limits = solver
-        self._from = self._ik.tool_at(start)
+        self._ik = ik
+        self._from = ik.tool_at(start)
         self._goal = goal
-        self.live = live
+        self.live = goal.live
         self._last = start.copy()
-        speed, bend = self._try_out(start, goal())
-        self.law, self.least_s = timed(times, speed, bend, limits)
+        speed, bend = self._try_out(start, goal.pose)
+        self.law = timed(times, speed, bend, limits)
 
     def at(self, time_s: float) -> Array:
         """Return joint positions (joints,), rad, `time_s` after the begin. Raises `Unfit`."""
         part = self.law.part(time_s)
-        self._last = self._solve(self._from.towards(self._goal(), part), self._last, part)
+        self._last = self._solve(self._from.towards(self._goal.pose, part), self._last, part)
         return self._last
 
     def _solve(self, pose: Pose, near: Array, part: float) -> Array:
@@ -166,8 +152,12 @@ class ToolLeg:
         return SAMPLED * np.abs(first).max(axis=0), SAMPLED * np.abs(second).max(axis=0)
 
 
-def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> tuple[TimeLaw, float]:
-    """Return the time law of a leg, and the least half blend time in which it may slow down.
+Leg = JointLeg | ToolLeg
+"""One motion."""
+
+
+def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> TimeLaw:
+    """Return the time law of a leg.
 
     `speed` and `bend` are the first and second derivatives of joint positions by the part of the
     way, (joints,) each. A segment time that is too short for a limit, or for two blends, is
@@ -181,7 +171,7 @@ def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> tuple[Time
     )
     segment = max(float(needed.max()), times.segment, 2.0 * half)
     room = most - bend / (segment * segment)
-    return TimeLaw(segment, half), min(half, float((PEAK * speed / segment / room).max()))
+    return TimeLaw(segment, half, min(half, float((PEAK * speed / segment / room).max())))
 
 
 class Settling:

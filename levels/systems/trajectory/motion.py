@@ -13,7 +13,8 @@ import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.robot.limits import Limits
-from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
+from rack.levels.systems.trajectory.goal import Unfit
+from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling
 
 STOP_PART = 0.85
 """Part of the acceleration limits that a stop takes: states are known by differences of samples
@@ -39,46 +40,43 @@ class SampledMotion:
     """Begins legs, blends them, stops: without a step in position or velocity, within the limits of
     every joint."""
 
-    def __init__(self, limits: Limits, joints: tuple[str, ...], period_s: float) -> None:
+    def __init__(
+        self, limits: Limits, joints: tuple[str, ...], period_s: float, rest: Array
+    ) -> None:
+        """Rest at the joint positions `rest`, (joints,), rad."""
         self._limits = limits
         self._joints = joints
         self._period_s = period_s
-        self._leg: Leg | None = None
+        # The leg under way or reached; None: the arm stops, or has stopped elsewhere.
+        self.leg: Leg | None = None
         self._begun_s = 0.0
         self._settling: Settling | None = None
         self._settles_s = 0.0  # when that began
-        self.rest_at(np.zeros(len(joints)))
+        self.rest_at(rest)
 
     def rest_at(self, position: Array) -> None:
         """Rest at joint positions (joints,), rad."""
-        self._leg = self._settling = None
+        self.leg = None
+        self._settling = None
         self._rest = np.array(position)
         self.time_s = 0.0  # of the present sample
         self._samples = self._rest, self._rest, self._rest  # those before, at and after it
-        self._held_state = self.state
 
     def advance(self, time_s: float) -> None:
         """Go on to the sample at `time_s`, the next one. Raises `Unfit` with the arm ramping to
         rest."""
         self.time_s = time_s
-        self._held_state = self.state
+        _, velocity, acceleration = self.state
         before, here = self._samples[1:]
         self._samples = before, here, here
         try:
-            after = self._evaluate(time_s + self._period_s)
-            self._samples = before, here, after
-            if self._leg is not None:
+            self._look_ahead()
+            if self.leg is not None:
                 self._check()
         except Unfit:
             # The sample ahead cannot be made: go on from the state before this one.
-            _, velocity, acceleration = self._held_state
-            self._settle(
-                JointState(here, velocity + self._period_s * acceleration, acceleration),
-                STOP_PART,
-                0.0,
-            )
-            self._leg = None
-            self._look_ahead()
+            velocity = velocity + self._period_s * acceleration
+            self._stop_from(JointState(here, velocity, acceleration))
             raise
 
     @property
@@ -91,11 +89,6 @@ class SampledMotion:
         )
 
     @property
-    def leg(self) -> Leg | None:
-        """The leg under way or reached; None: the arm stops, or has stopped elsewhere."""
-        return self._leg
-
-    @property
     def leg_s(self) -> float:
         """Time since the leg began."""
         return self.time_s - self._begun_s
@@ -104,10 +97,9 @@ class SampledMotion:
     def settled(self) -> bool:
         """Whether the leg, if there is one, has reached its goal, and nothing is left of the motion
         before it."""
-        reached = self._leg is None or self.leg_s >= self._leg.law.ends_s
-        return reached and (
-            self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s
-        )
+        if self.leg is not None and self.leg_s < self.leg.law.ends_s:
+            return False
+        return self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s
 
     @property
     def resting(self) -> bool:
@@ -120,8 +112,11 @@ class SampledMotion:
 
     def stop(self) -> None:
         """Ramp to rest from the present sample."""
-        self._settle(self.state, STOP_PART, LEAST_STOP_CYCLES * self._period_s)
-        self._leg = None
+        self._stop_from(self.state)
+
+    def _stop_from(self, state: JointState) -> None:
+        self._settle(state, STOP_PART)
+        self.leg = None
         self._look_ahead()
 
     def begin(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
@@ -130,21 +125,19 @@ class SampledMotion:
 
         Raises `Unfit` with the arm ramping to rest.
         """
-        if self.settled and self._leg is not None and not self._leg.live:
+        if self.settled and self.leg is not None and not self.leg.live:
             self._rest = self._samples[1]
             self._settling = None
-        elif not self.settled or self._leg is not None:
-            self._settle(
-                self.state, BLEND_PART, max(2.0 * half_blend_s, LEAST_STOP_CYCLES * self._period_s)
-            )
-        self._leg = None
+        elif not self.settled or self.leg is not None:
+            self._settle(self.state, BLEND_PART, 2.0 * half_blend_s)
+        self.leg = None
         try:
-            self._leg = make(self._rest)
+            self.leg = make(self._rest)
             self._begun_s = self.time_s
         finally:
             self._look_ahead()
 
-    def _settle(self, state: JointState, part: float, least_s: float) -> None:
+    def _settle(self, state: JointState, part: float, least_s: float = 0.0) -> None:
         least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
         self._settling = Settling(state, part * self._limits.acceleration, least_s)
         self._settles_s = self.time_s
@@ -157,11 +150,9 @@ class SampledMotion:
 
     def _evaluate(self, time_s: float) -> Array:
         """Return the joint positions at `time_s`. Raises `Unfit`."""
-        position = self._rest if self._leg is None else self._leg.at(time_s - self._begun_s)
+        position = self._rest if self.leg is None else self.leg.at(time_s - self._begun_s)
         settling = self._settling
-        if settling is None:
-            return position
-        if time_s - self._settles_s >= settling.ends_s:
+        if settling is None or time_s - self._settles_s >= settling.ends_s:
             return position
         return np.asarray(position + (settling.at(time_s - self._settles_s) - settling.end))
 

@@ -108,15 +108,13 @@ class RequestPlanner(Planner):
         self._home = cell.home
         self._upright = self._ik.tool_at(cell.home).quaternion
         self._bodies = context.scene.bodies
-        self._goals: dict[
-            int, Array
-        ] = {}  # joint positions (joints,), rad, at the end of each step planned
-        self._sent: int | None = None  # newest request queued; None: not yet known, after a start
-        self._taken = (
-            0,
-            0,
-        )  # newest request taken below, and the tick at which it or `_sent` changed
-        self._begun = 0, 0  # newest request begun below, and the tick at which it was seen
+        # Joint positions (joints,), rad, at the end of each step planned.
+        self._goals: dict[int, Array] = {}
+        self._sent = 0  # newest request queued, or taken below
+        self._taken = 0  # newest request taken below
+        self._taken_at = 0  # tick at which it or `_sent` changed
+        self._begun = 0  # newest request begun below
+        self._begun_at = 0  # tick at which it was seen
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return whether a step may be planned now."""
@@ -124,47 +122,44 @@ class RequestPlanner(Planner):
         if not read.status.is_there or below.error:
             return False
         begun = max(below.current, below.done)
-        if begun != self._begun[0]:
-            self._begun = begun, tick
-        if self._sent is None or below.taken > self._sent:
+        if begun != self._begun:
+            self._begun = begun
+            self._begun_at = tick
+        self._sent = max(self._sent, below.taken)
+        if below.taken != self._taken:
+            self._taken = below.taken
+            self._taken_at = tick
+        waited_s = (tick - self._taken_at) * self.context.tick_s
+        if below.taken < self._sent and waited_s > PATIENCE_S and not read.status.is_lost:
             self._sent = below.taken
-        if below.taken != self._taken[0]:
-            self._taken = below.taken, tick
-        elif (
-            below.taken < self._sent
-            and self._since_s(self._taken, tick) > PATIENCE_S
-            and not read.status.is_lost
-        ):
-            self._sent = below.taken
-            self._taken = (below.taken, tick)
-        return self._may_send(self._sent, below.done, tick)
+            self._taken_at = tick
+        return self._may_send(below.done, tick)
 
     def plan(self, read: Ports, write: Any, tick: int) -> None:
         """Plan the next steps, and queue their requests."""
-        assert self._sent is not None
         for _ in range(BATCH):
-            if not self._may_send(self._sent, read.status.value.done, tick):
+            if not self._may_send(read.status.value.done, tick):
                 return
             self._fill(write, self._sent, read.world.value)
             if not write.send():
                 return
             self._sent += 1
-            self._taken = self._taken[0], tick
+            self._taken_at = tick
 
-    def _since_s(self, event: tuple[int, int], tick: int) -> float:
-        return (tick - event[1]) * self.context.tick_s
-
-    def _may_send(self, sent: int, done: int, tick: int) -> bool:
+    def _may_send(self, done: int, tick: int) -> bool:
+        sent = self._sent
         if sent >= len(self._steps) or sent - done >= self._ahead:
             return False
         step = self._steps[sent]
         if not isinstance(step, CancelStep):
             return True
-        return self._begun[0] >= sent and self._since_s(self._begun, tick) >= step.after
+        begun_s = (tick - self._begun_at) * self.context.tick_s
+        return self._begun >= sent and begun_s >= step.after
 
     def _fill(self, request: Message, k: int, world: Message) -> None:
         """Make a request of step k."""
         step = self._steps[k]
+        self._goals[k] = self._goal(k, world)
         request.clear()
         request.id = k + 1
         request.body = -1
@@ -172,9 +167,7 @@ class RequestPlanner(Planner):
             request.segment = step.segment
             request.acceleration = step.acceleration
             self._fill_motion(request, step, k, world)
-            return
-        self._goals[k] = self._goal_before(k, world)
-        if isinstance(step, StayStep):
+        elif isinstance(step, StayStep):
             request.kind = MotionKind.STAY
             request.segment = step.seconds
         elif isinstance(step, GripStep):
@@ -188,14 +181,15 @@ class RequestPlanner(Planner):
             request.kind = MotionKind.CANCEL
 
     def _fill_motion(self, request: Message, step: Step, k: int, world: Message) -> None:
-        joints = self._goals[k] = self._goal(k, world)
+        joints = self._goals[k]
         tool = self._tool(step)
-        unsolved = tool is not None and joints is self._goal_before(k, world)
-        if tool is not None and (isinstance(step, LineStep) or unsolved):
-            request.kind, request.position, request.quaternion = MotionKind.POSE, *tool
-        else:
+        is_solved = joints is not self._goal_before(k, world)
+        if tool is None or (isinstance(step, MoveStep) and is_solved):
             request.kind = MotionKind.JOINTS
             request.joints = joints
+        else:
+            request.kind = MotionKind.POSE
+            request.position, request.quaternion = tool
         if isinstance(step, LineStep) and step.body is not None:
             request.body = self._bodies.index(step.body)
             request.live = step.live
@@ -235,4 +229,5 @@ class RequestPlanner(Planner):
         """Return the pose of the tool that a step gives, in its frame; None: it gives none."""
         if not isinstance(step, MoveStep | LineStep) or step.position is None:
             return None
-        return pose(step.position, self._upright if step.quaternion is None else step.quaternion)
+        turn = self._upright if step.quaternion is None else step.quaternion
+        return pose(step.position, turn)

@@ -134,11 +134,7 @@ class MotionProgram(Program):
             ):
                 why = f"{len(step.joints)} values; permitted: {len(robot.joints)}, one per joint"
                 yield f"step[{k}].joints", list(step.joints), why
-            if (
-                isinstance(step, LineStep)
-                and step.body is not None
-                and step.body not in scene.bodies
-            ):
+            if isinstance(step, LineStep) and step.body not in (None, *scene.bodies):
                 why = f"not in the scene; bodies: {', '.join(scene.bodies) or 'none'}"
                 yield f"step[{k}].body", step.body, why
             if isinstance(step, GripStep) and robot.gripper is None:

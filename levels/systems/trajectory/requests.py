@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +18,18 @@ MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
 """Kinds that may be blended into each other."""
 KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
 """Kinds that any trajectory level can do."""
+NUMBERS = (
+    "id",
+    "kind",
+    "body",
+    "acceleration",
+    "segment",
+    "opening",
+    "force",
+    "touch",
+    "operator",
+)
+"""Fields of a request that are one number each."""
 
 
 class MotionRequest(NamedTuple):
@@ -41,26 +52,10 @@ class MotionRequest(NamedTuple):
     @classmethod
     def of(cls, record: np.ndarray) -> MotionRequest:
         """Return a copy of a request's record."""
-        r = record.copy()
-        goal = pose(r["position"], r["quaternion"])
-        one = (
-            int(r["id"]),
-            int(r["kind"]),
-            np.array(r["joints"]),
-            goal,
-            int(r["body"]),
-            bool(r["live"]),
-        )
-        times = float(r["acceleration"]), float(r["segment"])
-        return cls(
-            *one,
-            *times,
-            float(r["opening"]),
-            float(r["force"]),
-            float(r["touch"]),
-            int(r["operator"]),
-            r,
-        )
+        own = record.copy()
+        goal = pose(own["position"], own["quaternion"])
+        numbers = {name: own[name].item() for name in NUMBERS}
+        return cls(joints=own["joints"], goal=goal, live=bool(own["live"]), record=own, **numbers)
 
     @property
     def moves(self) -> bool:
@@ -76,21 +71,14 @@ class MotionRequest(NamedTuple):
         """Return why no arm could do it; empty: it may be possible. `ranges` (joints, 2), rad."""
         if self.kind not in KINDS:
             return f"kind {self.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
-        numbers = (
-            self.record["acceleration"],
-            self.record["segment"],
-            self.record["opening"],
-            self.record["force"],
-        )
+        numbers = (self.acceleration, self.segment, self.opening, self.force)
         if not np.isfinite(numbers).all() or self.acceleration < 0.0 or self.segment < 0.0:
             return (
                 f"times {self.acceleration:g} and {self.segment:g} s; permitted: finite, 0 or more"
             )
-        place = self.record["position"]
         turn = self.record["quaternion"]
-        if self.kind == MotionKind.POSE and not (
-            np.isfinite(place).all() and np.isfinite(turn).all() and turn.any()
-        ):
+        is_pose = np.isfinite((*self.record["position"], *turn)).all() and turn.any()
+        if self.kind == MotionKind.POSE and not is_pose:
             return "the pose is not finite, or its quaternion is zero"
         # Written so that NaN is one.
         if not self.touch >= 0.0:
@@ -124,9 +112,8 @@ class Agenda:
         self.rests_on = 0  # newest command of an operator on which a request taken rests
         self.error = Error.NONE
         self.reason = ""
-        self.missing = (
-            False  # the request after `taken` was lost, with a board that died as it took it
-        )
+        # The request after `taken` was lost, with a board that died as it took it.
+        self.missing = False
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
     @property
@@ -170,7 +157,7 @@ class Agenda:
         self.taken = request.id
         self.rests_on = max(self.rests_on, request.operator)
         if request.kind == MotionKind.CANCEL:
-            self._flush(RequestEnd.CANCELLED)
+            self._drop_all()
             self.error = Error.NONE
             self.reason = ""
             self.held = [request]
@@ -206,11 +193,11 @@ class Agenda:
         if self.held:
             self.reason = f"request {self.held[0].id}: {reason}"
             self.end(how)
-        self._flush(RequestEnd.CANCELLED)
+        self._drop_all()
 
-    def _flush(self, how: RequestEnd) -> None:
+    def _drop_all(self) -> None:
         for request in self.held:
-            self._end(request, how)
+            self._end(request, RequestEnd.CANCELLED)
         self.held = []
         self.begun = False
 
@@ -223,9 +210,8 @@ class Agenda:
         status.taken = self.taken
         status.current = current.id if current is not None else 0
         status.done = self.done
-        for k, (request, how) in enumerate(self._ended):
-            status.ended[k] = request
-            status.ends[k] = how
+        for k, ended in enumerate(self._ended):
+            status.ended[k], status.ends[k] = ended
 
     def save(self, state: Message) -> None:
         """Fill a `MOTION_STATE`."""
@@ -240,7 +226,7 @@ class Agenda:
 
     def recall(self, state: Message, status: Message) -> None:
         """Continue from the last messages of a level that was restarted."""
-        self.held = [MotionRequest.of(record) for record in records(state)]
+        self.held = [MotionRequest.of(record) for record in state.requests[: state.count]]
         self.begun = bool(state.begun)
         self.goal = MotionRequest.of(state.goal) if state.goal["id"] else None
         self.taken = status.taken
@@ -249,8 +235,3 @@ class Agenda:
         self.reason = status.reason if status.error else ""
         ends = zip(status.ended.tolist(), status.ends.tolist(), strict=True)
         self._ended.extend((request, RequestEnd(how)) for request, how in ends if request)
-
-
-def records(state: Message) -> Sequence[np.ndarray]:
-    """Return the records of the requests in a `MOTION_STATE`."""
-    return [state.requests[k] for k in range(state.count)]

@@ -10,8 +10,8 @@ from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.limits import Limits
-from rack.levels.systems.trajectory.goal import ToolGoal, WorldSight
-from rack.levels.systems.trajectory.legs import JointLeg, Leg, Times, ToolLeg, Unfit
+from rack.levels.systems.trajectory.goal import ToolGoal, Unfit, WorldSight
+from rack.levels.systems.trajectory.legs import JointLeg, Leg, Times, ToolLeg
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import Agenda, MotionRequest
@@ -48,9 +48,8 @@ class RequestWork:
         self.agenda = agenda
         self.motion = motion
         self._tools = tools
-        self.goal: ToolGoal | None = (
-            None  # of the leg under way or reached; None: it is one in joint space
-        )
+        # Of the leg under way or reached; None: it is one in joint space.
+        self.goal: ToolGoal | None = None
         self.passed_s = 0.0  # time that the request under way has stayed or gripped
         self.grip = 0.0, 0.0  # opening, m, and force, N, wanted by the last GRIP
         self._interrupted = True  # motion must begin anew from rest
@@ -91,7 +90,7 @@ class RequestWork:
                 self.goal.update(time_s + self._tools.period_s)
             motion.advance(time_s)
         except Unfit as unfit:
-            self._fail(RequestEnd.FAILED, str(unfit))
+            self._fail(RequestEnd.FAILED, str(unfit), Error.LIMIT)
         if hold:
             if motion.leg is not None:
                 self.interrupt()
@@ -118,10 +117,8 @@ class RequestWork:
             return 1.0 - self._left
         return 1.0 - self._left * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
-    def _fail(self, how: RequestEnd, reason: str, code: Error = Error.NONE) -> None:
-        self.agenda.fail(
-            how, code or (Error.UNREACHABLE if how is RequestEnd.REFUSED else Error.LIMIT), reason
-        )
+    def _fail(self, how: RequestEnd, reason: str, code: Error) -> None:
+        self.agenda.fail(how, code, reason)
         self.goal = None
         self._left = 1.0
         self._interrupted = False
@@ -137,8 +134,9 @@ class RequestWork:
             self._left = 1.0
         elif self._can_begin(goal):
             self._interrupted = False
-            under_way = current is not None and current.id == goal.id
-            self._move(goal, 0.0, goal.segment * self._left if under_way else 0.0)
+            is_under_way = current is not None and current.id == goal.id
+            segment_s = goal.segment * self._left if is_under_way else 0.0
+            self._move(goal, 0.0, segment_s)
 
     def _is_done(self, current: MotionRequest) -> bool:
         if not self.motion.settled:
@@ -149,9 +147,9 @@ class RequestWork:
         return self.passed_s >= self._lasts_s(current)
 
     def _lasts_s(self, request: MotionRequest) -> float:
-        return request.segment or (
-            self._tools.params.gripping if request.kind == MotionKind.GRIP else 0.0
-        )
+        if request.kind == MotionKind.GRIP and not request.segment:
+            return self._tools.params.gripping
+        return request.segment
 
     def _consider(self, request: MotionRequest) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be
@@ -162,11 +160,11 @@ class RequestWork:
             return
         if current is None:
             if self.motion.settled:
-                self._begin(request, 0.0)
+                self._begin(0.0)
         elif current.moves and request.moves and leg is not None:
             half_s = self._blend_s(leg, request)
             if half_s is not None:
-                self._begin(request, half_s)
+                self._begin(half_s)
 
     def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
         """Return half the time in which `leg` slows down, if now is the time to blend it into
@@ -175,7 +173,7 @@ class RequestWork:
         passed_s = self.motion.leg_s
         if passed_s > law.ends_s - 2.0 * law.leaving_s:
             return max(0.5 * (law.ends_s - passed_s), 0.0)  # it slows down already
-        wanted_s = max(request.acceleration or self._tools.params.acceleration, leg.least_s)
+        wanted_s = max(request.acceleration or self._tools.params.acceleration, law.least_s)
         half_s = min(wanted_s, law.segment_s - law.half_blend_s)
         law.leave_within(half_s)
         left_s = law.nominal_s - passed_s
@@ -184,13 +182,12 @@ class RequestWork:
     def _can_begin(self, request: MotionRequest) -> bool:
         return not request.moves or request.body < 0 or self._tools.sight.knows
 
-    def _begin(self, request: MotionRequest, half_s: float) -> None:
-        self.agenda.begin()
+    def _begin(self, half_s: float) -> None:
+        request = self.agenda.begin()
         self.passed_s = 0.0
         self._left = 1.0
-        reason = self._misfit(request)
-        if reason:
-            self._fail(RequestEnd.REFUSED, reason)
+        if reason := self._misfit(request):
+            self._fail(RequestEnd.REFUSED, reason, Error.UNREACHABLE)
             self.motion.stop()
         elif request.moves:
             self._move(request, half_s, request.segment)
@@ -209,23 +206,21 @@ class RequestWork:
     def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of `request`; the motion so far slows down over twice
         `half_s`."""
-        params = self._tools.params
-        limits = self._tools.limits
-        times = Times(segment_s, max(request.acceleration or params.acceleration, half_s))
+        tools = self._tools
+        half_blend_s = max(request.acceleration or tools.params.acceleration, half_s)
+        times = Times(segment_s, half_blend_s)
         goal = None
         if request.kind == MotionKind.POSE:
-            goal = ToolGoal(
-                request.goal, request.body, request.live, self._tools.sight, params.follow
-            )
+            goal = ToolGoal(request, tools.sight, tools.params.follow)
 
         def make(start: Array) -> Leg:
             if goal is None:
-                return JointLeg(start, request.joints, times, limits)
-            goal.update(self.motion.time_s + self._tools.period_s)
-            return ToolLeg(start, goal.pose, goal.live, times, (self._tools.ik, limits))
+                return JointLeg(start, request.joints, times, tools.limits)
+            goal.update(self.motion.time_s + tools.period_s)
+            return ToolLeg(start, goal, times, tools.ik, tools.limits)
 
         try:
             self.motion.begin(make, half_s)
             self.goal = goal
         except Unfit as unfit:
-            self._fail(RequestEnd.REFUSED, str(unfit))
+            self._fail(RequestEnd.REFUSED, str(unfit), Error.UNREACHABLE)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
+from rack.levels.algebra import Array
 from rack.levels.operator import Answer, Operation
+from rack.levels.planning.pose import Pose
 from rack.levels.systems.trajectory.messages import HELD, MotionKind, RequestEnd
 from tests.levels.systems.trajectory.rig import EVERY, PERIOD_S, TrajectoryRig
 
@@ -58,15 +60,22 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
 
 
-def test_a_live_goal_is_evaluated_once_a_sample() -> None:
+def test_a_live_goal_is_evaluated_once_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = TrackingRig()
     rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
     rig.follow(1.0)
     goal = rig.level._work.goal
     assert goal is not None
-    before = goal.evaluations
+    evaluate = goal._followed
+    evaluations: list[Pose] = []
+
+    def evaluated(frame: Pose, seen: Pose, velocity: Array, passed_s: float) -> Pose:
+        evaluations.append(evaluate(frame, seen, velocity, passed_s))
+        return evaluations[-1]
+
+    monkeypatch.setattr(goal, "_followed", evaluated)
     rig.follow(1.0)
-    assert goal.evaluations == before + round(1.0 / PERIOD_S)
+    assert len(evaluations) == round(1.0 / PERIOD_S)
 
 
 def test_a_copied_goal_stays_where_the_body_was() -> None:
