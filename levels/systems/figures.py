@@ -51,28 +51,22 @@ class FigureParams(Table):
     )
     plan_ms: Milliseconds = Parameter(6.0, description="P: one plan, without its update, ms")
 
-    @property
-    def process_ns(self) -> tuple[int, ...]:
-        """X by cycle, ns, repeated from the first after the last."""
-        times = self.process_ms if isinstance(self.process_ms, tuple) else (self.process_ms,)
-        return tuple(round(ms * NS_PER_MS) for ms in times)
-
-    @property
-    def plan_ns(self) -> int:
-        """P, ns."""
-        return round(self.plan_ms * NS_PER_MS)
-
 
 class FigureLoop(Executor):
     """Computes for X of processor time in every cycle: a level without a planner."""
 
     outputs = {"status": FIGURE_STATUS}
     params = FigureParams
+    plan = -1
+    """Release that the plan in force answers; -1: there is none."""
 
     def __init__(self, context: LevelContext) -> None:
         """Raise `LevelError` for an invalid parameter."""
         super().__init__(context)
-        self._times_ns = read_params(FigureParams, context.params).process_ns
+        times_ms = read_params(FigureParams, context.params).process_ms
+        if not isinstance(times_ms, tuple):
+            times_ms = (times_ms,)
+        self._times_ns = [round(ms * NS_PER_MS) for ms in times_ms]
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report, then compute; time spent preempted does not count."""
@@ -80,12 +74,8 @@ class FigureLoop(Executor):
         status = write.status
         status.state = State.EXECUTING
         status.cycle = tick
-        status.plan = self.plan_in_force(read)
+        status.plan = self.plan
         compute_until(end)
-
-    def plan_in_force(self, read: Ports) -> int:
-        """Return the release that the plan in force answers; -1: there is none."""
-        return -1
 
 
 class FigureExecutor(FigureLoop):
@@ -93,9 +83,11 @@ class FigureExecutor(FigureLoop):
 
     inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
 
-    def plan_in_force(self, read: Ports) -> int:
-        """Return the release that the plan in force answers; -1: there is none yet."""
-        return read.plan.value.made_at if read.plan.is_there else -1
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Report, with the plan in force, then compute."""
+        if read.plan.is_there:
+            self.plan = read.plan.value.made_at
+        super().process(read, write, tick)
 
 
 class FigurePlanner(Planner):
@@ -108,7 +100,7 @@ class FigurePlanner(Planner):
     def __init__(self, context: LevelContext) -> None:
         """Raise `LevelError` for an invalid parameter."""
         super().__init__(context)
-        self._time_ns = read_params(FigureParams, context.params).plan_ns
+        self._time_ns = round(read_params(FigureParams, context.params).plan_ms * NS_PER_MS)
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return True: a plan is always wanted."""

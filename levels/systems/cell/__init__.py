@@ -15,5 +15,5 @@ __all__ = [
     "Coordinator",
     "OrderedTaskExecutor",
     "OrderedTaskPlanner",
+    "SharingServoExecutor",
 ]
-__all__ += ["SharingServoExecutor"]

@@ -11,7 +11,7 @@ from rack.backplane.message import Message
 from rack.levels.errors import ProgramError
 from rack.levels.operator import Goal
 from rack.levels.systems.cell.messages import ACTION_FIELDS, OrderAction
-from rack.levels.tables import RobotConfig, SceneConfig, frozen
+from rack.levels.tables import RobotConfig, SceneConfig
 from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misfits
 
 _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
@@ -31,23 +31,20 @@ def write_action(action: AnyAction, message: Message) -> None:
         message.lift = action.lift
     elif isinstance(action, Goto):
         message.action = OrderAction.GOTO
-        _write_goal(action, message)
-    elif isinstance(action, Home):
-        message.action = OrderAction.HOME
-
-
-def _write_goal(action: Goto, message: Message) -> None:
-    if action.joints is not None:
-        message.goal = Goal.JOINTS
-        message.count = len(action.joints)
-        message.joints[: message.count] = action.joints
-    elif action.position is not None:
+        if action.joints is not None:
+            message.goal = Goal.JOINTS
+            message.count = len(action.joints)
+            message.joints[: message.count] = action.joints
+            return
         message.position = action.position
-        message.goal = Goal.POSE if action.quaternion is not None else Goal.DIRECTION
         if action.quaternion is not None:
+            message.goal = Goal.POSE
             message.quaternion = action.quaternion
         else:
+            message.goal = Goal.DIRECTION
             message.direction = action.direction or DOWN
+    elif isinstance(action, Home):
+        message.action = OrderAction.HOME
 
 
 def copy_action(source: Message, target: Message) -> None:
@@ -59,9 +56,8 @@ def copy_action(source: Message, target: Message) -> None:
 def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> AnyAction:
     """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not
     suit arm or scene."""
-    table = _table(message) | ({"by": message.by} if message.by else {})
     try:
-        action: AnyAction = _ACTION.validate_python(frozen(table))
+        action: AnyAction = _ACTION.validate_python({**_table(message), "by": message.by or None})
     except ValidationError as error:
         lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
         raise ProgramError("\n".join(lines)) from error
@@ -71,29 +67,26 @@ def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> Any
 
 
 def _table(message: Message) -> dict[str, Any]:
-    what = message.action
-    goal = message.goal
-    if what == OrderAction.HOME:
-        return {"do": "home"}
-    if what == OrderAction.TRANSFER:
-        turn = {"yaw": message.yaw} if message.turned else {}
-        place = message.position.tolist()
-        return {
-            "do": "transfer",
-            "object": message.object,
-            "to": place,
-            "lift": message.lift,
-            **turn,
-        }
-    if what != OrderAction.GOTO or goal not in (Goal.JOINTS, Goal.POSE, Goal.DIRECTION):
-        raise ProgramError(
-            f"action {what} with goal {goal} is not known; permitted: transfer, goto, home"
-        )
-    if goal == Goal.JOINTS:
-        return {"do": "goto", "joints": message.joints[: message.count].tolist()}
-    turned = "quaternion" if goal == Goal.POSE else "direction"
-    return {
-        "do": "goto",
-        "position": message.position.tolist(),
-        turned: getattr(message, turned).tolist(),
-    }
+    """Return the action, but for its `by`, as a table of a program."""
+    place = message.position.tolist()
+    match message.action, message.goal:
+        case OrderAction.HOME, _:
+            return {"do": "home"}
+        case OrderAction.TRANSFER, _:
+            return {
+                "do": "transfer",
+                "object": message.object,
+                "to": place,
+                "lift": message.lift,
+                "yaw": message.yaw if message.turned else None,
+            }
+        case OrderAction.GOTO, Goal.JOINTS:
+            return {"do": "goto", "joints": message.joints[: message.count].tolist()}
+        case OrderAction.GOTO, Goal.POSE:
+            return {"do": "goto", "position": place, "quaternion": message.quaternion.tolist()}
+        case OrderAction.GOTO, Goal.DIRECTION:
+            return {"do": "goto", "position": place, "direction": message.direction.tolist()}
+    raise ProgramError(
+        f"action {message.action} with goal {message.goal} is not known; permitted: transfer, goto,"
+        " home"
+    )

@@ -14,9 +14,9 @@ begun.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 from rack.backplane.message import Message
+from rack.levels.level import Reading
 from rack.levels.messages import Error
 from rack.levels.systems.cell.messages import OrderVerb, Phase, Response
 
@@ -27,32 +27,26 @@ MAX_ATTEMPTS = 10
 NO = (Response.REFUSED, Response.FAILED)
 BROKEN_OFF = (Response.CANCELLED, Response.STOPPED, Response.ENDED)
 BEGUN = (Response.DOING, Response.DONE)
-
-
-class ArmAnswer(NamedTuple):
-    """What an arm reports: to which order it answers what."""
-
-    is_there: bool = False  # it reports, and is not lost
-    program: int = 0
-    order: int = 0
-    response: Response = Response.NONE
-    error: int = 0
-    reason: str = ""
-    until: float = (
-        0.0  # simulated time of the coordinator's rack up to which POSSIBLE holds, s; 0: any time
-    )
+VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLING: OrderVerb.CANCEL}
+"""What to say to the arms of a step."""
 
 
 class Agreement:
     """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each
-    step."""
+    step. The arms' answers are their `CELL_REPORT`s."""
 
-    def __init__(self, program: int, steps: Sequence[Collection[str]], margin_s: float) -> None:
-        """`margin_s`: time in which an order reaches its arm."""
+    def __init__(
+        self, program: int, steps: Sequence[Collection[str]], margin_s: float, farewell_s: float
+    ) -> None:
+        """`margin_s`: time in which an order reaches its arm; `farewell_s`: time that the arms have
+        to confirm the end."""
         self.program = program
         self._steps = steps
         self._margin_s = margin_s
+        self._farewell_s = farewell_s
         self._arms = list(dict.fromkeys(arm for step in steps for arm in step))
+        self._answers: Mapping[str, Reading] = {}  # as of this cycle
+        self._now_s = 0.0  # likewise, simulated time
         self.phase = Phase.AWAITING
         self.step = 0
         self.attempt = 0
@@ -86,9 +80,9 @@ class Agreement:
     @property
     def partners(self) -> Collection[str]:
         """The arms of the present step; none before the first and after the last one."""
-        return (
-            self._steps[self.step] if self.phase in VERBS and self.step < len(self._steps) else ()
-        )
+        if self.phase not in VERBS or self.step >= len(self._steps):
+            return ()
+        return self._steps[self.step]
 
     def verb(self, arm: str) -> OrderVerb:
         """Return what to say to an arm."""
@@ -96,118 +90,117 @@ class Agreement:
             return OrderVerb.END
         return VERBS[self.phase] if arm in self.partners else OrderVerb.NONE
 
-    def said(self, arm: str, answers: Mapping[str, ArmAnswer]) -> Response:
-        """Return an arm's answer to the present order."""
-        answer = answers[arm]
-        is_ours = (answer.program, answer.order) == (self.program, self.order)
-        return answer.response if is_ours else Response.NONE
-
-    def advance(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
-        """Take one step forward, if the answers allow it."""
+    def advance(self, answers: Mapping[str, Reading], now_s: float) -> None:
+        """Take one step forward, if the answers allow it; be over once every arm has confirmed the
+        end, or had time to."""
+        self._answers = answers
+        self._now_s = now_s
         if self.phase is Phase.AWAITING:
-            self._await(answers, now_s)
+            self._await()
         elif self.phase is Phase.ASKING:
-            self._ask(answers, now_s)
+            self._ask()
         elif self.phase is Phase.DOING:
-            self._follow(answers, now_s)
+            self._follow()
         elif self.phase is Phase.CANCELLING:
-            self._cancel(answers, now_s)
+            self._cancel()
+        if self.phase is Phase.ENDING:
+            said = self._said(self._arms)
+            is_confirmed = all(response is Response.ENDED for response in said.values())
+            if is_confirmed or now_s - self.ending_s > self._farewell_s:
+                self.phase = Phase.OVER
 
-    def _await(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
+    def _said(self, arms: Collection[str]) -> dict[str, Response]:
+        """Return the answers of these arms to the present order."""
+        said = dict.fromkeys(arms, Response.NONE)
+        for arm in arms:
+            answer = self._answers[arm].value
+            if (answer.program, answer.echo) == (self.program, self.order):
+                said[arm] = Response(answer.response)
+        return said
+
+    def _are_there(self, arms: Collection[str]) -> bool:
+        """Return whether all these arms report, and none is lost."""
+        answers = [self._answers[arm] for arm in arms]
+        return all(answer.is_there and not answer.is_lost for answer in answers)
+
+    def _await(self) -> None:
         """Go on once every arm reports, with the step that the reports show, or with the end."""
-        ours = [answer for answer in answers.values() if answer.program == self.program]
-        ended = [answer for answer in ours if answer.response is Response.ENDED]
-        newest = max([answer.order for answer in ended or ours], default=0)
+        answers = [reading.value for reading in self._answers.values()]
+        ours = [answer for answer in answers if answer.program == self.program]
+        ended = [answer for answer in ours if answer.response == Response.ENDED]
+        newest = max([answer.echo for answer in ended or ours], default=0)
         if newest // ATTEMPTS in range(1, len(self._steps) + 2):
             self.step = newest // ATTEMPTS - 1
             self.attempt = newest % ATTEMPTS
         if ended:
-            self.end(Error(ended[0].error), ended[0].reason, now_s)
-        elif all(answers[arm].is_there for arm in self._arms):
-            self._go_on(now_s)
+            self.end(Error(ended[0].error), ended[0].reason)
+        elif self._are_there(self._arms):
+            self._go_on()
         if self.phase is Phase.ASKING:
             # At once: an arm that has forgotten its promise must not be asked for it again.
-            self._ask(answers, now_s)
+            self._ask()
 
-    def _go_on(self, now_s: float) -> None:
+    def _go_on(self) -> None:
         if self.step < len(self._steps):
             self.phase = Phase.ASKING
         else:
-            self.end(Error.NONE, "", now_s)
+            self.end(Error.NONE, "")
 
-    def _ask(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
-        said = {arm: self.said(arm, answers) for arm in self.partners}
-        if self._ends_by(said, NO, answers, now_s):
+    def _ask(self) -> None:
+        said = self._said(self.partners)
+        if self._ends_by(said, NO):
             return
         if any(response in BROKEN_OFF for response in said.values()):
             self.phase = Phase.CANCELLING
         elif any(response in BEGUN for response in said.values()):
             self.phase = Phase.DOING  # told so by a launch before this one
-        elif all(said[arm] is Response.POSSIBLE and answers[arm].is_there for arm in said):
-            times = [answers[arm].until for arm in said if answers[arm].until]
-            in_time = now_s + self._margin_s <= min(times, default=now_s + self._margin_s)
+        elif all(r is Response.POSSIBLE for r in said.values()) and self._are_there(said):
+            arrives_s = self._now_s + self._margin_s
+            times = [self._answers[arm].value.until for arm in said]
+            in_time = all(arrives_s <= until_s for until_s in times if until_s)
             self.phase = Phase.DOING if in_time else Phase.CANCELLING
 
-    def _follow(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
-        said = {arm: self.said(arm, answers) for arm in self.partners}
-        if self._ends_by(said, (*NO, *BROKEN_OFF), answers, now_s):
+    def _follow(self) -> None:
+        said = self._said(self.partners)
+        if self._ends_by(said, (*NO, *BROKEN_OFF)):
             return
         if all(response is Response.DONE for response in said.values()):
-            self.step = self.step + 1
+            self.step += 1
             self.attempt = 0
-            self._go_on(now_s)
+            self._go_on()
 
-    def _cancel(self, answers: Mapping[str, ArmAnswer], now_s: float) -> None:
-        said = {arm: self.said(arm, answers) for arm in self.partners}
-        if self._ends_by(said, NO, answers, now_s):
+    def _cancel(self) -> None:
+        said = self._said(self.partners)
+        if self._ends_by(said, NO):
             return
         if any(response not in (*BROKEN_OFF, Response.DONE) for response in said.values()):
             return
         begun = [arm for arm, response in said.items() if response is not Response.CANCELLED]
         self.attempt += 1
         if begun:
-            self.end(
-                Error.GIVEN_UP,
-                f"step {self.step}: {begun[0]} had begun when it was cancelled",
-                now_s,
-            )
+            why = f"step {self.step}: {begun[0]} had begun when it was cancelled"
+            self.end(Error.GIVEN_UP, why)
         elif self.attempt == MAX_ATTEMPTS:
             why = f"step {self.step}: {MAX_ATTEMPTS} promises expired before all arms had answered"
-            self.end(Error.TOO_LATE, why, now_s)
+            self.end(Error.TOO_LATE, why)
         else:
             self.phase = Phase.ASKING
 
-    def _ends_by(
-        self,
-        said: Mapping[str, Response],
-        kinds: Collection[Response],
-        answers: Mapping[str, ArmAnswer],
-        now_s: float,
-    ) -> bool:
+    def _ends_by(self, said: Mapping[str, Response], kinds: Collection[Response]) -> bool:
         """End the program if an arm has given one of these answers; return whether it has."""
-        arm = next((arm for arm, response in said.items() if response in kinds), None)
-        if arm is None:
-            return False
-        answer = answers[arm]
-        word = said[arm].name.lower()
-        reason = f"step {self.step} {word}: {arm}: {answer.reason}".removesuffix(": ")
-        self.end(Error(answer.error) or Error.GIVEN_UP, reason, now_s)
-        return True
+        for arm, response in said.items():
+            if response in kinds:
+                answer = self._answers[arm].value
+                what = f"step {self.step} {response.name.lower()}: {arm}"
+                reason = f"{what}: {answer.reason}".removesuffix(": ")
+                self.end(Error(answer.error) or Error.GIVEN_UP, reason)
+                return True
+        return False
 
-    def end(self, error: Error, reason: str, now_s: float) -> None:
+    def end(self, error: Error, reason: str) -> None:
         """End the program, and with it the runs of the arms."""
         if self.phase not in (Phase.ENDING, Phase.OVER):
             self.phase = Phase.ENDING
             self.error = error
             self.reason = reason
-            self.ending_s = now_s
-
-    def take_leave(self, answers: Mapping[str, ArmAnswer], now_s: float, farewell_s: float) -> None:
-        """Be over once every arm has confirmed the end, or had time to."""
-        is_confirmed = all(self.said(arm, answers) is Response.ENDED for arm in self._arms)
-        if self.phase is Phase.ENDING and (is_confirmed or now_s - self.ending_s > farewell_s):
-            self.phase = Phase.OVER
-
-
-VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLING: OrderVerb.CANCEL}
-"""What to say to the arms of a step."""
+            self.ending_s = self._now_s

@@ -12,14 +12,13 @@ from rack.levels.level import Executor, Input, LevelContext, MadePorts, Output, 
 from rack.levels.messages import TASK_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.systems.cell.actions import write_action
-from rack.levels.systems.cell.agreement import Agreement, ArmAnswer
+from rack.levels.systems.cell.agreement import Agreement
 from rack.levels.systems.cell.messages import (
     CELL_ORDER,
     CELL_PROGRESS,
     CELL_REPORT,
     OrderVerb,
     Phase,
-    Response,
 )
 from rack.levels.systems.cell.params import CoordinatorParams
 from rack.levels.systems.cell.program import CellProgram
@@ -49,7 +48,9 @@ class Coordinator(Executor):
         self._table = read_params(CoordinatorParams, context.params)
         program = CellProgram.model_validate(context.task)
         self._steps = [step.actions for step in program.step]
-        self._agreement = Agreement(program.checksum, self._steps, 2.0 * context.period_s)
+        margin_s = 2.0 * context.period_s
+        self._agreement = Agreement(program.checksum, self._steps, margin_s, self._table.farewell_s)
+        self._readings: Mapping[str, Reading] = {}  # of the arms' reports, in this cycle
         self._operated = Orders(self.commands)
         self._started = False
         self._moves = 0  # moves of the steps done
@@ -83,18 +84,18 @@ class Coordinator(Executor):
         if not self._started:
             self._recall(read)
         self._operated.take(read.operator)
-        now_s = tick * self.context.tick_s
-        readings = {arm: getattr(read, f"report_{arm}") for arm in self._table.arms}
-        answers = {arm: answer_of(reading) for arm, reading in readings.items()}
-        held = self._reason_to_hold(readings)
-        self._go_on(readings, answers, now_s)
-        waits = held or self._reason_to_wait(readings)
-        self._check_progress(readings, waits, tick)
+        self._readings = {arm: getattr(read, f"report_{arm}") for arm in self._table.arms}
+        held = self._reason_to_hold()
+        if self._steps:
+            self._go_on(tick * self.context.tick_s)
+        waits = held or self._reason_to_wait()
+        if self._steps:
+            self._check_progress(waits, tick)
         for arm in self._table.arms:
             self._order(arm, held, getattr(write, f"order_{arm}"))
         self._agreement.write_to(write.progress)
         fill_counts(write.progress.record[["moves"]], (self._moves,))
-        self._report(readings, waits, write.status)
+        self._report(waits, write.status)
 
     def _recall(self, read: Ports) -> None:
         """Continue from the last progress in the mailbox, after a restart of the board."""
@@ -103,56 +104,52 @@ class Coordinator(Executor):
             self._agreement.recall(read.last_progress.value)
             self._moves = read.last_progress.value.moves
 
-    def _go_on(
-        self, readings: Mapping[str, Reading], answers: Mapping[str, ArmAnswer], now_s: float
-    ) -> None:
+    def _go_on(self, now_s: float) -> None:
         agreement = self._agreement
-        if not self._steps:
-            return
         step = agreement.step
-        moves = self._moves_of_step(readings)[1]
-        agreement.advance(answers, now_s)
+        moves = self._moves_of_step()[1]
+        agreement.advance(self._readings, now_s)
         if agreement.step > step:
             self._moves += moves
-        agreement.take_leave(answers, now_s, self._table.farewell_s)
 
-    def _moves_of_step(self, readings: Mapping[str, Reading]) -> tuple[int, int]:
+    def _moves_of_step(self) -> tuple[int, int]:
         """Return how many moves of the present step are done, of how many."""
-        reports = [readings[arm].value for arm in self._agreement.partners]
-        mine = [
-            r
-            for r in reports
-            if (r.program, r.echo) == (self._agreement.program, self._agreement.order)
-        ]
+        agreement = self._agreement
+        reports = [self._readings[arm].value for arm in agreement.partners]
+        mine = [r for r in reports if (r.program, r.echo) == (agreement.program, agreement.order)]
         return sum(r.moves_done for r in mine), sum(r.moves for r in mine)
 
-    def _reason_to_hold(self, readings: Mapping[str, Reading]) -> str:
+    def _reason_to_hold(self) -> str:
         """Return why the arms are to rest on their paths; empty: they are not."""
         if self._operated.standing is Operation.HOLD:
             return self._operated.keeps(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
             return ""
-        lost = next(
-            (arm for arm, reading in readings.items() if reading.is_there and reading.is_lost), ""
-        )
-        return f"{lost} is lost: the program waits until it is back" if lost else ""
+        for arm, reading in self._readings.items():
+            if reading.is_there and reading.is_lost:
+                return f"{arm} is lost: the program waits until it is back"
+        return ""
 
-    def _reason_to_wait(self, readings: Mapping[str, Reading]) -> str:
+    def _reason_to_wait(self) -> str:
         """Return why the program does not go on; empty: it does."""
         agreement = self._agreement
         if agreement.phase is Phase.ENDING:
             return agreement.reason
         if agreement.phase is Phase.AWAITING:
-            silent = next((arm for arm, reading in readings.items() if not reading.is_there), "")
-            return f"no report from {silent} yet" if silent else ""
-        waiting = [arm for arm in agreement.partners if readings[arm].value.state == State.HOLDING]
-        return f"{waiting[0]}: {readings[waiting[0]].value.reason}" if waiting else ""
+            for arm, reading in self._readings.items():
+                if not reading.is_there:
+                    return f"no report from {arm} yet"
+        for arm in agreement.partners:
+            report = self._readings[arm].value
+            if report.state == State.HOLDING:
+                return f"{arm}: {report.reason}"
+        return ""
 
-    def _check_progress(self, readings: Mapping[str, Reading], waits: str, tick: int) -> None:
+    def _check_progress(self, waits: str, tick: int) -> None:
         """End the program when nothing has happened for too long, unless an operator keeps it from
         going on."""
         agreement = self._agreement
-        reports = [reading.value for reading in readings.values()]
+        reports = [reading.value for reading in self._readings.values()]
         operated = self._operated.standing is not Operation.NONE or any(
             report.operated for report in reports
         )
@@ -161,13 +158,13 @@ class Coordinator(Executor):
             agreement.order,
             *((r.echo, r.response, r.moves_done, r.moves) for r in reports),
         )
-        if operated or stage != self._stage or not self._steps:
+        if operated or stage != self._stage:
             self._stage = stage
             self._moved_at = tick
         elif (tick - self._moved_at) * self.context.tick_s > self._table.stalled_s:
             awaited = waits or f"step {agreement.step}: {', '.join(agreement.partners)}"
             reason = f"nothing has happened for {self._table.stalled_s:g} s: {awaited}"
-            agreement.end(Error.STALLED, reason, tick * self.context.tick_s)
+            agreement.end(Error.STALLED, reason)
 
     def _order(self, arm: str, held: str, order: Message) -> None:
         """Fill the order for one arm."""
@@ -175,49 +172,31 @@ class Coordinator(Executor):
         what = agreement.verb(arm)
         if what in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
             write_action(self._steps[agreement.step][arm], order)
-        is_none = what is OrderVerb.NONE
-        order.id, order.program = (0, 0) if is_none else (agreement.order, agreement.program)
+        is_spoken_to = what is not OrderVerb.NONE
+        order.id = agreement.order if is_spoken_to else 0
+        order.program = agreement.program if is_spoken_to else 0
         order.what = what
         order.hold = bool(held)
         order.reason = agreement.reason if what is OrderVerb.END else held
 
-    def _report(self, readings: Mapping[str, Reading], waits: str, status: Message) -> None:
+    def _report(self, waits: str, status: Message) -> None:
         agreement = self._agreement
-        status.state = self._state()
-        if waits and status.state == State.EXECUTING:
-            status.state = State.HOLDING
-        is_over = agreement.phase is Phase.OVER
-        status.error = agreement.error if is_over else Error.NONE
-        status.reason = (
-            agreement.reason if is_over else waits if status.state == State.HOLDING else ""
-        )
+        status.state = State.IDLE
+        status.error = Error.NONE
+        status.reason = ""
+        if agreement.phase is Phase.OVER:
+            status.state = State.ERROR if agreement.error else State.DONE
+            status.error = agreement.error
+            status.reason = agreement.reason
+        elif self._steps:
+            status.state = State.HOLDING if waits else State.EXECUTING
+            status.reason = waits
         status.action = agreement.step
         status.actions = len(self._steps)
-        done, moves = self._moves_of_step(readings)
+        done, moves = self._moves_of_step()
         fill_counts(
             status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves)
         )
         if self._operated.standing is Operation.HOLD:
             self._operated.done()
         self._operated.report(status)
-
-    def _state(self) -> State:
-        if not self._steps:
-            return State.IDLE
-        if self._agreement.phase is Phase.OVER:
-            return State.ERROR if self._agreement.error else State.DONE
-        return State.EXECUTING
-
-
-def answer_of(reading: Reading) -> ArmAnswer:
-    """Return what a `CELL_REPORT` answers."""
-    report: Message = reading.value
-    return ArmAnswer(
-        is_there=reading.is_there and not reading.is_lost,
-        program=report.program,
-        order=report.echo,
-        response=Response(report.response),
-        error=report.error,
-        reason=report.reason,
-        until=report.until,
-    )

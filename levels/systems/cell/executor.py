@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.levels.errors import ProgramError
 from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
-from rack.levels.messages import WORLD_MODEL, Error
+from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
 from rack.levels.operator import Operation
 from rack.levels.peer import PEER, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
@@ -23,6 +23,8 @@ from rack.levels.tables import read_params
 from rack.levels.task.executor import TaskExecutor
 from rack.levels.task.program import AnyAction
 
+PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
+"""Answers to an order that rest on its plan."""
 MAX_STRAY_RAD = 0.005
 """A plan holds if no joint has moved farther since it was requested."""
 
@@ -48,12 +50,12 @@ class OrderedTaskExecutor(TaskExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._table = read_params(OrderedTaskParams, context.params)
-        self._source = (
-            f"rack '{self._table.coordinator}'" if self._table.coordinator else "the coordinator"
-        )
+        rack = self._table.coordinator
+        self._source = f"rack '{rack}'" if rack else "the coordinator"
         self._taken = TakenOrder()
         self._begun = 0  # request whose plan is followed; 0: none
-        self._orders_begun = self._orders_done = 0
+        self._orders_begun = 0
+        self._orders_done = 0
         self._moves = 0, 0  # done, of how many, of the newest order begun
         self._halted = False  # moves were withdrawn: the arm is held until another order begins
         self._breaking_off: int | None = None  # first move that must not begin
@@ -62,7 +64,7 @@ class OrderedTaskExecutor(TaskExecutor):
         self._held = ""  # why the coordinator holds the arm
         self._waits = ""  # why an order cannot be planned yet
         self._is_end_reported = False
-        self._nothing: Message | None = None  # the plan of no order
+        self._nothing = Message(TASK_PLAN.dtype(context.sizes))  # the plan of no order
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
@@ -71,12 +73,10 @@ class OrderedTaskExecutor(TaskExecutor):
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
             return MadePorts(is_whole=False)
-        peer = (
-            {"peer": Input(PEER, f"lan.{peer_port(table.coordinator)}")}
-            if table.coordinator
-            else {}
-        )
-        return MadePorts({"order": Input(CELL_ORDER, table.orders), **peer})
+        ports = {"order": Input(CELL_ORDER, table.orders)}
+        if table.coordinator:
+            ports["peer"] = Input(PEER, f"lan.{peer_port(table.coordinator)}")
+        return MadePorts(ports)
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
         return ()
@@ -109,12 +109,11 @@ class OrderedTaskExecutor(TaskExecutor):
         if taken.is_asked:
             self._answer_order(read, request, tick)
         elif taken.is_under_way and not self._begun:
-            self._begin(read, request, tick)
+            self._begin(read, request)
         write.status.echo = plan.id if plan.id == request.id else 0
         self._fill_times(plan, request, write.report)
         below = read.status.value
         write.report.operated = below.operated or self._orders.standing is not Operation.NONE
-        self._nothing = self._nothing or Message(plan.record.dtype)
         return plan if self._begun and self._begun == plan.id else self._nothing
 
     def _listen(self, reading: Reading) -> None:
@@ -127,7 +126,8 @@ class OrderedTaskExecutor(TaskExecutor):
             self._absent = f"{self._source} is lost: held until it is back"
         else:
             self._taken.hear(order.program, order.id, order.what, order.reason)
-            self._held = order.reason if order.hold and self._taken.is_under_way else ""
+            if order.hold and self._taken.is_under_way:
+                self._held = order.reason
         if self._taken.response is Response.ENDED:
             if self._is_end_reported and not self._error:
                 self._error = self._taken.error
@@ -140,26 +140,25 @@ class OrderedTaskExecutor(TaskExecutor):
         taken = self._taken
         if (request.program, request.order) == (taken.program, taken.order):
             if plan.id == request.id and not plan.error:
-                taken.promise()
+                taken.answer(Response.POSSIBLE)
             elif plan.id == request.id:
                 taken.fail(Error(plan.error), plan.reason)
             return
-        order = read.order.value
-        ahead_s = self._ahead(read)
-        now_s = tick * self.context.tick_s
         self._waits = self._not_ready(read)
         if self._waits:
             return
+        order = read.order.value
+        # The coordinator's simulated time less that here.
+        ahead_s = float(read.peer.value.ahead) if self._table.coordinator else 0.0
+        now_s = tick * self.context.tick_s
         try:
             action = read_action(order, self.context.robot, self.context.scene)
         except ProgramError as error:
             taken.fail(Error.UNREACHABLE, str(error))
             return
         if action.by is not None and action.by - ahead_s <= now_s:
-            taken.fail(
-                Error.TOO_LATE,
-                f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already",
-            )
+            why = f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already"
+            taken.fail(Error.TOO_LATE, why)
             return
         request.program = taken.program
         request.order = taken.order
@@ -175,25 +174,19 @@ class OrderedTaskExecutor(TaskExecutor):
         request.revision = read.world.value.revision
         request.start = read.status.value.start
 
-    def _ahead(self, read: Ports) -> float:
-        """Return the coordinator's simulated time less that here, s."""
-        return float(read.peer.value.ahead) if self._table.coordinator else 0.0
-
-    def _knows_time(self, read: Ports) -> bool:
-        peer: Reading | None = read.peer if self._table.coordinator else None
-        return peer is None or (peer.is_there and peer.value.uncertainty >= 0.0)
-
     def _not_ready(self, read: Ports) -> str:
         """Return why nothing can be planned now; empty: it can."""
         if self._orders.standing is not Operation.NONE or not read.status.value.resting:
             return "the arm does not rest yet"
         if not read.world.value.revision:
             return "the world model knows nothing yet"
-        if read.order.value.by and not self._knows_time(read):
-            return f"the clock of {self._source} has not been compared yet"
+        if read.order.value.by and self._table.coordinator:
+            peer = read.peer
+            if not (peer.is_there and peer.value.uncertainty >= 0.0):
+                return f"the clock of {self._source} has not been compared yet"
         return ""
 
-    def _begin(self, read: Ports, request: Message, tick: int) -> None:
+    def _begin(self, read: Ports, request: Message) -> None:
         """Begin with the plan that was promised; have it planned anew if the world has changed
         since."""
         if not self._actions:
@@ -222,11 +215,11 @@ class OrderedTaskExecutor(TaskExecutor):
         rested = self._rests
         self._rests = False
         if self._taken.stops and self._detour.move:
-            self._taken.finish(Response.STOPPED)
+            self._taken.answer(Response.STOPPED)
         elif self._taken.stops:
             self._breaking_off, self._rests = self._window.breaking_off(plan, done, below)
             if rested and below.resting:
-                self._taken.finish(Response.STOPPED)
+                self._taken.answer(Response.STOPPED)
                 self._halted = True
         return done
 
@@ -257,9 +250,11 @@ class OrderedTaskExecutor(TaskExecutor):
         self._settle(plan)
         taken = self._taken
         if self._begun:
-            self._moves = report.moves_done, report.moves = self._done, plan.count
+            self._moves = self._done, plan.count
+            report.moves_done, report.moves = self._moves
         elif (report.program, report.echo) != (taken.program, taken.order):
-            report.moves_done = report.moves = 0
+            report.moves_done = 0
+            report.moves = 0
         super()._report(plan, waits, write)
         status.echo = echo
         fill_counts(status.record[["action", "actions"]], (self._orders_done, self._orders_begun))
@@ -291,24 +286,22 @@ class OrderedTaskExecutor(TaskExecutor):
             self._error = Error.NONE
             self._reason = ""
         elif taken.is_under_way and plan.count and self._done == plan.count:
-            taken.finish(Response.DONE)
+            taken.answer(Response.DONE)
             self._orders_done += 1
 
     def _fill_times(self, plan: Message, request: Message, report: Message) -> None:
         """Report the earliest end, and how long a promise holds, in the coordinator's time."""
-        report.earliest = report.until = 0.0
-        if plan.id == request.id and self._taken.response in (
-            Response.POSSIBLE,
-            Response.DOING,
-            Response.REFUSED,
-        ):
+        response = self._taken.response
+        report.earliest = 0.0
+        report.until = 0.0
+        if plan.id == request.id and response in PLANNED:
             report.earliest = plan.earliest
-        if self._taken.response is Response.POSSIBLE and request.by:
+        if response is Response.POSSIBLE and request.by:
             report.until = request.begin + request.ahead + request.by - plan.earliest
 
     def _answer(self, below: Message, write: Ports) -> None:
         super()._answer(below, write)
-        is_held = self._taken.is_under_way and bool(self._absent or self._held)
+        is_held = self._taken.is_under_way and (self._absent or self._held)
         if not self._detour.move and (self._halted or self._rests or is_held):
             write.command.hold = 1
 

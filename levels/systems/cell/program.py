@@ -94,7 +94,7 @@ class CellProgram(Program):
                     )
                 yield from _too_long(place, action)
                 arms.add(action.arm)
-            latest = max([latest, *(action.by for action in step.do if action.by is not None)])
+            latest = max([latest, *(action.by or 0.0 for action in step.do)])
 
 
 def _too_long(

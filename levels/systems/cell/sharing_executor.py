@@ -80,25 +80,18 @@ class SharingServoExecutor(ServoExecutor):
         names = context.params["shared"]
         scene = context.scene
         for name in dict.fromkeys(names):
+            why = ""
             if name not in scene.objects:
-                kind = (
-                    "an obstacle, which moves by itself"
-                    if name in scene.obstacles
-                    else "not in the scene"
-                )
-                yield (
-                    "params.shared",
-                    name,
-                    f"{kind}; objects: {', '.join(scene.objects) or 'none'}",
-                )
+                why = "not in the scene"
+                if name in scene.obstacles:
+                    why = "an obstacle, which moves by itself"
+                why += f"; objects: {', '.join(scene.objects) or 'none'}"
             elif names.count(name) > 1:
-                yield "params.shared", name, "named twice"
+                why = "named twice"
             elif len(name) > NAME_BYTES or not name.isascii():
-                yield (
-                    "params.shared",
-                    name,
-                    f"no name for a message; permitted: ASCII, at most {NAME_BYTES} characters",
-                )
+                why = f"no name for a message; permitted: ASCII, at most {NAME_BYTES} characters"
+            if why:
+                yield "params.shared", name, why
         yield from super().misfits(context, above, below)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:

@@ -30,12 +30,12 @@ class TakenOrder:
 
     def __init__(self, report: Message | None = None) -> None:
         """Begin without an order, or with that of a `CELL_REPORT`, after a restart of the board."""
-        self.program = self.order = 0
+        self.program = 0
+        self.order = 0
         self.response = Response.NONE
-        self.error, self.reason = (
-            Error.NONE,
-            "",
-        )  # of a refusal, a failure, or a program that ends early
+        # Of a refusal, a failure, or a program that ends early.
+        self.error = Error.NONE
+        self.reason = ""
         self.stops = False  # under way, and to be broken off
         if report is not None and report.echo:
             self.program = report.program
@@ -60,36 +60,32 @@ class TakenOrder:
         early."""
         if not order or what not in TAKEN or self.response is Response.ENDED:
             return
+        if what != OrderVerb.END:
+            reason = ""
         is_same = (program, order) == (self.program, self.order)
         if self.is_under_way:
             self.stops = self.stops or not is_same or what in (OrderVerb.CANCEL, OrderVerb.END)
         elif what == OrderVerb.END or not is_same:
             self.program = program
             self.order = order
-            self._answer(TAKEN[OrderVerb(what)], reason if what == OrderVerb.END else "")
+            self.answer(TAKEN[OrderVerb(what)], reason)
         elif what == OrderVerb.CANCEL and self.response in (Response.NONE, Response.POSSIBLE):
-            self._answer(Response.CANCELLED)
+            self.answer(Response.CANCELLED)
         elif what == OrderVerb.DO and self.response is Response.POSSIBLE:
-            self._answer(Response.DOING)
+            self.answer(Response.DOING)
         elif what == OrderVerb.DO and self.is_asked:
-            self._answer(Response.FAILED)
+            self.answer(Response.FAILED)
         if self.response is Response.FAILED and not self.error:
             self.error = Error.GIVEN_UP
             self.reason = NOT_PROMISED
 
-    def promise(self) -> None:
-        """Answer that it is possible."""
-        self._answer(Response.POSSIBLE)
-
     def fail(self, error: Error, reason: str) -> None:
         """Refuse the order to which an answer is due, or end the one under way."""
-        self._answer(Response.REFUSED if self.is_asked else Response.FAILED, reason, error)
+        response = Response.REFUSED if self.is_asked else Response.FAILED
+        self.answer(response, reason, error)
 
-    def finish(self, response: Response) -> None:
-        """End the order under way, as DONE or STOPPED."""
-        self._answer(response)
-
-    def _answer(self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP) -> None:
+    def answer(self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP) -> None:
+        """Answer the order; without a reason nothing is wrong."""
         self.response = response
         self.reason = reason
         self.stops = False

@@ -11,13 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rack.backplane.message import Message
+from rack.levels.level import Reading, Verdict
 from rack.levels.messages import Error
-from rack.levels.systems.cell.agreement import ATTEMPTS, BEGUN, MAX_ATTEMPTS, Agreement, ArmAnswer
+from rack.levels.systems.cell.agreement import ATTEMPTS, BEGUN, MAX_ATTEMPTS, Agreement
 from rack.levels.systems.cell.messages import CELL_PROGRESS, CELL_REPORT, OrderVerb, Phase, Response
 from rack.levels.systems.cell.taken import TakenOrder
 
 PROGRAM, ARMS = 7, ("puma", "k1607", "third")
 STEPS = (("puma", "k1607"), ("third",), ("k1607", "puma", "third"))
+SILENCE = Reading(Message(CELL_REPORT.dtype({})), Verdict.NONE)
 FINISH = 400
 """Cycles after which an undisturbed program is over."""
 
@@ -43,7 +45,7 @@ class PlayedArm:
     def __post_init__(self) -> None:
         self.report = Message(CELL_REPORT.dtype({}))
 
-    def cycle(self, order: tuple[int, OrderVerb, str], now_s: float) -> ArmAnswer:
+    def cycle(self, order: tuple[int, OrderVerb, str], now_s: float) -> Reading:
         """Take up what is said; return the report."""
         taken = self.taken
         asked, was_under_way = taken.is_asked, taken.is_under_way
@@ -58,26 +60,28 @@ class PlayedArm:
             taken.response,
         )
         self.report.error, self.report.reason = taken.error, taken.reason
-        head = taken.program, taken.order, taken.response
-        return ArmAnswer(True, *head, taken.error, taken.reason, self.until)
+        self.report.until = self.until
+        answer = Message(self.report.record.dtype)
+        answer.copy_from(self.report)
+        return Reading(answer, Verdict.NEW)
 
     def _plan(self, now_s: float) -> None:
         if at(self.taken.order) in self.refuses:
             self.taken.fail(Error.NO_PATH, "something is in the way")
         else:
-            self.taken.promise()
+            self.taken.answer(Response.POSSIBLE)
             self.until = now_s + self.keeps_s if self.keeps_s else 0.0
 
     def _move(self, is_first: bool) -> None:
         step = at(self.taken.order)
         self.moved = 0 if is_first else self.moved + 1
         if self.taken.stops:
-            self.taken.finish(Response.STOPPED)
+            self.taken.answer(Response.STOPPED)
             self.stopped += 1
         elif self.moved == 2 and step in self.fails:
             self.taken.fail(Error.GRASP_MISSED, "holds nothing")
         elif self.moved == 2:
-            self.taken.finish(Response.DONE)
+            self.taken.answer(Response.DONE)
             self.done[step] += 1
 
     def restart(self) -> None:
@@ -96,10 +100,10 @@ class Play:
 
     def __init__(self, **arms: PlayedArm) -> None:
         self.arms = {name: arms.get(name, PlayedArm()) for name in ARMS}
-        self.agreement = Agreement(PROGRAM, STEPS, margin_s=1.0)
+        self.agreement = Agreement(PROGRAM, STEPS, margin_s=1.0, farewell_s=50.0)
         self.progress = Message(CELL_PROGRESS.dtype({}))
         self.orders = dict.fromkeys(ARMS, (0, OrderVerb.NONE, ""))
-        self.answers = dict.fromkeys(ARMS, ArmAnswer())
+        self.answers = dict.fromkeys(ARMS, SILENCE)
         self.now_s = 0.0
 
     def cycle(self, lost: frozenset[str] = frozenset()) -> None:
@@ -110,7 +114,6 @@ class Play:
             if name not in lost:
                 self.answers[name] = answer
         self.agreement.advance(self.answers, self.now_s)
-        self.agreement.take_leave(self.answers, self.now_s, farewell_s=50.0)
         self.agreement.write_to(self.progress)
         for name in ARMS:
             if f">{name}" not in lost:
@@ -127,11 +130,11 @@ class Play:
         if who in self.arms:
             self.arms[who].restart()
             return
-        self.agreement = Agreement(PROGRAM, STEPS, margin_s=1.0)
+        self.agreement = Agreement(PROGRAM, STEPS, margin_s=1.0, farewell_s=50.0)
         if who == "cell":
             self.agreement.recall(self.progress)
         else:
-            self.answers = dict.fromkeys(ARMS, ArmAnswer())
+            self.answers = dict.fromkeys(ARMS, SILENCE)
 
     def check(self) -> None:
         """No arm does an order that another one has refused; none does a step twice."""
@@ -267,7 +270,7 @@ def test_promise_that_expires_is_asked_for_so_many_times(
 def test_order_that_was_never_promised_fails() -> None:
     arm = PlayedArm()
     answer = arm.cycle((3000, OrderVerb.DO, ""), 1.0)
-    assert (answer.response, answer.reason) == (
+    assert (answer.value.response, answer.value.reason) == (
         Response.FAILED,
         "told to do what it has not promised: its rack was launched anew",
     )
