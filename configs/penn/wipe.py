@@ -12,9 +12,13 @@ from rack.levels.systems.trajectory.messages import RequestEnd
 
 X = 0.50
 DOWN = (0.0, 0.0, 1.0, 0.0)
-ABOVE, SURFACE = 0.62, 0.50  # m: a free height, and where the surface should be
-START, END, BEYOND = -0.25, 0.12, 0.30  # m, along y; the wall is somewhere before BEYOND
-PRESS, STEP = 15.0, 0.002  # N; m: the force is looked at once on so much of the way
+ABOVE = 0.62  # m: a free height
+SURFACE = 0.50  # m: where it should be
+START = -0.25  # m, along y, as are END and BEYOND
+END = 0.12
+BEYOND = 0.30  # the wall is somewhere before it
+PRESS = 15.0  # N
+STEP = 0.002  # m: the force is looked at once on so much of the way
 
 
 def expect(request, end, what):

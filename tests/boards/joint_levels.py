@@ -84,7 +84,7 @@ class StallingArm(ArmExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         self._given = read_params(StallingParams, context.params)
-        super().__init__(context, self._given)
+        super().__init__(context)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Drive the arm, unless it stalls: its messages are those of the last cycle then."""

@@ -16,12 +16,14 @@ from rack.levels.level import Finding, Input, LevelContext, Ports
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Reaction
+from rack.levels.systems.force.contact import HALVES
 from rack.levels.systems.force.messages import WRENCH
 from rack.levels.systems.force.wrist_level import WristLevel
 from rack.levels.systems.joint_boards import ArmExecutor
 from rack.levels.tables import read_params
 
-KINDS = ((Alarm.FORCE_LIMIT, "force", "N"), (Alarm.MOMENT_LIMIT, "torque", "N m"))
+ALARMS = (Alarm.FORCE_LIMIT, Alarm.MOMENT_LIMIT)
+"""By half of a wrench."""
 
 
 class ForceArmParams(ArmParams):
@@ -59,15 +61,14 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         params = read_params(ForceArmParams, context.params)
-        super().__init__(context, params)
+        super().__init__(context)
         assert self.cell.wrist is not None, "`misfits` refuses an arm without a sensor"
         self._most = self.cell.wrist.most
         self._on_limit = Reaction[params.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
         self._exact = self.cell.encoders.exact
-        self._before = np.zeros(
-            len(self.cell.dof)
-        )  # (joints,), rad/s: velocities at the tick before
+        # (joints,), rad/s: velocities at the tick before.
+        self._before = np.zeros(len(self.cell.dof))
         self._since: int | None = None  # that tick; None: not known
         self._exceeded = 0  # cycles in which the contact was beyond the limits
 
@@ -96,16 +97,11 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         raw = self.arm.feel()
         velocity = self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
-        passed_s = self.context.tick_s * (
-            self.context.every if self._since is None else tick - self._since
-        )
-        known = (
-            self._since is not None
-            and not self.sensors.faulty
-            and (self._exact or not self.abandoned)
-        )
-        gained = velocity - self._before if known else np.zeros(len(velocity))
-        self.contact.take(raw, self.sensors.state, gained / passed_s)
+        acceleration = np.zeros(len(velocity))
+        known = not self.sensors.faulty and (self._exact or not self.abandoned)
+        if known and self._since is not None:
+            acceleration = (velocity - self._before) / (self.context.tick_s * (tick - self._since))
+        self.contact.take(raw, self.sensors.state, acceleration)
         self._before[:] = velocity
         self._since = tick
         self._limit(tick)
@@ -125,10 +121,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
                 found, "contact too strong: the wrist sensor is at the end of its range", tick
             )
             return
-        for part, most, (alarm, what, unit) in zip(
-            (slice(0, 3), slice(3, 6)), self._most, KINDS, strict=True
-        ):
-            strength = norm(contact.wrench[part])
+        for (half, what, unit), most, alarm in zip(HALVES, self._most, ALARMS, strict=True):
+            strength = norm(contact.wrench[half])
             if strength > most:
                 text = f"contact too strong: {what} of {strength:.3g} {unit}; permitted: {most:g}"
                 self._stop(Finding(alarm, -1, strength), text, tick)

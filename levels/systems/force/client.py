@@ -23,9 +23,9 @@ from pydantic import ValidationError
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
 from rack.levels.level import Input, LevelContext
-from rack.levels.systems.force.contact import AXIS_NAMES
+from rack.levels.systems.force.contact import AXIS_NAMES, Wanted
 from rack.levels.systems.force.messages import SERVER_REQUEST, SERVER_STATUS, Mode
-from rack.levels.systems.force.program import ContactConfig, ForceProgram, Wanted
+from rack.levels.systems.force.program import ContactConfig, ForceProgram
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
 from rack.levels.systems.trajectory.messages import MotionKind
 
@@ -85,10 +85,10 @@ class ForceMotions(Motions):
     def _wanted(self, call: str, name: str, changes: Mapping[str, Any]) -> Wanted:
         """Return a contact of the program, with changes. Raises `LevelError`."""
         contact = self._program.contact.get(name)
-        known = ", ".join(self._program.contact)
         if contact is None:
+            known = ", ".join(self._program.contact) or "none"
             raise LevelError(
-                f"{call}: contact '{name}' is not in [task.contact]; permitted: {known or 'none'}"
+                f"{call}: contact '{name}' is not in [task.contact]; permitted: {known}"
             )
         try:
             changed = ContactConfig(**{**contact.model_dump(), **changes})

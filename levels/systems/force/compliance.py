@@ -27,10 +27,8 @@ class ComplianceWatch:
         self._most = most
         self._oldest = OLDEST_CYCLES * every
         self.task: ForceTask | None = None  # axes of force; None: there are none
-        self.struck, self.axis = (
-            0,
-            -1,
-        )  # id of the newest command whose guard was struck, and its axis
+        self.struck = 0  # id of the newest command whose guard was struck
+        self.axis = -1  # of that guard
         self.sensed = -1  # tick of the newest wrench; -1: none yet
         self.felt = np.zeros(AXES)  # (6,), N, N m: of the contact on the tool, in the task frame
         self.rests = False  # the motion must end

@@ -4,9 +4,10 @@ a motion."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
@@ -24,6 +25,22 @@ SAME = 1e-9
 """Largest difference between the numbers of quaternions that are the same."""
 
 
+class Wanted(NamedTuple):
+    """What a request asks of a contact; the last four (6,), by axis. See `SERVER_REQUEST`."""
+
+    frame: Array  # (4,)
+    selected: NDArray[np.bool_]
+    wrench: Array
+    speed: Array
+    guard: Array
+
+    @classmethod
+    def of(cls, record: Any) -> Self:
+        """Return that of the record of a request."""
+        wanted = cls(*(record[name] for name in cls._fields))
+        return wanted._replace(selected=wanted.selected.astype(bool))
+
+
 class Contact:
     """What is in force: the content of a server's `COMPLIANCE`."""
 
@@ -38,18 +55,19 @@ class Contact:
         """Whether any axis is one of force."""
         return bool(self.selected.any())
 
-    def comply(self, frame: Array, selected: Array, wrench: Array, speed: Array) -> bool:
+    def comply(self, wanted: Wanted) -> bool:
         """Replace the axes of force, and the guards if the frame is another; return whether motion
         begins anew."""
-        turned = not self._is_frame(frame)
+        selected = wanted.selected
+        turned = not self._is_frame(wanted.frame)
         begins_anew = self.complies and (turned or bool((self.selected != selected).any()))
         if turned:
             self.guard[:] = 0.0
         self.id += 1
-        self.frame[:] = frame / norm(frame)
+        self.frame[:] = wanted.frame / norm(wanted.frame)
         self.selected[:] = selected
-        self.speed[:] = speed
-        self.wrench[:] = np.where(selected, wrench, 0.0)
+        self.speed[:] = wanted.speed
+        self.wrench[:] = np.where(selected, wanted.wrench, 0.0)
         return begins_anew
 
     def watch(self, frame: Array, guard: Array) -> None:
@@ -91,17 +109,13 @@ class Contact:
         """Fill a `COMPLIANCE`."""
         compliance.id = self.id
         compliance.active = self.complies or bool(self.guard.any())
-        compliance.frame = self.frame
-        compliance.selected = self.selected
-        compliance.wrench = self.wrench
-        compliance.speed = self.speed
-        compliance.guard = self.guard
+        for name in Wanted._fields:
+            setattr(compliance, name, getattr(self, name))
 
     def recall(self, compliance: Message) -> None:
         """Continue from the last message of a level that was restarted."""
         self.id = compliance.id
-        self.selected[:] = compliance.selected
-        for name in ("frame", "wrench", "speed", "guard"):
+        for name in Wanted._fields:
             getattr(self, name)[:] = getattr(compliance, name)
 
 

@@ -64,9 +64,8 @@ class HybridExecutor(WristLevel):
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._boards = JointBoards(context.robot.joints)
         self._target: Array = cell.home.copy()  # (joints,), rad: commanded last
-        self._moving = np.zeros(
-            len(cell.home)
-        )  # (joints,), rad/s: of the motion alone, without that for forces
+        # (joints,), rad/s: of the motion alone, without that for forces.
+        self._moving = np.zeros(len(cell.home))
         self._still = np.zeros(len(cell.home))
         self._tick: int | None = None  # of the last cycle
 
@@ -113,9 +112,8 @@ class HybridExecutor(WristLevel):
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every
-        command.position, command.velocity, command.acceleration, command.inertia, command.load = (
-            joints
-        )
+        for name, values in joints._asdict().items():
+            setattr(command, name, values)
         self._target = joints.position
         self._moving[:] = motion.velocity
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
@@ -136,10 +134,14 @@ class HybridExecutor(WristLevel):
         status.due = read.command.value.due
         worst = max(values, key=lambda value: value.error)
         kept = self._watch.reason if self._boards.in_step else self._boards.awaited
-        resting = State.IDLE if self._reference.holding else State.EXECUTING
-        status.state = State.ERROR if worst.error else State.HOLDING if kept else resting
         status.error = worst.error
         status.reason = worst.reason if worst.error else kept
+        if worst.error:
+            status.state = State.ERROR
+        elif kept:
+            status.state = State.HOLDING
+        else:
+            status.state = State.IDLE if self._reference.holding else State.EXECUTING
 
     def _report_force(self, compliance: Message, force: Message) -> None:
         watch = self._watch

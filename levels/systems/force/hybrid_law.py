@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.levels.algebra import Array, gram, mat_vec, solve, transposed_mat_vec
+from rack.levels.planning.pose import site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo.curves import Motion
@@ -65,9 +66,8 @@ class ForceTask(NamedTuple):
     rotation: Array  # (3, 3), of the task frame in the world
     selected: NDArray[np.bool_]  # (6,), axes of force
     wanted: Array  # (6,), N, N m: of the tool on the surroundings, on axes of force
-    exerted: (
-        Array | None
-    )  # (6,), N, N m: of the tool on the surroundings; None: not known, so force axes rest
+    # (6,), N, N m: of the tool on the surroundings; None: not known, so force axes rest.
+    exerted: Array | None
     speed: Array  # (6,), m/s, rad/s: most on axes of force
 
 
@@ -94,12 +94,9 @@ class ToolKinematics:
         self.terms = self._dynamics.terms(position, velocity, payload)
         model, data = self._dynamics.evaluated
         mujoco.mj_jacSite(model, data, self._whole[:3], self._whole[3:], self._cell.tool)
-        self.jacobian: Array = np.take(
-            self._whole, self._cell.dof, axis=1
-        )  # (6, joints), in the world's frame
-        self.position = data.site_xpos[self._cell.tool].copy()  # (3,), m
-        self.quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(self.quaternion, data.site_xmat[self._cell.tool])
+        # (6, joints), in the world's frame.
+        self.jacobian: Array = np.take(self._whole, self._cell.dof, axis=1)
+        self.pose = site_pose(data, self._cell.tool)
 
 
 class HybridLaw:
@@ -115,9 +112,9 @@ class HybridLaw:
         self._smoothing_s = gains.smoothing
         self._there = ToolKinematics(cell)
         self._here = ToolKinematics(cell)
-        self._away, self._speed, self._base = np.zeros(
-            (3, joints)
-        )  # dq, its velocity; dq of a motion without force
+        self._away = np.zeros(joints)  # dq
+        self._speed = np.zeros(joints)  # its velocity
+        self._base = np.zeros(joints)  # dq of a motion without force
         self._forward = np.zeros(AXES)  # N, N m: fed forward, in the world's frame
         self._forced = np.zeros(AXES)  # m/s, rad/s: on the axes of force, in the task frame
         self.offset = np.zeros(3)  # (3,), m: from where the motion alone would have the tool
@@ -151,7 +148,9 @@ class HybridLaw:
         most = self._limits.acceleration * passed_s
         part = float((np.abs(change) / most).max())
         before = self._speed.copy()
-        self._speed += change / part if part > 1.0 else change
+        if part > 1.0:
+            change /= part
+        self._speed += change
         self._away += (0.5 * passed_s) * (before + self._speed)
         low, high = self._limits.position.T
         position = np.clip(q + self._away, low, high)
@@ -168,24 +167,25 @@ class HybridLaw:
     def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
         """Return the joint velocities, rad/s, that follow the motion on its axes, and move for
         force on the others."""
-        there = self._there
-        here = self._here
-        there.look(motion.position + self._base, motion.velocity)
-        here.look(motion.position + self._away, motion.velocity + self._speed)
+        self._there.look(motion.position + self._base, motion.velocity)
+        self._here.look(motion.position + self._away, motion.velocity + self._speed)
+        there = self._there.pose
+        here = self._here.pose
         turn = np.zeros(3)
         error = np.zeros(AXES)
         error[:3] = there.position - here.position
         self.offset[:] = -error[:3]
         mujoco.mju_subQuat(turn, there.quaternion, here.quaternion)
         mujoco.mju_rotVecQuat(error[3:], turn, here.quaternion)
-        twist = turned(task.rotation.T, mat_vec(there.jacobian, motion.velocity) + CATCH_UP * error)
+        wanted = mat_vec(self._there.jacobian, motion.velocity) + CATCH_UP * error
+        twist = turned(task.rotation.T, wanted)
         forced = np.zeros(AXES)
         if task.exerted is not None:
             forced = np.clip(self._gain * (task.wanted - task.exerted), -task.speed, task.speed)
         forced -= self._forced
         self._forced += min(passed_s / self._smoothing_s, 1.0) * forced
         velocity = damped_inverse(
-            here.jacobian, turned(task.rotation, np.where(task.selected, self._forced, twist))
+            self._here.jacobian, turned(task.rotation, np.where(task.selected, self._forced, twist))
         )
         excess = float((np.abs(velocity) / self._limits.velocity).max())
         return velocity / excess if excess > 1.0 else velocity

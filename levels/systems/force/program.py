@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import Field
 
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Program
-from rack.levels.systems.force.contact import AXIS_NAMES, Axis, misfit
+from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
 from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, Vector
 
 MAX_COSINE = 1e-3
@@ -31,11 +31,9 @@ class FrameConfig(Table):
         if not lengths > 0.0:
             return "an axis of length 0: no frame"
         cosine = float((np.array(self.x) * self.z).sum()) / lengths
-        return (
-            ""
-            if abs(cosine) <= MAX_COSINE
-            else "its axes x and z are not at a right angle: no frame"
-        )
+        if abs(cosine) > MAX_COSINE:
+            return "its axes x and z are not at a right angle: no frame"
+        return ""
 
     @property
     def quaternion(self) -> Array:
@@ -61,16 +59,6 @@ class ContactConfig(Table):
     guard: dict[Axis, Positive] = Field(
         {}, description="wrench, either way, that ends a motion, N or N m; by axis"
     )
-
-
-class Wanted(NamedTuple):
-    """A contact as the numbers of a request; the last four (6,), by axis."""
-
-    frame: Array  # (4,)
-    selected: Array
-    wrench: Array
-    speed: Array
-    guard: Array
 
 
 class ForceProgram(Program):
@@ -114,11 +102,13 @@ class ForceProgram(Program):
 
     def wanted(self, contact: ContactConfig) -> Wanted:
         """Return a contact as the numbers of a request."""
-        wrench, speed, guard = (
-            by_axis(values) for values in (contact.wrench, contact.speed, contact.guard)
+        return Wanted(
+            frame=self.frame[contact.frame].quaternion,
+            selected=np.array([name in contact.wrench for name in AXIS_NAMES]),
+            wrench=by_axis(contact.wrench),
+            speed=by_axis(contact.speed),
+            guard=by_axis(contact.guard),
         )
-        selected = np.array([name in contact.wrench for name in AXIS_NAMES])
-        return Wanted(self.frame[contact.frame].quaternion, selected, wrench, speed, guard)
 
 
 def by_axis(values: Mapping[Axis, float]) -> Array:

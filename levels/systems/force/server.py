@@ -59,16 +59,16 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         assert wrist is not None, "`misfits` refuses an arm without a sensor"
         self._work.most = wrist.most_force, wrist.most_torque
         self._now = 0  # tick of this cycle
-        self._heard: int | None = (
-            None  # tick of the client's last sign of life; None: not yet counted
-        )
-        self._without, self._since = Mode.MOTION, 0  # mode without a client, and tick since when
+        self._heard = -1  # tick of the client's last sign of life; -1: not yet counted
+        self._without = Mode.MOTION  # mode without a client
+        self._since = 0  # tick since when
         self._sensed = np.array(context.robot.home)  # (joints,), rad
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Take requests, look at client and contact, go on with the motion."""
         self._now = tick
-        self._heard = tick if self._heard is None or read.requests.is_new else self._heard
+        if self._heard < 0 or read.requests.is_new:
+            self._heard = tick
         super().process(read, write, tick)
         self._work.contact.fill(write.compliance)
         write.compliance.operator = write.command.operator
@@ -128,17 +128,16 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             self._enter(Mode.RELEASING, "forces go to zero")
         elif self._without is Mode.RELEASING:
             is_over = self._passed_s(self._since) > params.reach
-            if is_over or (work.force is not None and (work.off() <= 1.0).all()):
+            if is_over or (work.off() <= 1.0).all():
                 work.release()
                 self._enter(Mode.RELEASED, "forces released, the position is held")
 
     def _lose_client(self) -> None:
-        complies = self._work.contact.complies
-        mode, what = (
-            (Mode.HELD, "forces are held") if complies else (Mode.RELEASED, "the position is held")
-        )
         self._work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
-        self._enter(mode, f"{what} for {self._params.hold:g} s" if complies else what)
+        if self._work.contact.complies:
+            self._enter(Mode.HELD, f"forces are held for {self._params.hold:g} s")
+        else:
+            self._enter(Mode.RELEASED, "the position is held")
 
     def _enter(self, mode: Mode, what: str) -> None:
         self._without = mode
@@ -146,13 +145,13 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         silent = f"no sign of life from the client for {self._params.silence:g} s"
         self._agenda.reason = f"{silent}: {what}; cancel, then go on"
 
-    def _passed_s(self, tick: int | None) -> float:
-        return 0.0 if tick is None else (self._now - tick) * self.context.tick_s
+    def _passed_s(self, tick: int) -> float:
+        return (self._now - tick) * self.context.tick_s
 
     def _show(self, status: Message) -> None:
         """Fill what a server's status says beyond a trajectory level's."""
         work = self._work
-        force = self._work.force
+        force = work.force
         status.mode = self.mode
         (status.place, status.quaternion) = self._ik.tool_at(self._sensed)
         status.frame = work.contact.frame

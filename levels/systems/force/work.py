@@ -9,7 +9,7 @@ from pydantic import Field
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import Error
-from rack.levels.systems.force.contact import AXIS_NAMES, UNITS, Contact, misfit
+from rack.levels.systems.force.contact import AXIS_NAMES, UNITS, Contact, Wanted, misfit
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
@@ -62,16 +62,12 @@ class ServerWork(RequestWork):
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
         self.contact = Contact()
-        self.force: Message | None = (
-            None  # FORCE_STATUS that answers the contact in force; None: none does yet
-        )
-        self.guarded, self.axis = (
-            0,
-            -1,
-        )  # newest request that a guard has ended, and the guard's axis
-        self._on_s = self._off_s = (
-            0.0  # time for which all forces are as wanted, and since they were settled
-        )
+        # FORCE_STATUS that answers the contact in force; None: none does yet.
+        self.force: Message | None = None
+        self.guarded = 0  # newest request that a guard has ended
+        self.axis = -1  # of that guard
+        self._on_s = 0.0  # time for which all forces are as wanted
+        self._off_s = 0.0  # time since they were settled
 
     def step(self, time_s: float, hold: bool) -> None:
         """Go on to the sample at `time_s`; with `hold`, ramp to rest. Judge the contact."""
@@ -150,25 +146,24 @@ class ServerWork(RequestWork):
         self.interrupt()
 
     def _misfit(self, request: MotionRequest) -> str:
-        r = request.record
+        wanted = Wanted.of(request.record)
+        frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
-            return misfit(r["frame"], (r["wrench"],), self.most) if r["selected"].any() else ""
+            return misfit(frame, (wanted.wrench,), self.most) if wanted.selected.any() else ""
         if request.kind == MotionKind.GUARD:
-            return misfit(r["frame"], (r["guard"],), self.most) or self.contact.objection(
-                r["frame"], r["guard"]
-            )
+            reason = misfit(frame, (wanted.guard,), self.most)
+            return reason or self.contact.objection(frame, wanted.guard)
         return super()._misfit(request)
 
     def _start(self, request: MotionRequest) -> None:
-        contact = self.contact
-        r = request.record
+        wanted = Wanted.of(request.record)
         if request.kind == MotionKind.GUARD:
-            contact.watch(r["frame"], r["guard"])
-        elif request.kind == MotionKind.COMPLY and r["selected"].any():
+            self.contact.watch(wanted.frame, wanted.guard)
+        elif request.kind == MotionKind.COMPLY and wanted.selected.any():
             usual = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
-            speed = np.where(r["speed"] > 0.0, r["speed"], usual)
+            speed = np.where(wanted.speed > 0.0, wanted.speed, usual)
             self._on_s = self._off_s = 0.0
-            if contact.comply(r["frame"], r["selected"].astype(bool), r["wrench"], speed):
+            if self.contact.comply(wanted._replace(speed=speed)):
                 self._begin_anew("the arm comes to rest: other axes of force")
         elif request.kind == MotionKind.COMPLY:
             self.release()

@@ -4,13 +4,13 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.level import Input, LevelContext, Ports, Reading, Verdict
+from rack.levels.level import Input, LevelContext, Ports, Reading
 from rack.levels.messages import ARM_STATE
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.dynamics import Terms
@@ -43,26 +43,20 @@ class ArmExecutor(ArmDriver):
     }
     outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
-    params = ArmParams
+    params: ClassVar[type[ArmParams]] = ArmParams
 
-    def __init__(self, context: LevelContext, params: ArmParams | None = None) -> None:
-        super().__init__(
-            context, read_params(ArmParams, context.params) if params is None else params
-        )
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context, read_params(self.params, context.params))
         limits = self.cell.limits
         self.joints = JointTorques(context, self.cell)
         self.orders = Orders(self.commands)
         rest_s = float(np.max(limits.velocity / limits.acceleration))
-        self._rest_ticks = round(rest_s / context.tick_s) + max(
-            self.joints.oldest.values(), default=0
-        )
+        self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values())
         self._defied = False  # the boards above have not brought it to rest in that time
-        self._rest_by: int | None = (
-            None  # tick by which the arm must have come to rest; None: it need not
-        )
-        self._braked_at: int | None = (
-            None  # tick of the first status that said so; None: not braked, or not yet said
-        )
+        # Tick by which the arm must have come to rest; None: it need not.
+        self._rest_by: int | None = None
+        # Tick of the first status that said so; None: not braked, or not yet said.
+        self._braked_at: int | None = None
         self._torques: Mapping[str, Reading] = {}
         self._waiting = ""  # why the boards above do not drive the arm
 
@@ -91,12 +85,9 @@ class ArmExecutor(ArmDriver):
                 )
         grips = [other.board for other in above if other.params.get("gripper", False)]
         if len(grips) != (context.robot.gripper is not None):
-            is_bare = context.robot.gripper is None
-            must = (
-                "the arm has no gripper"
-                if is_bare
-                else "the gripper must be commanded by one board"
-            )
+            must = "the gripper must be commanded by one board"
+            if context.robot.gripper is None:
+                must = "the arm has no gripper"
             yield "above", list(wanted), f"{must}; {_by(grips)}"
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
@@ -107,8 +98,7 @@ class ArmExecutor(ArmDriver):
     def take_messages(self, read: Ports) -> None:
         """Take over what is new."""
         self._torques = read.torques
-        if read.operator.verdict is Verdict.NEW:
-            self.orders.take(read.operator)
+        self.orders.take(read.operator)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return where the boards above want the arm; None: not all of them drive it."""
@@ -119,8 +109,7 @@ class ArmExecutor(ArmDriver):
         self._defied = self._defied and stops
         if self._defied or (reaction is Reaction.STOP and self.abandoned):
             return None
-        since = 0 if self._braked_at is None else self._braked_at
-        self._waiting = self.joints.missing(self._torques, tick, since)
+        self._waiting = self.joints.missing(self._torques, tick, self._braked_at or 0)
         if self._waiting:
             return None
         self.joints.add_up()
@@ -144,14 +133,13 @@ class ArmExecutor(ArmDriver):
         """
         away = self.joints.wanted.position - self.sensors.position
         joint = int(np.abs(away).argmax())
-        astray = abs(away[joint]) > ASTRAY_RAD
-        if astray:
-            name = self.context.robot.joints[joint]
-            self._waiting = (
-                f"braked: joint '{name}' is wanted more than {ASTRAY_RAD:g} rad away from where"
-                " it is"
-            )
-        return bool(astray)
+        if abs(away[joint]) <= ASTRAY_RAD:
+            return False
+        name = self.context.robot.joints[joint]
+        self._waiting = (
+            f"braked: joint '{name}' is wanted more than {ASTRAY_RAD:g} rad away from where it is"
+        )
+        return True
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
         """Return whether the arm `stops`, and the boards above have had enough time to bring it to
@@ -192,14 +180,12 @@ class ArmExecutor(ArmDriver):
     def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
         """Return what the status says of the torques from above."""
         held = self.orders.standing is Operation.HOLD
-        kept = self.stopping.reason or self._waiting or (HELD if held else "")
-        return (
-            0,
-            self.abandoned or not self.joints.moves,
-            self.abandoned or reaction > 0 or held,
-            0,
-            kept,
-        )
+        kept = self.stopping.reason or self._waiting
+        if held and not kept:
+            kept = HELD
+        holding = self.abandoned or not self.joints.moves
+        stopped = self.abandoned or reaction > 0 or held
+        return 0, holding, stopped, 0, kept
 
 
 def _by(boards: Sequence[str]) -> str:

@@ -17,6 +17,9 @@ LEAD_CYCLES = 2
 """Cycles of this board until a reference that is there has come to the boards below: they need it
 in time."""
 
+Link = deque[tuple[int, bytes]]
+"""Messages on their way, each with the tick at which it arrives."""
+
 
 class GatewayParams(Table):
     """`[board.<name>.params]`: the link to the level above, and what to do without it."""
@@ -47,19 +50,16 @@ class JointGateway(Executor):
         super().__init__(context)
         params = read_params(GatewayParams, context.params)
         every = context.every
-        self._delay = (
-            -(-round(params.delay / context.tick_s) // every) * every
-        )  # ticks: whole cycles
+        # Ticks, in whole cycles.
+        self._delay = -(-round(params.delay / context.tick_s) // every) * every
         self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
         self._missing = params.missing
         self._period = max(pace.every for pace in context.above.values())
         self._above = ", ".join(context.above)
-        self._down: deque[tuple[int, bytes]] = (
-            deque()
-        )  # messages on the link, with the tick at which they are here
-        self._up: deque[tuple[int, bytes]] = deque()
-        self._newest: Message | None = None  # reference that came
-        self._merged: Message | None = None  # status of the boards below, as one
+        self._down: Link = deque()
+        self._up: Link = deque()
+        self._newest = Message(JOINT_REFERENCE.dtype(context.sizes))  # reference that came
+        self._merged = Message(JOINT_STATUS.dtype(context.sizes))  # of the boards below, as one
         self._due = 0  # tick at which the last reference given is due; 0: none is followed
         self._frozen = False  # too many are missing
 
@@ -71,29 +71,23 @@ class JointGateway(Executor):
 
     def _take(self, command: Reading, tick: int) -> None:
         """Put what is new on the link; take what has passed it."""
-        if self._newest is None:
-            self._newest = Message(command.value.record.dtype)
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.value.raw)))
-        while self._down and self._down[0][0] <= tick:
-            self._newest.raw[:] = self._down.popleft()[1]
+        take_arrived(self._down, self._newest, tick)
 
     def _give(self, command: Message, tick: int) -> None:
         newest = self._newest
-        assert newest is not None
-        if not newest.due:
+        due = newest.due + self.latency if newest.due else 0
+        if not due or due > max(self._due, tick):
             command.raw[:] = newest.raw
-            self._due = 0
-            self._frozen = False
-        elif newest.due + self.latency > max(self._due, tick):
-            command.raw[:] = newest.raw
-            self._due = command.due = newest.due + self.latency
+            self._due = command.due = due
             self._frozen = False
         elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
-            self._extrapolate(newest, command)
+            self._extrapolate(command)
 
-    def _extrapolate(self, newest: Message, command: Message) -> None:
+    def _extrapolate(self, command: Message) -> None:
         """Make up the reference after the last one given, or give up."""
+        newest = self._newest
         ahead = self._due + self._period - self.latency - newest.due  # ticks
         if ahead > self._missing * self._period:
             self._due = command.due = 0
@@ -109,15 +103,12 @@ class JointGateway(Executor):
 
     def _report(self, statuses: Mapping[str, Reading], status: Message, tick: int) -> None:
         """Put the status of the boards below on the link; show the one that has passed it."""
-        if self._merged is None:
-            self._merged = Message(status.record.dtype)
-            self._merged.holding = self._merged.stopped = True
-        self._merge(statuses, self._merged)
+        self._merge(statuses)
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
-        while self._up and self._up[0][0] <= tick:
-            status.raw[:] = self._up.popleft()[1]
+        take_arrived(self._up, status, tick)
 
-    def _merge(self, statuses: Mapping[str, Reading], merged: Message) -> None:
+    def _merge(self, statuses: Mapping[str, Reading]) -> None:
+        merged = self._merged
         values = [reading.value for reading in statuses.values()]
         merged.position[:] = values[0].position
         for name in ("target", "target_velocity", "torque", "driven"):
@@ -128,14 +119,12 @@ class JointGateway(Executor):
         silent = [
             board for board, reading in statuses.items() if reading.is_lost or not reading.is_there
         ]
-        worst = max(
-            values, key=lambda value: (bool(value.error), bool(value.stopped), bool(value.holding))
-        )
-        merged.holding = any(bool(value.holding) for value in values)
-        merged.stopped = bool(silent) or any(bool(value.stopped) for value in values)
-        merged.echo = min([value.echo for value in values])
-        merged.due = min([value.due for value in values])
-        merged.operator = max([value.operator for value in values])
+        worst = max(values, key=lambda value: (value.error > 0, value.stopped, value.holding))
+        merged.holding = any(value.holding for value in values)
+        merged.stopped = bool(silent) or any(value.stopped for value in values)
+        merged.echo = min(value.echo for value in values)
+        merged.due = min(value.due for value in values)
+        merged.operator = max(value.operator for value in values)
         merged.state = worst.state
         merged.error = worst.error
         merged.reason = worst.reason
@@ -146,3 +135,9 @@ class JointGateway(Executor):
             late = f"no reference from '{self._above}'"
             merged.state = State.HOLDING
             merged.reason = f"{late}: held after {self._missing} extrapolated"
+
+
+def take_arrived(link: Link, message: Message, tick: int) -> None:
+    """Let what has arrived by `tick` replace `message`, the newest last."""
+    while link and link[0][0] <= tick:
+        message.raw[:] = link.popleft()[1]

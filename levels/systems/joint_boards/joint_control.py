@@ -31,9 +31,8 @@ class JointLoads:
         self._payload = Payload(0.0, np.zeros(3))
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(joints)
-        self._computed_at = np.full(
-            joints, np.nan
-        )  # (joints,), rad; NaN: they are those of a reference
+        # (joints,), rad; NaN: they are those of a reference.
+        self._computed_at = np.full(joints, np.nan)
 
     @staticmethod
     def are_good(command: Message) -> bool:
@@ -84,12 +83,10 @@ def servo_joints(
 
     torque = inertia (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + load + dry friction
     """
-    stiffness, damping, dry, limits = (
-        constants[0],
-        constants[1],
-        constants[2],
-        constants[3],
-    )  # 1/s2, 1/s, N m, N m
+    stiffness = constants[0]  # 1/s2
+    damping = constants[1]  # 1/s
+    dry = constants[2]  # N m
+    limits = constants[3]  # N m
     driven = constants[4]  # 1: a joint of this board; 0: of another
     joints = len(driven)
     for j in range(joints):

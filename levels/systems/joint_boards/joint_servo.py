@@ -12,7 +12,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, LevelContext, Ports, Verdict
+from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
@@ -91,21 +91,18 @@ class JointServo(Executor):
         self.operator = OperatorControl(
             self.commands, robot.joints, cell.limits.position, self._driven, modify=modify
         )
-        self._unmodified: Array = np.zeros(
-            7 * len(robot.joints)
-        )  # what the law sets for its modifications
+        # What the law sets for its modifications.
+        self._unmodified: Array = np.zeros(7 * len(robot.joints))
         self._grip = Grip(robot.gripper) if params.gripper and robot.gripper is not None else None
         below = max(pace.every for pace in context.below.values())
         # Ticks, of a status: while its board stalls for less, the arm goes on with the last
         # torques.
         self._oldest = below + cell.patience.ticks(below, context.tick_s)
-        self._sample: Array = np.zeros(
-            0
-        )  # numbers of a status of the arm, and of the messages to write
-        self._shown_numbers: tuple[Array, ...] = ()
+        self._sample: Array  # numbers of a status of the arm
+        self._shown_numbers: tuple[Array, ...] = ()  # of the messages to write
         self._offered: Message | None = None  # reference whose loads are not yet taken
         self._command = self._rests_on = self._due = 0
-        self._shown: tuple[int, bool, bool, int, str, Error] | None = None  # in the last status
+        self._shown: tuple[Any, ...] = ()  # in the last status
         self._met = False  # a status of the arm has come
 
     @classmethod
@@ -169,7 +166,7 @@ class JointServo(Executor):
             self._modify(times, wanted, tick)
         torque = write.command
         torque.sampled = sampled
-        torque.id = torque.id + 1
+        torque.id += 1
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
         torque.operator = operator.orders.rests_on(self._rests_on)
@@ -217,9 +214,9 @@ class JointServo(Executor):
 
     def _take_messages(self, read: Ports, write: Ports) -> None:
         """Take over what is new."""
-        if read.operator.verdict is Verdict.NEW:
+        if read.operator.is_new:
             self.operator.take(read.operator, read.status.value.position)
-        if read.command.verdict is Verdict.NEW:
+        if read.command.is_new:
             command: Message = read.command.value
             self._command = command.id
             self._rests_on = command.operator
@@ -246,13 +243,14 @@ class JointServo(Executor):
         """Fill the steady fields of the status when they change."""
         operator = self.operator
         holding = self.reference.holding
-        kept = operator.reason if operator.stands else ""
+        kept = operator.reason
         error = Error.NONE
         if away:
             kept = ARM_LOST
         elif stopped:
             kept = f"arm: {arm.reason}"
-            error = Error(arm.error) if arm.state == State.ERROR else Error.NONE
+            if arm.state == State.ERROR:
+                error = Error(arm.error)
         note = kept or self._modified.reason
         shown = self._command, holding, stopped or operator.stands, self._due, note, error
         if shown == self._shown:

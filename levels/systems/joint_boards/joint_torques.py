@@ -25,18 +25,17 @@ class JointTorques(CommandsAbove):
     def __init__(self, context: LevelContext, cell: Cell) -> None:
         super().__init__(context, cell.patience, 1, "torque", "braked")
         joints = len(cell.home)
-        self._sum = np.zeros(
-            3 * joints + 5
-        )  # the fields of a `JOINT_TORQUE` from `torque` to `payload_offset`
+        # The fields of a `JOINT_TORQUE` from `torque` to `payload_offset`.
+        self._sum = np.zeros(3 * joints + 5)
         self.torque = self._sum[:joints]  # (joints,), N m
         self._offset = self._sum[-3:]
-        self.wanted = Motion(
-            np.zeros((3, joints))
-        )  # where the boards want the joints; accelerations are not known
+        # Where the boards want the joints; accelerations are not known.
+        self.wanted = Motion(np.zeros((3, joints)))
         self.moves = False  # a joint is wanted to move
         self.rests_on = 0  # serial of the newest command of an operator that the torques rest on
         self._messages: dict[str, Message] = {}
-        self._memory, self._begins = self._sum, np.zeros(0, dtype=np.int64)  # of the messages
+        self._memory: Array  # of the messages
+        self._begins: NDArray[np.int64]  # (boards,): of their numbers, in `_memory`
         self._add_up = add_up.load()
 
     @property
@@ -61,7 +60,7 @@ class JointTorques(CommandsAbove):
 
     def add_up(self) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
-        self.rests_on = max([message.operator for message in self._messages.values()], default=0)
+        self.rests_on = max(message.operator for message in self._messages.values())
         self.moves = self._add_up(self._sum, self.wanted.table, self._memory, self._begins)
 
     def _see(self, board: str, message: Message) -> None:

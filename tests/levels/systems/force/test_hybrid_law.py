@@ -46,7 +46,7 @@ def place(cell: Cell, q: Array) -> Array:
     """Return the tool's place at `q`, m."""
     tool = ToolKinematics(cell)
     tool.look(q, np.zeros(6))
-    return tool.position
+    return tool.pose.position
 
 
 def test_the_inverse_gives_the_velocity_wanted_and_stays_finite_at_a_singularity(

@@ -21,10 +21,11 @@ LATENCY = DELAY + 2 * EVERY
 SPEED = 0.5
 """rad/s, of every joint."""
 BOARDS = ("near", "far")
+SIZES = sizes(cell("puma560"))
 
 
 def message(kind: MessageType) -> Message:
-    return Message(kind.dtype(sizes(cell("puma560"))))
+    return Message(kind.dtype(SIZES))
 
 
 class GatewayRig:
@@ -39,7 +40,7 @@ class GatewayRig:
         }
         params = {"delay": DELAY * TICK_S, "missing": MISSING}
         context = LevelContext(
-            "gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, {}, **paces, params=params
+            "gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, SIZES, **paces, params=params
         )
         self.gateway = JointGateway(context)
         self.write = Ports(command=message(JOINT_REFERENCE), status=message(JOINT_STATUS))
