@@ -14,21 +14,22 @@ from rack.backplane.words import Demand
 from rack.levels.algebra import Array
 from rack.levels.arm import poses, substeps
 from rack.levels.arm.above import CommandsAbove
-from rack.levels.errors import LevelError
 from rack.levels.faults import TendonStep
-from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Reading, Verdict
+from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Reading
 from rack.levels.messages import ARM_STATE, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
 from rack.levels.servo.driver import SCENES
-from rack.levels.systems.hand.messages import EXTENSOR, HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.messages import HAND_STATUS, TENSION_COMMAND
 from rack.levels.systems.hand.simulated import HandSample, SimulatedHand
 from rack.levels.tables import Table
 
 HELD = "held by the operator: valves closed; `resume` opens them"
 DEMANDED = "demand '{}' on the hand: valves closed until boards and emergency stop are in order"
+TENDONS = ("flexor", "extensor")
+"""In words, by row of tensions."""
 
 
 class HandExecutor(Executor):
@@ -53,23 +54,21 @@ class HandExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
-        if cell.hand is None:
-            raise LevelError("robot.hand is missing: this board drives a hand")
+        assert cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand = SimulatedHand(
             cell, context.scene, context.clock_ns, context.every, context.seed
         )
         self.tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
         self._started = False  # the first cycle has begun
-        self._closed_at: int | None = (
-            0  # tick of the first status that said so; None: the valves are open
-        )
+        # Tick of the first status that said so; None: the valves are open.
+        self._closed_at: int | None = 0
         self._opened = False  # the valves have been open on this board, or before it was restarted
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
         self._wrong: Alarm | None = None  # last cycle's finding about a tension
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
         self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
-        self._shown: tuple[Any, ...] | None = None  # what seldom changes, in the last status
+        self._shown: tuple[Any, ...] = ()  # what seldom changes, in the last status
 
     @classmethod
     def preload(cls) -> None:
@@ -106,22 +105,23 @@ class HandExecutor(Executor):
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the torn tendons; one of a joint that the hand lacks has no effect."""
         joints = np.arange(len(self.hand.hand.arms))
-        struck = [(fault.joint < 0) | (joints == fault.joint) for fault in faults]
         torn = np.zeros((2, len(joints)), dtype=bool)
-        for fault, own in zip(faults, struck, strict=True):
-            torn[int(fault.parameters["side"])] |= own
+        self._torn = {}
+        for place, fault in enumerate(faults):
+            struck = (fault.joint < 0) | (joints == fault.joint)
+            torn[int(fault.parameters["side"])] |= struck
+            if struck.any():
+                self._torn[place] = True
         self.hand.tear(torn)
-        self._torn = {place: True for place, own in enumerate(struck) if own.any()}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
         hand = self.hand
         was_struck = hand.struck > 0
-        self._catch_up(read.before.value if read.before.is_there else None, tick)
+        self._catch_up(read.before, tick)
         if hand.contact is not None and not was_struck:
             self.findings.append(Finding(Alarm.COLLISION, *hand.contact))
-        if read.operator.verdict is Verdict.NEW:
-            self.orders.take(read.operator)
+        self.orders.take(read.operator)
         sample = hand.sense()
         self.findings += self._slack.look(sample.tension, hand.wanted)
         self.acted |= self._torn
@@ -132,12 +132,12 @@ class HandExecutor(Executor):
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             hand.look(write.scene)
 
-    def _catch_up(self, before: Message | None, tick: int) -> None:
+    def _catch_up(self, before: Reading, tick: int) -> None:
         """Advance the hand to `tick`. A restarted board first restores it."""
         if not self._started:
             self._started = True
-            if before is not None:
-                self.hand.restore(before)
+            if before.is_there:
+                self.hand.restore(before.value)
                 self._opened = True
             self._closed_at = tick
         self.hand.step(tick - self.hand.tick)
@@ -146,19 +146,17 @@ class HandExecutor(Executor):
 
     def _drive(self, read: Ports, tick: int) -> None:
         """Give the valves the tensions of the boards above, or close them and say why."""
-        since = 0 if self._closed_at is None or not self._opened else self._closed_at
-        missing = self.tensions.missing(read.tensions, tick, since)
-        found = None
-        refused = ""
-        if not missing:
+        since = self._closed_at if self._opened else 0
+        self._waiting = self.tensions.missing(read.tensions, tick, since or 0)
+        if not self._waiting:
             self.tensions.join(read.tensions)
-            found, refused = self.tensions.check()
+            found, self._waiting = self.tensions.check()
             self._find(found)
         held = self.orders.standing is Operation.HOLD
-        demanded = (
-            DEMANDED.format(self.demand.name.lower()) if self.demand is not Demand.NONE else ""
-        )
-        self._waiting = demanded or missing or refused or (HELD if held else "")
+        if held and not self._waiting:
+            self._waiting = HELD
+        if self.demand is not Demand.NONE:
+            self._waiting = DEMANDED.format(self.demand.name.lower())
         if self._waiting:
             if self._closed_at is None:
                 self._closed_at = tick
@@ -172,11 +170,13 @@ class HandExecutor(Executor):
 
     def _find(self, found: Finding | None) -> None:
         """Report a tension that is not as it should be, once an episode."""
-        if found is not None:
-            self.hand.clipped += 1
-            if found.alarm is not self._wrong:
-                self.findings.append(found)
-        self._wrong = None if found is None else found.alarm
+        if found is None:
+            self._wrong = None
+            return
+        self.hand.clipped += 1
+        if found.alarm is not self._wrong:
+            self.findings.append(found)
+        self._wrong = found.alarm
 
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
         """Fill the status; the fields that seldom change only when they do."""
@@ -197,18 +197,21 @@ class HandExecutor(Executor):
         status.holding = closed
         status.stopped = closed and self._opened
         status.demand = self.demand
-        status.clipped, status.touches, status.violations, status.pushed = counts
+        status.clipped = hand.clipped
+        status.touches = hand.touches
+        status.violations = hand.violations
+        status.pushed = hand.pushed
         if hand.fault:
             status.state = State.ERROR
             status.error = Error.SIMULATION
             status.reason = hand.fault
             return
-        status.state = (
-            State.EXECUTING if not closed else State.HOLDING if self._opened else State.IDLE
-        )
-        status.error = (
-            Error.LIMIT if hand.violations else Error.TOUCHED if hand.touches else Error.NONE
-        )
+        if closed:
+            status.state = State.HOLDING if self._opened else State.IDLE
+        else:
+            status.state = State.EXECUTING
+        touched = Error.TOUCHED if hand.touches else Error.NONE
+        status.error = Error.LIMIT if hand.violations else touched
         status.reason = (
             self._waiting or hand.first_violation or hand.first_touch or self._slack.note
         )
@@ -242,11 +245,8 @@ class SlackMonitor:
         self._cycles = np.where(slack, self._cycles + 1, 0)
         self._any = bool(slack.any())
         torn = np.argwhere(self._cycles >= SLACK_CYCLES).tolist()
-        named = (
-            f"{'extensor' if row == EXTENSOR else 'flexor'} of '{self._joints[joint]}'"
-            for row, joint in torn
-        )
-        self.note = f"slack: {', '.join(named)}" if torn else ""
+        named = ", ".join(f"{TENDONS[row]} of '{self._joints[joint]}'" for row, joint in torn)
+        self.note = f"slack: {named}" if named else ""
         found = np.argwhere(self._cycles == SLACK_CYCLES).tolist()
         return [Finding(Alarm.TENDON, joint, float(tension[row, joint])) for row, joint in found]
 
@@ -283,19 +283,15 @@ class Tensions(CommandsAbove):
         tension = self.tension
         low = self._low
         high = self._high
+        found = None
         within = (tension >= low - self._margin) & (tension <= high + self._margin)  # NaN is not
-        if within.all():
-            np.clip(tension, low, high, out=tension)
-            return None, ""
-        if not np.isfinite(tension).all():
-            row, joint = np.argwhere(~np.isfinite(tension))[0].tolist()
-            return Finding(
-                Alarm.TENSION_INVALID, joint
-            ), f"rejected: tension of {self._named(row, joint)} is NaN"
-        row, joint = np.argwhere(~within)[0].tolist()
-        found = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
+        if not within.all():
+            finite = np.isfinite(tension)
+            if not finite.all():
+                row, joint = np.argwhere(~finite)[0].tolist()
+                refused = f"rejected: tension of '{self._joints[joint]}', {TENDONS[row]} is NaN"
+                return Finding(Alarm.TENSION_INVALID, joint), refused
+            row, joint = np.argwhere(~within)[0].tolist()
+            found = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
         np.clip(tension, low, high, out=tension)
         return found, ""
-
-    def _named(self, row: int, joint: int) -> str:
-        return f"'{self._joints[joint]}', {'extensor' if row == EXTENSOR else 'flexor'}"

@@ -15,7 +15,7 @@ from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.robot import dynamics
 from rack.levels.systems.hand import joint_law, tendon_law
 from rack.levels.systems.hand.fingertip_law import FingertipGains, FingertipLaw
-from rack.levels.systems.hand.fingertip_loop import NUMBERS, VELOCITIES, follow_grasp
+from rack.levels.systems.hand.fingertip_loop import follow_grasp
 from rack.levels.systems.hand.joint_law import JointGains, JointLaw
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.loop import HandLoop
@@ -51,8 +51,6 @@ class FingerExecutor(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": FINGER_STATUS}
     params = FingerParams
-    numbers = NUMBERS
-    velocities = VELOCITIES
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

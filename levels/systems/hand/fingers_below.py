@@ -47,4 +47,4 @@ class FingersBelow:
                 self.target[own] = status.target[own]
                 self.tip[finger] = status.tip[finger]
                 self.force[finger] = status.force[finger]
-        self.rests_on = min([reading.value.operator for reading in statuses.values()], default=0)
+        self.rests_on = min(reading.value.operator for reading in statuses.values())

@@ -56,13 +56,11 @@ class FingertipLaw:
         self._fingers = fingers
         self._posture = gains.posture
         self._period_s = period_s
-        self._most = (
-            kinematics.limits.velocity * period_s
-        )  # (joints,), rad: farthest that a target goes in a cycle
+        # (joints,), rad: farthest that a target goes in a cycle.
+        self._most = kinematics.limits.velocity * period_s
         self.wanted = np.zeros(len(self._most))  # (joints,), rad: targets of the last cycle
-        self._rest = (
-            self.wanted.copy()
-        )  # (joints,), rad: posture to which an undetermined joint tends
+        # (joints,), rad: posture to which an undetermined joint tends.
+        self._rest = self.wanted.copy()
         self._tips = np.zeros((len(kinematics.joints), 3))  # (fingers, 3), m: as sensed
 
     def start(self, position: Array) -> None:
@@ -82,6 +80,7 @@ class FingertipLaw:
         after `sense`."""
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
+        reaching = []
         for finger in self._fingers:
             own = self.kinematics.joints[finger]
             mode = grasp.mode[finger]
@@ -96,10 +95,11 @@ class FingertipLaw:
                 out.torque[own] = transposed_mat_vec(jacobian, grasp.force[finger])
                 out.spring[np.ix_(own, own)] = grasp.stiffness[finger] * gram(jacobian)
                 out.stiff[own] = self._posture
-        self._reach(
-            [finger for finger in self._fingers if grasp.mode[finger] != FingerMode.JOINTS], points
-        )
-        moved = np.minimum(np.maximum(self.wanted - before, -self._most), self._most)
+            if mode != FingerMode.JOINTS:
+                reaching.append(finger)
+        if reaching:
+            self._reach(reaching, points)
+        moved = np.clip(self.wanted - before, -self._most, self._most)
         self.wanted[:] = before + moved
         for finger in self._fingers:
             own = self.kinematics.joints[finger]
@@ -109,7 +109,7 @@ class FingertipLaw:
     def _reach(self, fingers: Sequence[int], points: Array) -> None:
         """Bring the targets of `fingers` closer to where their tips are at `points`, (fingers, 3),
         m."""
-        for _ in range(STEPS if fingers else 0):
+        for _ in range(STEPS):
             self.kinematics.look(self.wanted)
             for finger in fingers:
                 own = self.kinematics.joints[finger]

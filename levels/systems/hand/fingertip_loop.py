@@ -20,13 +20,6 @@ from rack.levels.systems.hand.messages import (
 )
 from rack.levels.tables import read_params
 
-NUMBERS = ("position", "velocity", "tip", "tip_velocity", "stiffness", "force")
-VELOCITIES = ("velocity", "tip_velocity")
-
-
-class FingertipParams(FingertipGains):
-    """`[board.<name>.params]` of a fingertip loop."""
-
 
 class FingertipLoop(HandLoop):
     """Turns postures, points and forces of fingers into targets of joints. See `FingertipLaw`.
@@ -42,21 +35,20 @@ class FingertipLoop(HandLoop):
         "last": Input(FINGER_TARGET, "own.command"),
     }
     outputs = {"command": FINGER_TARGET, "status": FINGER_STATUS}
-    params = FingertipParams
-    numbers = NUMBERS
-    velocities = VELOCITIES
+    params = FingertipGains
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(self.hand.names), True)
         kinematics = FingerKinematics(self.cell, self.hand)
-        gains = read_params(FingertipParams, context.params)
+        gains = read_params(FingertipGains, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
     def meet(self, read: Ports, hand: Message) -> None:
         """Begin where the joints are, or with the last targets."""
         last = read.last.value
-        self._law.start(last.position if read.last.is_there and last.active else hand.position)
+        begin = last if read.last.is_there and last.active else hand
+        self._law.start(begin.position)
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the targets of the joints."""

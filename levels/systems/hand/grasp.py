@@ -30,8 +30,13 @@ from rack.levels.systems.hand.grasp_program import (
 from rack.levels.systems.hand.grasp_steps import WORKS, Grasp, GraspParams, StepWork
 from rack.levels.systems.hand.grip import HandGrip
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.messages import FINGER_STATUS, GRASP_STATUS, GRASP_TARGET, GraspKind
-from rack.levels.systems.hand.plan_message import GRASP_PLAN
+from rack.levels.systems.hand.messages import (
+    FINGER_STATUS,
+    GRASP_PLAN,
+    GRASP_STATUS,
+    GRASP_TARGET,
+    GraspKind,
+)
 from rack.levels.tables import read_params
 
 PLANNED = "planned"
@@ -93,7 +98,7 @@ class GraspExecutor(Executor):
         self._waited_s = 0.0  # in a row, other than for an operator
         self._failed = Refused(Error.NONE, "")
         self._plan = Message(GRASP_PLAN.dtype(context.sizes))  # in use; id 0: none
-        self._tick: int | None = None  # of the last cycle
+        self._started = False  # the first cycle has begun
 
     @classmethod
     def misfits(
@@ -125,29 +130,31 @@ class GraspExecutor(Executor):
         grasp = self._grasp
         self._orders.take(read.operator)
         grasp.fingers.look(read.fingers)
-        if read.world.is_there and read.world.value.revision:
+        if read.world.value.revision:
             self._see(read.world.value)
-        if self._tick is None:
+        if not self._started:
+            self._started = True
             self._recall(read)
-        self._tick = tick
         waits = self._waits(read)
         self._count_waiting(waits)
         if not waits and not self._failed.code and self._done < len(self._program.step):
             self._go_on(read)
         if waits or self._failed.code:
             grasp.target.velocity = grasp.target.tip_velocity = 0.0
-        target = write.command
         grasp.target.id += 1
-        grasp.target.operator = self._orders.rests_on(0)
-        target.copy_from(grasp.target)
+        grasp.target.operator = self._orders.basis
+        write.command.copy_from(grasp.target)
         self._report(write.status, waits)
 
     def _see(self, world: Message) -> None:
         """Find the object in the world model."""
         close = self._closing()
         if close is not None:
-            row = self.context.scene.objects.index(close.object)
+            row = self._row(close)
             self._grasp.object = self._from_world @ Pose(world.position[row], world.quaternion[row])
+
+    def _row(self, close: CloseStep) -> int:
+        return self.context.scene.objects.index(close.object)
 
     def _posture(self, posture: Posture) -> Array:
         """Return a posture of all fingers as one of all joints, (joints,), rad."""
@@ -189,7 +196,7 @@ class GraspExecutor(Executor):
 
     @staticmethod
     def _newest(plans: Mapping[str, Reading]) -> Message:
-        return max([reading.value for reading in plans.values()], key=lambda plan: plan.id)
+        return max((reading.value for reading in plans.values()), key=lambda plan: plan.id)
 
     def _awaits_plan(self) -> bool:
         """Return whether the step under way is to be planned: a CLOSE, or a PRESHAPE before it."""
@@ -228,7 +235,7 @@ class GraspExecutor(Executor):
     def _take_up(self, close: CloseStep) -> None:
         """Grip by a CLOSE from now on."""
         grasp = self._grasp
-        gripping = np.array([name in close.points for name in self._grasp.names])
+        gripping = np.array([name in close.points for name in grasp.names])
         grasp.close = close
         grasp.base = 0.0
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
@@ -260,10 +267,10 @@ class GraspExecutor(Executor):
 
     def _recall(self, read: Ports) -> None:
         """Continue after a restart, from the level's own last messages."""
-        status = read.last_status.value
-        grasp = self._grasp
         if not (read.last_status.is_there and read.last_command.is_there):
             return
+        status = read.last_status.value
+        grasp = self._grasp
         grasp.target.copy_from(read.last_command.value)
         self._done = status.step
         self._passed_s = status.passed
@@ -290,13 +297,13 @@ class GraspExecutor(Executor):
         status.echo = grasp.target.id
         status.step = self._done
         status.steps = len(steps)
-        status.kind = GraspKind.NONE if self._work is None else self._work.kind
+        status.kind = GraspKind.NONE
+        if self._work is not None:
+            status.kind = GraspKind[self._work.step.do.upper()]
         status.passed = self._passed_s
         status.touching = grasp.touching
         status.grip = grasp.grip.force
-        status.object = (
-            -1 if grasp.close is None else self.context.scene.objects.index(grasp.close.object)
-        )
+        status.object = -1 if grasp.close is None else self._row(grasp.close)
         status.load = grasp.grip.load
         status.anchor = grasp.anchor
         status.plan = self._plan.id

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.levels.algebra import Array, norm, transposed_mat_vec
@@ -78,32 +79,24 @@ class GraspPlanner:
         self._kinematics = FingerKinematics(cell, cell.hand)
         self._data = cell.start()
         self._opposing = names.index(opposing)
-        self._palm = self._data.site_xmat[cell.tool].reshape(3, 3).copy()
-        self._origin = self._data.site_xpos[cell.tool].copy()
-        bases = [int(np.flatnonzero(row)[0]) for row in cell.hand.fingers]
-        self._bases = [
-            self._data.xanchor[self._joint(base)].copy() for base in bases
-        ]  # (3,), m, of each finger
+        first = [own[0] for own in self._kinematics.joints]
+        # (fingers, 3), m.
+        self._bases = self._data.xanchor[cell.model.dof_jntid[cell.dof[first]]].copy()
 
     def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
         """Return a grasp of the object in a row of the scene at a pose in the world; None if no
         line is possible."""
-        self._place(row, position, quaternion)
-        found = (self._along(row, 2.0 * math.pi * number / LINES) for number in range(LINES))
-        return max(
-            (one for one in found if one is not None), key=lambda one: one.margin, default=None
-        )
-
-    def _place(self, row: int, position: Array, quaternion: Array) -> None:
-        at = self._cell.object_qpos[row]
-        self._data.qpos[at : at + 7] = *position, *quaternion
+        address = self._cell.object_qpos[row]
+        self._data.qpos[address : address + 7] = *position, *quaternion
         self._data.qpos[self._cell.qpos] = self._cell.home
         mujoco.mj_kinematics(self._cell.model, self._data)
+        lines = (self._along(row, 2.0 * math.pi * number / LINES) for number in range(LINES))
+        grasps = [grasp for grasp in lines if grasp is not None]
+        return max(grasps, key=lambda grasp: grasp.margin, default=None)
 
     def _along(self, row: int, angle: float) -> PlannedGrasp | None:
         """Return the grasp along one line across the palm, if it is possible."""
-        across = self._palm[:, 0]
-        out = self._palm[:, 2]
+        across, _, out = self._kinematics.rotation.T
         line = math.cos(angle) * across + math.sin(angle) * out
         contact, normal = np.zeros((2, len(self._bases), 3))
         for finger, base in enumerate(self._bases):
@@ -113,11 +106,11 @@ class GraspPlanner:
                 return None
             contact[finger] = touched
             normal[finger] = way
-        closed = self._reach(contact - self._rules.pad * normal)
-        open_ = (
-            None if closed is None else self._reach(contact - self._rules.clear * normal, closed)
-        )
-        if closed is None or open_ is None or self._touches(open_):
+        closed = self._reach(contact - self._rules.pad * normal, self._cell.home)
+        if closed is None:
+            return None
+        posture = self._reach(contact - self._rules.clear * normal, closed)
+        if posture is None or self._touches(posture):
             return None
         low, high = self._cell.limits.position.T
         margin = float((np.minimum(closed - low, high - closed) / (high - low)).min())
@@ -127,7 +120,7 @@ class GraspPlanner:
         return PlannedGrasp(
             contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
             normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
-            posture=open_,
+            posture=posture,
             grip=self._grip(row),
             margin=margin,
         )
@@ -138,30 +131,33 @@ class GraspPlanner:
         model = self._cell.model
         data = self._data
         body = self._cell.bodies[row]
-        along = self._palm[:, 1]  # the knuckles' line
+        along = self._kinematics.rotation[:, 1]  # the knuckles' line
         centre = data.xipos[body]
         centre = centre + float(((base - centre) * along).sum()) * along
         start = centre - OUTSIDE_M * way
         nearest = math.inf
-        for own in range(
-            model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]
-        ):
-            if not model.geom_contype[own]:
+        for geom in self._geoms(row):
+            if not model.geom_contype[geom]:
                 continue
-            size = model.geom_size[own]
-            kind = int(model.geom_type[own])
+            size = model.geom_size[geom]
+            kind = int(model.geom_type[geom])
             distance = mujoco.mju_rayGeom(
-                data.geom_xpos[own], data.geom_xmat[own], size, start, way, kind, None
+                data.geom_xpos[geom], data.geom_xmat[geom], size, start, way, kind, None
             )
-            nearest = min(nearest, distance if distance >= 0.0 else math.inf)
+            if 0.0 <= distance < nearest:
+                nearest = distance
         return None if nearest > OUTSIDE_M else start + nearest * way
 
-    def _reach(self, tips: Array, start: Array | None = None) -> Array | None:
+    def _geoms(self, row: int) -> NDArray[np.int_]:
+        """Return the geoms of the object."""
+        return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
+
+    def _reach(self, tips: Array, start: Array) -> Array | None:
         """Return joint positions, (joints,), rad, at which the tips are at points of the world,
-        (fingers, 3), m."""
+        (fingers, 3), m; sought from `start` on. None: there are none."""
         kinematics = self._kinematics
-        position = (self._cell.home if start is None else start).copy()
-        wanted = [transposed_mat_vec(self._palm, point - self._origin) for point in tips]
+        position = start.copy()
+        wanted = [kinematics.from_world(point) for point in tips]
         for _ in range(STEPS):
             kinematics.look(position)
             ways = [point - kinematics.tip(finger) for finger, point in enumerate(wanted)]
@@ -170,9 +166,7 @@ class GraspPlanner:
                 return position
             for finger, (way, length) in enumerate(zip(ways, lengths, strict=True)):
                 homing = np.zeros(len(kinematics.joints[finger]))
-                kinematics.step(
-                    finger, position, way * min(1.0, STEP_M / max(length, STEP_M)), homing
-                )
+                kinematics.step(finger, position, way * (STEP_M / max(length, STEP_M)), homing)
         return None
 
     def _touches(self, position: Array) -> bool:
@@ -189,14 +183,7 @@ class GraspPlanner:
         pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
-        first = model.body_geomadr[body]
-        friction = float(model.geom_friction[first : first + model.body_geomnum[body], 0].max())
+        friction = float(model.geom_friction[self._geoms(row), 0].max())
         weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
-        return (
-            self._rules.reserve
-            * (weight + self._rules.pull)
-            / (2.0 * friction * (len(self._bases) - 1))
-        )
-
-    def _joint(self, number: int) -> int:
-        return int(np.flatnonzero(self._cell.model.jnt_qposadr == self._cell.qpos[number])[0])
+        load = self._rules.reserve * (weight + self._rules.pull)
+        return load / (2.0 * friction * (len(self._bases) - 1))

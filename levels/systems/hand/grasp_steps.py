@@ -29,10 +29,9 @@ from rack.levels.systems.hand.grasp_program import (
     ReleaseStep,
     ShiftStep,
     SqueezeStep,
-    Step,
 )
 from rack.levels.systems.hand.grip import GripGains, HandGrip
-from rack.levels.systems.hand.messages import FingerMode, GraspKind
+from rack.levels.systems.hand.messages import FingerMode
 from rack.levels.tables import Positive, Table
 
 SLIPPED_PART = 0.2
@@ -85,16 +84,24 @@ class Grasp:
         """Where the object is, (3,), m."""
         return self.anchor if self.object is None else self.object.position
 
+    @property
+    def missing(self) -> list[str]:
+        """Names of the fingers that should touch the object, and do not."""
+        return [self.names[finger] for finger in np.flatnonzero(self.grip.fingers & ~self.touching)]
+
 
 class StepWork(ABC):
-    """A step at work, begun `passed_s` after it began first."""
+    """A step at work, begun `begun_s` after it began first."""
 
-    kind: GraspKind
-
-    def __init__(self, grasp: Grasp, step: Any, passed_s: float) -> None:
+    def __init__(self, grasp: Grasp, step: Any, begun_s: float) -> None:
         self.grasp = grasp
         self.step = step
-        self.begun_s = passed_s
+        self.begun_s = begun_s
+        self.begin()
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Note from where the step goes on."""
 
     @abstractmethod
     def do(self, passed_s: float) -> bool:
@@ -120,27 +127,28 @@ def least_jerk(time: float) -> tuple[float, float]:
 class PreshapeWork(StepWork):
     """Brings all joints to a posture; done when they are there."""
 
-    kind = GraspKind.PRESHAPE
     step: PreshapeStep
 
-    def __init__(self, grasp: Grasp, step: PreshapeStep, passed_s: float) -> None:
-        super().__init__(grasp, step, passed_s)
-        self._start = grasp.fingers.target.copy()
-        self._posture = grasp.postures[step.posture]
+    def begin(self) -> None:
+        """Start at the targets that the joints have."""
+        self._start = self.grasp.fingers.target.copy()
+        self._posture = self.grasp.postures[self.step.posture]
 
     def do(self, passed_s: float) -> bool:
         """Move the joints."""
         grasp = self.grasp
-        target = self.grasp.target
+        target = grasp.target
         part, rate = self.progress(passed_s)
         way = self._posture - self._start
         target.mode = FingerMode.JOINTS
         target.force = 0.0
         target.position = self._start + part * way
         target.velocity = rate * way
+        if part < 1.0:
+            return False
         away = np.abs(grasp.fingers.position - self._posture)
-        if part < 1.0 or bool((away < grasp.params.astray).all()):
-            return part >= 1.0
+        if (away < grasp.params.astray).all():
+            return True
         if passed_s > self.step.seconds + grasp.params.patience:
             joint = int(away.argmax())
             far = (
@@ -155,11 +163,12 @@ class CloseWork(StepWork):
     """Moves tips evenly towards points in the object, until each touches it; one that touches
     stays, and presses."""
 
-    kind = GraspKind.CLOSE
     step: CloseStep
 
-    def __init__(self, grasp: Grasp, step: CloseStep, passed_s: float) -> None:
-        super().__init__(grasp, step, passed_s)
+    def begin(self) -> None:
+        """Start where the tips are."""
+        grasp = self.grasp
+        step = self.step
         self._start = grasp.fingers.tip.copy()
         self._ways = np.zeros_like(self._start)  # (fingers, 3), m
         for name, point in step.points.items():
@@ -168,17 +177,15 @@ class CloseWork(StepWork):
             inside = grasp.object @ Pose(np.array(point), np.array([1.0, 0.0, 0.0, 0.0]))
             self._ways[finger] = inside.position - self._start[finger]
         self._seconds = max(norm(way) for way in self._ways) / step.speed
-        self._touch = step.touch / min(
-            grasp.grip.shares[grasp.grip.fingers]
-        )  # N: with which the opposing one presses
+        # N: with which the opposing one presses.
+        self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])
 
     def do(self, passed_s: float) -> bool:
         """Move the tips."""
         grasp = self.grasp
-        target = self.grasp.target
-        closing = self.grasp.grip.fingers
+        target = grasp.target
         part = min((passed_s - self.begun_s) / self._seconds, 1.0)
-        for finger in np.flatnonzero(closing & ~grasp.touching).tolist():
+        for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching).tolist():
             way = self._ways[finger]
             if norm(grasp.fingers.force[finger]) >= self.step.touch:
                 grasp.touching[finger] = True
@@ -187,7 +194,7 @@ class CloseWork(StepWork):
                 target.mode[finger] = FingerMode.POINT
                 target.tip[finger] = self._start[finger] + part * way
                 target.tip_velocity[finger] = way / self._seconds if part < 1.0 else 0.0
-        missing = [grasp.names[finger] for finger in np.flatnonzero(closing & ~grasp.touching)]
+        missing = grasp.missing
         at_the_end = passed_s - self.begun_s > self._seconds + grasp.params.patience
         if missing and (at_the_end or passed_s > self.step.seconds):
             raise Refused(
@@ -199,8 +206,8 @@ class CloseWork(StepWork):
 
     def _stay(self, finger: int, force: Array) -> None:
         """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
-        target = self.grasp.target
         grasp = self.grasp
+        target = grasp.target
         target.mode[finger] = FingerMode.FORCE
         target.stiffness[finger] = grasp.grip.stiffness[finger]
         target.tip[finger] = grasp.fingers.tip[finger]
@@ -212,16 +219,15 @@ class GrippingWork(StepWork):
     """Base of the steps while the fingers have the object: they keep the grip, and notice when it
     is lost."""
 
-    def __init__(self, grasp: Grasp, step: Step, passed_s: float) -> None:
-        super().__init__(grasp, step, passed_s)
-        self._silent_s = np.zeros(
-            len(grasp.names)
-        )  # (fingers,), s: time for which one has not touched
+    def begin(self) -> None:
+        """Start with every finger at the object."""
+        # (fingers,), s: time for which one has not touched.
+        self._silent_s = np.zeros(len(self.grasp.names))
 
     def keep(self) -> None:
         """Press with the grip that the load asks for; raises `Refused` when the object is lost."""
         grasp = self.grasp
-        fingers = self.grasp.fingers
+        fingers = grasp.fingers
         away = grasp.object_at - grasp.anchor
         grasp.moved = norm(away)
         grasp.farthest = max(grasp.farthest, grasp.moved)
@@ -232,26 +238,19 @@ class GrippingWork(StepWork):
 
     def press(self) -> None:
         """Press with the grip as it is; raises `Refused` when the object is lost."""
-        self.grasp.target.force = self.grasp.grip.forces(self.grasp.fingers.tip)
-        self._notice()
-
-    def _notice(self) -> None:
         grasp = self.grasp
-        params = self.grasp.params
-        close = self.grasp.close
+        params = grasp.params
+        close = grasp.close
+        grasp.target.force = grasp.grip.forces(grasp.fingers.tip)
         assert close is not None, "checked with the program"
-        silent = np.array(
-            [norm(force) < SLIPPED_PART * close.touch for force in grasp.fingers.force]
-        )
-        self._silent_s[:] = np.where(silent, self._silent_s + grasp.period_s, 0.0)
+        felt = np.array([norm(force) for force in grasp.fingers.force])
+        silent = felt < SLIPPED_PART * close.touch
+        self._silent_s = np.where(silent, self._silent_s + grasp.period_s, 0.0)
         grasp.touching[:] = grasp.grip.fingers & (self._silent_s < params.lost)
-        without = [
-            grasp.names[finger] for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching)
-        ]
-        if without:
+        if missing := grasp.missing:
             raise Refused(
                 Error.OBJECT_LOST,
-                f"lost '{close.object}': no longer touched by {', '.join(without)}",
+                f"lost '{close.object}': no longer touched by {', '.join(missing)}",
             )
         if grasp.moved > params.tolerance:
             far = (
@@ -265,18 +264,19 @@ class SqueezeWork(GrippingWork):
     """Raises the grip. The object settles between the fingers meanwhile: its place is where it is
     afterwards."""
 
-    kind = GraspKind.SQUEEZE
     step: SqueezeStep
 
-    def __init__(self, grasp: Grasp, step: SqueezeStep, passed_s: float) -> None:
-        super().__init__(grasp, step, passed_s)
-        self._from = grasp.base
+    def begin(self) -> None:
+        """Start with the grip as it is."""
+        super().begin()
+        self._from = self.grasp.base
 
     def do(self, passed_s: float) -> bool:
         """Squeeze."""
+        grasp = self.grasp
         part, _ = self.progress(passed_s)
-        self.grasp.anchor[:] = self.grasp.object_at
-        self.grasp.base = self.grasp.grip.force = self._from + part * (self.step.grip - self._from)
+        grasp.anchor[:] = grasp.object_at
+        grasp.base = grasp.grip.force = self._from + part * (self.step.grip - self._from)
         self.press()
         return part >= 1.0
 
@@ -285,19 +285,19 @@ class ShiftWork(GrippingWork):
     """Moves the place of the object, and the points of the tips with it; `by` is a way in the
     palm's frame."""
 
-    kind = GraspKind.SHIFT
     step: ShiftStep
 
-    def __init__(self, grasp: Grasp, step: ShiftStep, passed_s: float) -> None:
-        super().__init__(grasp, step, passed_s)
-        done, _ = least_jerk(passed_s / step.seconds)
-        self._way = (1.0 - done) * np.array(step.by)
+    def begin(self) -> None:
+        """Start with the way that is left."""
+        super().begin()
+        done, _ = least_jerk(self.begun_s / self.step.seconds)
+        self._way = (1.0 - done) * np.array(self.step.by)
         self._part = 0.0
 
     def do(self, passed_s: float) -> bool:
         """Move the object."""
         grasp = self.grasp
-        target = self.grasp.target
+        target = grasp.target
         part, rate = self.progress(passed_s)
         gone = (part - self._part) * self._way
         self._part = part
@@ -311,7 +311,6 @@ class ShiftWork(GrippingWork):
 class HoldWork(GrippingWork):
     """Keeps the object where it is."""
 
-    kind = GraspKind.HOLD
     step: HoldStep
 
     def do(self, passed_s: float) -> bool:
@@ -323,11 +322,11 @@ class HoldWork(GrippingWork):
 class ReleaseWork(StepWork):
     """Lets the forces fall in the first half of its time; the tips withdraw in the second."""
 
-    kind = GraspKind.RELEASE
     step: ReleaseStep
 
-    def __init__(self, grasp: Grasp, step: ReleaseStep, passed_s: float) -> None:
-        super().__init__(grasp, step, passed_s)
+    def begin(self) -> None:
+        """Start with the grip as it is, where the tips are."""
+        grasp = self.grasp
         self._force = grasp.grip.force
         self._load = grasp.grip.load.copy()
         self._start = grasp.fingers.tip.copy()
@@ -336,7 +335,7 @@ class ReleaseWork(StepWork):
     def do(self, passed_s: float) -> bool:
         """Let go."""
         grasp = self.grasp
-        target = self.grasp.target
+        target = grasp.target
         half = 0.5 * self.step.seconds
         if passed_s < half:
             left = 1.0 - passed_s / half

@@ -59,7 +59,7 @@ class HandGrip:
         self._gains = gains
         self._period_s = period_s
         self._opposing = opposing
-        self.fingers = fingers.copy()
+        self.fingers = fingers
         self._others = fingers.copy()
         self._others[opposing] = False
         count = max(1, int(self._others.sum()))

@@ -49,18 +49,14 @@ class JointLaw:
         """Drive the joints `driven`, (joints,)."""
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))
-        self._constants = np.zeros((4, len(driven)))  # in the rows of `set_joint_torques`
-        self._constants[:] = (
-            self._dynamics.dry,
-            cell.model.dof_damping[cell.dof],
-            cell.bounds.torque,
-            driven,
-        )
+        viscous = cell.model.dof_damping[cell.dof]
+        # In the rows of `set_joint_torques`.
+        self._constants = np.array((self._dynamics.dry, viscous, cell.bounds.torque, driven))
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
-        self._state: Array = np.zeros(0)  # numbers of a status of the hand, and of a target
-        self._wanted: Array = np.zeros(0)
-        self._spring: Array = np.zeros(0)
+        self._state: Array  # numbers of a status of the hand
+        self._wanted: Array  # numbers of a target
+        self._spring: Array  # likewise
         self._set = set_joint_torques.load()
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
@@ -74,9 +70,18 @@ class JointLaw:
         """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by
         `ahead_s`."""
         terms = self._dynamics.terms(self._state[0], self._still)
-        times = age_s + self._ahead, ahead_s
-        given = self._state, self._wanted, self._spring
-        if self._set(self._gains, times, self._constants, *given, terms.inertia, terms.bias, out):
+        is_cut = self._set(
+            self._gains,
+            (age_s + self._ahead, ahead_s),
+            self._constants,
+            self._state,
+            self._wanted,
+            self._spring,
+            terms.inertia,
+            terms.bias,
+            out,
+        )
+        if is_cut:
             self.clipped += 1
 
 
@@ -93,12 +98,10 @@ def set_joint_torques(
     torque: Array,  # (joints,), N m: set; 0 for joints of other boards
 ) -> bool:
     """Set the torques; return whether a limit cut one."""
-    dry, viscous, limit, driven = (
-        constants[0],
-        constants[1],
-        constants[2],
-        constants[3],
-    )  # N m, N m s/rad, N m, 1
+    dry = constants[0]  # N m
+    viscous = constants[1]  # N m s/rad
+    limit = constants[2]  # N m
+    driven = constants[3]  # 1: a joint of this board; 0: of another
     joints = len(torque)
     clipped = False
     for j in range(joints):

@@ -15,10 +15,6 @@ from rack.levels.systems.hand.messages import FINGER_TARGET, HAND_STATUS, LOOP_S
 from rack.levels.tables import read_params
 
 
-class JointParams(JointGains):
-    """`[board.<name>.params]` of a joint loop."""
-
-
 class JointLoop(HandLoop):
     """Brings the joints to their targets with torques; until there are targets it holds them where
     it found them.
@@ -33,14 +29,12 @@ class JointLoop(HandLoop):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
-    params = JointParams
-    numbers = ("position", "velocity", "stiff", "torque", "spring")
-    velocities = ("velocity",)
+    params = JointGains
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
-        self._law = JointLaw(self.cell, self.driven, read_params(JointParams, context.params))
+        self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
     @classmethod
     def preload(cls) -> None:

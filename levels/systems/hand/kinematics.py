@@ -28,9 +28,8 @@ class FingerKinematics:
     def __init__(self, cell: Cell, hand: Hand) -> None:
         self._cell = cell
         self._tips = hand.tips
-        self.joints = [
-            np.flatnonzero(row) for row in hand.fingers
-        ]  # of each finger, as indices of `robot.joints`
+        # Of each finger, as indices of `robot.joints`.
+        self.joints = [np.flatnonzero(row) for row in hand.fingers]
         self._data = d = mujoco.MjData(cell.model)
         mujoco.mj_resetDataKeyframe(cell.model, d, 0)
         self.limits = cell.limits
@@ -39,9 +38,8 @@ class FingerKinematics:
         self._whole = np.zeros((3, cell.model.nv))
         mujoco.mj_kinematics(cell.model, d)
         self.palm = site_pose(d, cell.tool)  # in the world
-        self._turned = (
-            d.site_xmat[cell.tool].reshape(3, 3).copy()
-        )  # from the palm's frame into the world's
+        # From the palm's frame into the world's.
+        self.rotation = d.site_xmat[cell.tool].reshape(3, 3).copy()
 
     def look(self, position: Array) -> None:
         """Go to joint positions, (joints,), rad: tips and Jacobians are for these from now on."""
@@ -51,9 +49,11 @@ class FingerKinematics:
 
     def tip(self, finger: int) -> Array:
         """Return the tip of a finger, (3,), m."""
-        return transposed_mat_vec(
-            self._turned, self._data.site_xpos[self._tips[finger]] - self.palm.position
-        )
+        return self.from_world(self._data.site_xpos[self._tips[finger]])
+
+    def from_world(self, point: Array) -> Array:
+        """Return a point of the world, (3,), m, in the frame of the palm."""
+        return transposed_mat_vec(self.rotation, point - self.palm.position)
 
     def jacobian(self, finger: int) -> Array:
         """Return the Jacobian of the tip of a finger by its own joints, (3, joints of the finger),
@@ -61,7 +61,7 @@ class FingerKinematics:
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
         own = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
         rotated = np.empty_like(own)
-        mujoco.mju_mulMatTMat(rotated, self._turned, own)
+        mujoco.mju_mulMatTMat(rotated, self.rotation, own)
         return rotated
 
     def step(self, finger: int, position: Array, way: Array, homing: Array) -> None:

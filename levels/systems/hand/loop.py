@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
-from rack.levels.errors import LevelError
 from rack.levels.level import Executor, LevelContext, Ports, Reading
 from rack.levels.operator import BELOW_LOST, Operation, Orders
 from rack.levels.robot.cell import build_cell
@@ -31,34 +30,30 @@ class HandLoop(Executor):
     """
 
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
-    numbers: tuple[str, ...]
-    """Fields of a command that must be finite."""
-    velocities: tuple[str, ...] = ()
-    """Fields of a command that are set to 0 while an operator holds the loop."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.cell = build_cell(context.robot, context.scene, context.clock_ns)
-        if self.cell.hand is None:
-            raise LevelError(f"level '{context.board}' drives a hand; there is no [robot.hand]")
+        assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand: Hand = self.cell.hand
         self.orders = Orders(self.commands)
-        self.command = Message(self.inputs["command"].type.dtype(context.sizes))  # that is followed
+        command = self.inputs["command"].type
+        self.command = Message(command.dtype(context.sizes))  # that is followed
+        # Names of its fields that must be finite.
+        self._numbers = [field.name for field in command.fields if field.kind == "f8"]
         self.commanded = False  # there was one
-        self.driven: NDArray[
-            np.bool_
-        ]  # (joints,) or (fingers,), as in the status: those of this board
+        # (joints,) or (fingers,), as in the status: those of this board.
+        self.driven: NDArray[np.bool_]
         self._above = ", ".join(context.above)
         self._period = max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
-        self._oldest = slowest + self.cell.patience.ticks(
-            slowest, context.tick_s
-        )  # ticks, of a status of the hand
+        # Ticks, of a status of the hand.
+        self._oldest = slowest + self.cell.patience.ticks(slowest, context.tick_s)
         self._taken = 0  # tick at which `command` came
         self._rejected = ""  # why the newest command is not followed
         self._held = False  # by an operator, in the last cycle
         self._met = False  # a status of the hand has come
-        self._shown: tuple[Any, ...] | None = None  # in the last status
+        self._shown: tuple[Any, ...] = ()  # in the last status
 
     @classmethod
     def misfits(
@@ -83,8 +78,7 @@ class HandLoop(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Follow the newest command, and report."""
         hand: Reading = read.hand
-        if read.operator.is_new:
-            self.orders.take(read.operator)
+        self.orders.take(read.operator)
         if not self._met:
             if not hand.is_there:
                 self._wait(write.status)
@@ -115,12 +109,15 @@ class HandLoop(Executor):
         released = self._held
         self._held = self.orders.standing is Operation.HOLD
         if self._held:
-            for name in self.velocities:
-                setattr(self.command, name, 0.0)
+            for name in self._numbers:
+                if name.endswith("velocity"):  # what is commanded is kept at rest
+                    setattr(self.command, name, 0.0)
             self.orders.done()
         elif command.is_new or (released and command.is_there):
             wrong = [
-                name for name in self.numbers if not np.isfinite(getattr(command.value, name)).all()
+                name
+                for name in self._numbers
+                if not np.isfinite(getattr(command.value, name)).all()
             ]
             self._rejected = (
                 f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""

@@ -41,6 +41,13 @@ class GraspKind(IntEnum):
     RELEASE = 6  # tips let go and withdraw
 
 
+MOTION = (
+    Field("position", "f8", "rad", "joint positions", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+)
+DRIVEN = Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",))
+SENSED = Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet")
+
 TENSION_COMMAND = command(
     "tension_command",
     1,
@@ -52,7 +59,7 @@ TENSION_COMMAND = command(
         "tick of the hand's status that it rests on; -1: none yet, so no tension",
     ),
     Field("tension", "f8", "N", "of the tendons of the board's own joints", (2, "joints")),
-    Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
+    DRIVEN,
 )
 """From the boards of tendon loops to the board of the hand."""
 
@@ -61,8 +68,7 @@ HAND_STATUS = status(
     1,
     *ANSWER,
     Field("tick", "i8", "tick", "tick at which the hand was sensed"),
-    Field("position", "f8", "rad", "joint positions", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    *MOTION,
     Field("torque", "f8", "N m", "of the tendons on the joints", ("joints",)),
     Field("tension", "f8", "N", "of the tendons, as sensed", (2, "joints")),
     Field("wanted", "f8", "N", "tensions commanded of the valves", (2, "joints")),
@@ -93,8 +99,7 @@ FINGER_TARGET = command(
     1,
     RESTS_ON,
     Field("active", "u1", "1", "0: no target yet, hold"),
-    Field("position", "f8", "rad", "joint positions", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    *MOTION,
     Field(
         "stiff",
         "f8",
@@ -138,8 +143,8 @@ LOOP_STATUS = status(
     "loop_status",
     1,
     *ANSWER,
-    Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
-    Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
+    DRIVEN,
+    SENSED,
     Field("clipped", "u4", "1", "cycles in which a torque was cut to what tendons can give"),
     Field("holding", "u1", "1", "1: no fresh command from above: what was commanded last is kept"),
     Field(
@@ -156,7 +161,7 @@ FINGER_STATUS = status(
     1,
     *ANSWER,
     Field("driven", "u1", "1", "1: the finger is one of this board's", ("fingers",)),
-    Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
+    SENSED,
     Field("position", "f8", "rad", "joint positions, from the hand's status", ("joints",)),
     Field("target", "f8", "rad", "joint positions wanted", ("joints",)),
     Field("tip", "f8", "m", "points of the tips", ("fingers", 3)),
@@ -189,6 +194,32 @@ GRASP_STATUS = status(
     Field("plan", "u4", "1", "id of the grasp plan in use; 0: none"),
 )
 """From the grasp loop. Points and forces are in the frame of the palm."""
+
+GRASP_PLAN = command(
+    "grasp_plan",
+    1,
+    RESTS_ON,
+    Field("object", "i2", "1", "row of the object in the world model"),
+    Field("sensed", "i8", "tick", "tick of the world model that it rests on"),
+    Field("posture", "f8", "rad", "joint positions from which the fingers close", ("joints",)),
+    Field(
+        "contact",
+        "f8",
+        "m",
+        "of each tip, on the object's surface, in the object's frame",
+        ("fingers", 3),
+    ),
+    Field(
+        "normal",
+        "f8",
+        "1",
+        "direction of each tip's force there, in the object's frame",
+        ("fingers", 3),
+    ),
+    Field("grip", "f8", "N", "force of each finger; the opposing one bears their sum"),
+)
+"""From a planner, on a board or on the host side, to the grasp loop: where the fingers take hold of
+an object, and from which posture they close. The newest with an `id` above 0 counts."""
 
 STREAMED_DOWN = (TENSION_COMMAND.name, TENDON_TORQUE.name, FINGER_TARGET.name, GRASP_TARGET.name)
 """Names of commands that change in every cycle."""

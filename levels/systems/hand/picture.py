@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from xml.sax.saxutils import escape
 
 import mujoco
@@ -61,25 +62,21 @@ class HandPicture:
         self._hand = cell.hand
         self._data = cell.start()
         model = cell.model
-        own = set(cell.gripper_geoms.tolist())
-        self._palm = model.site_bodyid[cell.tool]
         shown = self._data.site_xpos[[cell.tool, *self._hand.tips]]
         self._centre = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
-        bodies = cell.bodies
-        self._objects = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in bodies]
-        fixed = [
-            geom
-            for geom in range(model.ngeom)
-            if geom not in self._objects and self._is_solid(geom)
-        ]
-        self._palms = [
-            geom for geom in fixed if geom in own and model.geom_bodyid[geom] == self._palm
-        ]
-        self._rest = [geom for geom in fixed if geom not in own]
-        self._local = {
-            geom: local_points(model, geom) for geom in (*self._rest, *self._palms, *self._objects)
+        body = model.geom_bodyid
+        objects = np.isin(body, cell.bodies)
+        fixed = ~objects & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+        hand = np.isin(np.arange(model.ngeom), cell.gripper_geoms)
+        palm = hand & (body == model.site_bodyid[cell.tool])
+        # Of the geoms, in the order in which they are drawn.
+        self._colours = {
+            int(geom): colour
+            for geoms, colour in ((fixed & ~hand, REST), (fixed & palm, REST), (objects, OBJECT))
+            for geom in np.flatnonzero(geoms)
         }
-        joints = np.array([self._joint(address) for address in cell.qpos])
+        self._local = {geom: local_points(model, geom) for geom in self._colours}
+        joints = model.dof_jntid[cell.dof]
         self._chains = [joints[row] for row in self._hand.fingers]
 
     def draw(self, scene: HandScene, text: Sequence[str] = ()) -> str:
@@ -117,15 +114,13 @@ class HandPicture:
 
     def _view(self, scene: HandScene, axes: tuple[int, int]) -> Iterator[str]:
         """Yield the elements of one view, the farthest first."""
-        for geoms, colour in ((self._rest, REST), (self._palms, REST), (self._objects, OBJECT)):
-            for geom in geoms:
-                outline = hull([self._pixel(point, axes) for point in self._surface(geom)])
-                points = " ".join(f"{x:.1f},{y:.1f}" for x, y in outline)
-                if points:
-                    yield (
-                        f'<polygon points="{points}" fill="{colour}" fill-opacity="0.45"'
-                        f' stroke="{colour}"/>'
-                    )
+        for geom, colour in self._colours.items():
+            outline = hull([self._pixel(point, axes) for point in self._surface(geom)])
+            points = " ".join(f"{x:.1f},{y:.1f}" for x, y in outline)
+            yield (
+                f'<polygon points="{points}" fill="{colour}" fill-opacity="0.45"'
+                f' stroke="{colour}"/>'
+            )
         for finger, chain in enumerate(self._chains):
             tip = self._data.site_xpos[self._hand.tips[finger]]
             row = [self._pixel(point, axes) for point in (*self._data.xanchor[chain], tip)]
@@ -143,8 +138,10 @@ class HandPicture:
                 f' font-size="11">{escape(self._hand.names[finger])}</text>'
             )
             yield from self._arrow(row[-1], scene.force[finger], axes)
-        for point in self._in_world(scene):
-            x, y = self._pixel(point, axes)
+        body = self._cell.bodies[scene.held]
+        turned = self._data.xmat[body].reshape(3, 3)
+        for contact in scene.contact:
+            x, y = self._pixel(self._data.xpos[body] + mat_vec(turned, contact), axes)
             yield (
                 f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="none" stroke="{PLAN}"'
                 ' stroke-width="2"/>'
@@ -154,9 +151,7 @@ class HandPicture:
         self, start: tuple[float, float], force: Array, axes: tuple[int, int]
     ) -> Iterator[str]:
         """Yield the force of a tip on what it touches."""
-        turned = mat_vec(
-            self._data.site_xmat[self._cell.tool].reshape(3, 3), np.asarray(force, dtype=float)
-        )
+        turned = mat_vec(self._data.site_xmat[self._cell.tool].reshape(3, 3), force)
         scale = SIDE / 2.0 / NEWTONS_A_VIEW
         way = np.array([scale * turned[axes[0]], -scale * turned[axes[1]]])
         length = float(np.sqrt((way**2).sum()))
@@ -177,16 +172,6 @@ class HandPicture:
         )
         yield f'<polygon points="{points}" fill="{FORCE}"/>'
 
-    def _in_world(self, scene: HandScene) -> Iterator[Array]:
-        """Yield the contacts of a plan, (3,), m."""
-        if len(scene.contact):
-            body = self._cell.bodies[scene.held]
-            turned = self._data.xmat[body].reshape(3, 3)
-            origin = self._data.xpos[body]
-            yield from (
-                origin + mat_vec(turned, point) for point in np.asarray(scene.contact, dtype=float)
-            )
-
     def _pixel(self, point: Array, axes: tuple[int, int]) -> tuple[float, float]:
         right, up = (float(point[axis] - self._centre[axis]) / REACH_M for axis in axes)
         return SIDE / 2.0 * (1.0 + right), SIDE / 2.0 * (1.0 - up)
@@ -197,31 +182,26 @@ class HandPicture:
         points = np.array([mat_vec(turned, point) for point in self._local[geom]])
         return np.asarray(points + self._data.geom_xpos[geom])
 
-    def _is_solid(self, geom: int) -> bool:
-        return bool(self._cell.model.geom_type[geom] != int(mujoco.mjtGeom.mjGEOM_PLANE))
-
-    def _joint(self, address: int) -> int:
-        return int(np.flatnonzero(self._cell.model.jnt_qposadr == address)[0])
-
 
 def local_points(model: mujoco.MjModel, geom: int) -> Array:
     """Return points on the surface of a geom, (n, 3), m, in its own frame; of a box or mesh the
     corners of its box."""
     kinds = mujoco.mjtGeom
-    a, b, c = model.geom_size[geom]
+    size = model.geom_size[geom]
+    a, b, _ = size
     kind = kinds(int(model.geom_type[geom]))
     turns = [2.0 * math.pi * k / RIM for k in range(RIM)]
     ring = np.array([(math.cos(turn), math.sin(turn), 0.0) for turn in turns])
     up = np.array([0.0, 0.0, 1.0])
     if kind in (kinds.mjGEOM_CYLINDER, kinds.mjGEOM_CAPSULE):
         ends = [a * ring + b * up, a * ring - b * up]
-        return np.concatenate(
-            ends if kind == kinds.mjGEOM_CYLINDER else [*ends, [(a + b) * up, -(a + b) * up]]
-        )
+        if kind == kinds.mjGEOM_CAPSULE:
+            ends.append(np.array([(a + b) * up, -(a + b) * up]))
+        return np.concatenate(ends)
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
-        size = np.array([a, a, a] if kind == kinds.mjGEOM_SPHERE else [a, b, c])
-        return np.array(size * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]]))
-    corners = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
+        axes = a if kind == kinds.mjGEOM_SPHERE else size
+        return np.array(axes * np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]]))
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     return np.asarray(model.geom_aabb[geom, :3] + corners * model.geom_aabb[geom, 3:])
 
 

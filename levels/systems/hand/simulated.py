@@ -12,7 +12,6 @@ from rack.levels.algebra import Array
 from rack.levels.arm.drives import CoarseSensors
 from rack.levels.arm.simulation import Simulation
 from rack.levels.robot.cell import Cell
-from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.tables import SceneConfig
 
 
@@ -53,11 +52,9 @@ class SimulatedHand(Simulation):
         pull = hand.closed * hand.arms
         self._spring = np.stack((-pull, pull))  # (2, joints), N/rad: of closed valves
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
-        self._before = np.zeros(len(hand.arms))
         acts = cell.model.actuator_actadr[hand.actuators]
-        self._acts = (
-            acts if (acts >= 0).all() else None
-        )  # (2, joints), tensions behind valves that take time
+        # (2, joints): tensions behind valves that take time; None: they take none.
+        self._acts = acts if (acts >= 0).all() else None
 
     def _start_with(self, tension: Array) -> None:
         """Let the valves have had tensions, (2, joints), N, for ever."""
@@ -127,16 +124,15 @@ class SimulatedHand(Simulation):
         became slack.
         """
         if not self.braked:
-            return super()._simulate()
+            super()._simulate()
+            return
         position = self._state[0]
-        before = self._before
-        before[:] = position
+        before = position.copy()
         super()._simulate()
         drawn = self._spring * (position - before)
         self._data.ctrl[self.hand.actuators] += drawn
         if self._acts is not None:
             self._data.act[self._acts] = np.maximum(self._data.act[self._acts] + drawn, 0.0)
-        return None
 
 
 def _carrying(cell: Cell, data: mujoco.MjData) -> Array:
@@ -144,7 +140,5 @@ def _carrying(cell: Cell, data: mujoco.MjData) -> Array:
     hand = cell.hand
     assert hand is not None, "it is a hand"
     turn = (data.qfrc_bias - data.qfrc_passive)[cell.dof] / (2.0 * hand.arms)
-    tension = np.zeros((2, len(turn)))
-    tension[FLEXOR] = hand.rest + turn
-    tension[EXTENSOR] = hand.rest - turn
-    return np.clip(tension, hand.least, hand.most)
+    tension = np.stack((hand.rest + turn, hand.rest - turn))  # flexors, extensors
+    return np.asarray(np.clip(tension, hand.least, hand.most))

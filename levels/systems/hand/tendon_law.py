@@ -60,11 +60,9 @@ class TendonLaw:
     ) -> None:
         """Drive the joints `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
-        self._constants = np.zeros((4, joints))  # in the rows of `set_tensions`
-        self._constants[0] = hand.arms
-        self._constants[1] = hand.least + gains.margin
-        self._constants[2] = hand.most
-        self._constants[3] = driven
+        least = np.full(joints, hand.least + gains.margin)
+        # In the rows of `set_tensions`.
+        self._constants = np.array((hand.arms, least, hand.most, driven))
         self._numbers = (
             hand.rest,
             gains.lead,
@@ -75,10 +73,6 @@ class TendonLaw:
         self._trim = gains.trim
         self._tick_s = context.tick_s
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
-        self._elapsed, self._shares = (
-            0,
-            (0.0, 0.0),
-        )  # ticks between two samples, and shares of that time
         self._set = set_tensions.load()
         self._status: Message  # of the hand
         self._sensed: Array  # its numbers
@@ -100,24 +94,21 @@ class TendonLaw:
         # Valves that are closed do not follow their commands: nothing is to be learned from them.
         elapsed = 0 if self._status.holding else self._status.tick - self._sampled
         self._sampled = self._status.tick
-        if elapsed != self._elapsed:
-            self._elapsed = elapsed
-            elapsed_s = elapsed * self._tick_s
-            self._shares = (
-                1.0 - math.exp(-elapsed_s / self._lag),
-                min(self._trim * elapsed_s, MOST_LEARNED),
-            )
+        elapsed_s = elapsed * self._tick_s
+        shares = (
+            1.0 - math.exp(-elapsed_s / self._lag),
+            min(self._trim * elapsed_s, MOST_LEARNED),
+        )
         if self._set(
-            self._numbers, self._shares, self._constants, self._valves, self._sensed, torque, out
+            self._numbers, shares, self._constants, self._valves, self._sensed, torque, out
         ):
             self.clipped += 1
 
 
 @compiled
 def set_tensions(
-    numbers: tuple[
-        float, float, float, float
-    ],  # mean tension, N, lead, share of a cycle in the lag, largest trim, N
+    # Mean tension, N, lead, share of a cycle in the lag, largest trim, N.
+    numbers: tuple[float, float, float, float],
     shares: tuple[float, float],  # of the time since the sample before: in the lag, and in the trim
     constants: Array,  # (4, joints): rows as below
     valves: Array,  # (3, 2, joints), N: rows as below
@@ -127,12 +118,13 @@ def set_tensions(
 ) -> bool:
     """Set the tensions; return whether a torque had to be clipped."""
     rest, lead, share, most_trim = numbers
-    arm, least, most, driven = constants[0], constants[1], constants[2], constants[3]  # m, N, N, 1
-    reached, expected, trim = (
-        valves[0],
-        valves[1],
-        valves[2],
-    )  # model now, model at the sample, correction
+    arm = constants[0]  # m
+    least = constants[1]  # N
+    most = constants[2]  # N
+    driven = constants[3]  # 1: a joint of this board; 0: of another
+    reached = valves[0]  # by the model, now
+    expected = valves[1]  # by the model, at the sample
+    trim = valves[2]  # correction
     joints = len(arm)
     clipped = False
     for j in range(joints):

@@ -20,10 +20,6 @@ from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from rack.levels.tables import read_params
 
 
-class TendonParams(TendonGains):
-    """`[board.<name>.params]` of a tendon loop."""
-
-
 class TendonLoop(HandLoop):
     """Gives the hand a tension for each tendon, in every cycle. See `TendonLaw`.
 
@@ -37,13 +33,12 @@ class TendonLoop(HandLoop):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": TENSION_COMMAND, "status": LOOP_STATUS}
-    params = TendonParams
-    numbers = ("torque",)
+    params = TendonGains
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
-        gains = read_params(TendonParams, context.params)
+        gains = read_params(TendonGains, context.params)
         self._law = TendonLaw(self.hand, self.driven, gains, context)
 
     @classmethod

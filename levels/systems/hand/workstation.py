@@ -24,9 +24,8 @@ from rack.levels.level import Input, LevelContext
 from rack.levels.messages import WORLD_MODEL
 from rack.levels.robot.cell import build_cell
 from rack.levels.systems.hand.grasp_planner import GraspPlanner, GraspRules, PlannedGrasp
-from rack.levels.systems.hand.messages import GRASP_STATUS, HAND_STATUS, GraspKind
+from rack.levels.systems.hand.messages import GRASP_PLAN, GRASP_STATUS, HAND_STATUS, GraspKind
 from rack.levels.systems.hand.picture import HandPicture, HandScene
-from rack.levels.systems.hand.plan_message import GRASP_PLAN
 from rack.levels.tables import Positive, Table, read_params
 
 MOVED_M = 0.003
@@ -69,6 +68,8 @@ class Workstation(HostProgram):
             raise LevelError(f"params.object = {p.object}: not in the scene; objects: {known}")
         self._row = context.scene.objects.index(p.object)
         cell = build_cell(context.robot, context.scene, context.clock_ns)
+        assert cell.hand is not None, "a cell with a hand"
+        self._hand = cell.hand
         self._planner = GraspPlanner(cell, p.opposing, p.rules)
         self._drawing = HandPicture(cell)
         self._planned: PlannedGrasp | None = None
@@ -88,25 +89,27 @@ class Workstation(HostProgram):
     def plan(self, bus: Bus) -> PlannedGrasp | None:
         """Plan and send a grasp if one is wanted; return the newest, None without one."""
         world = bus.read("world")
-        grasp = bus.read("grasp")
-        if not (world.is_there and grasp.is_there) or grasp.value.kind > GraspKind.PRESHAPE:
+        status = bus.read("grasp")
+        if not (world.is_there and status.is_there) or status.value.kind > GraspKind.PRESHAPE:
             return self._planned
-        position = world.value.position[self._row]
-        quaternion = world.value.quaternion[self._row]
+        model: Message = world.value
+        position = model.position[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned
-        self._at = np.array(position)
-        sensed = int(world.value.sensed)
-        self._planned = found = self._planner.plan(self._row, self._at, np.array(quaternion))
-        if found is not None:
-            parts = {
-                "contact": found.contact,
-                "normal": found.normal,
-                "posture": found.posture,
-                "grip": found.grip,
-            }
-            bus.send("plan", object=self._row, sensed=sensed, **parts)
-        return found
+        self._at = position.copy()
+        grasp = self._planner.plan(self._row, position, model.quaternion[self._row])
+        self._planned = grasp
+        if grasp is not None:
+            bus.send(
+                "plan",
+                object=self._row,
+                sensed=model.sensed,
+                contact=grasp.contact,
+                normal=grasp.normal,
+                posture=grasp.posture,
+                grip=grasp.grip,
+            )
+        return grasp
 
     def draw(self, bus: Bus) -> None:
         """Replace the picture by one of now; a reader of the file never finds a part of it."""
@@ -120,7 +123,7 @@ class Workstation(HostProgram):
             position=np.array(hand.value.position),
             bodies=np.array(model.position),
             quaternions=np.array(model.quaternion),
-            force=-np.array(hand.value.force),
+            force=-hand.value.force,
             contact=contact,
             held=self._row,
         )
@@ -166,16 +169,11 @@ class Workstation(HostProgram):
         if self._planned is not None:
             margin = f"joints {100 * self._planned.margin:.0f} % from their ends"
             yield f"planned: grip {self._planned.grip:.1f} N, {margin}"
-        robot = self.context.robot.hand
-        for finger, force in zip(
-            robot.finger if robot is not None else (), hand.force, strict=True
+        for name, joints, force in zip(
+            self._hand.names, self._hand.fingers, hand.force, strict=True
         ):
-            rows = [self.context.robot.joints.index(joint) for joint in finger.joints]
-            pulls = hand.tension[:, rows]
-            yield (
-                f"{finger.name}: {norm(force):.1f} N, tendons {pulls.min():.0f} to"
-                f" {pulls.max():.0f} N"
-            )
+            pulls = hand.tension[:, joints]
+            yield (f"{name}: {norm(force):.1f} N, tendons {pulls.min():.0f} to {pulls.max():.0f} N")
         yield "crate memory: cycles, missed, skipped"
         for task, counts in self.boards(bus).items():
             yield f"{task}: {', '.join(map(str, counts.values()))}"
