@@ -23,6 +23,9 @@ from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
 
+COUNTED = (Entry.STAGE, Entry.STRUCK_TICK, Entry.HIDDEN, Entry.COUNT)
+"""Words of a fault's entry that do not depend on time."""
+
 
 class Seen(NamedTuple):
     """What a read gave: its tick, the release tick that the message holds, -1 for none, and what
@@ -136,10 +139,55 @@ class Link:
         rows = MailboxRing(self.segment, NAME).drain().rows
         return [(int(row["tick"]), int(row["serial"]), int(row["visible_at"])) for row in rows]
 
+    def rung(self, task: str) -> list[tuple[object, ...]]:
+        """Return what a task has rung since the last call, but for the time."""
+        rows = self._rings[task].drain().rows
+        names = [name for name in rows.dtype.names or () if name != "time_ns"]
+        return [tuple(row) for row in rows[names].tolist()]
+
     def alarms(self, task: str = "reader") -> list[tuple[int, Alarm]]:
         """Return tick and code of what a task has rung since the last call."""
         rows = self._rings[task].drain().rows
         return [(int(row["tick"]), Alarm(row["code"])) for row in rows]
+
+
+def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
+    """Let a link live through two spells of a fault, and pauses of either end; return all that it
+    leaves, but for times."""
+    entries = []
+    written = []
+    for begin in (0, 400):
+        rack.run(begin, begin + 60)
+        entries.append(rack.fault(kind, *parameters, seed=begin + 3))
+        rack.run(begin + 60, begin + 120)
+        rack.heal()
+        rack.run(begin + 120, begin + 240)
+        for tick in range(begin + 240, begin + 264, rack.reader.every):
+            rack.reader.cycle(tick)
+        for tick in range(begin + 264, begin + 296, rack.writer.every):
+            rack.writer.cycle(tick)
+        rack.run(begin + 296, begin + 400)
+        written += rack.written()
+    writer = rack.writer.ports.writers["point"]
+    reader = rack.reader.ports.readers[NAME]
+    statistics = reader.statistics
+    return {
+        "seen": rack.reader.seen,
+        "written": written,
+        "reader": rack.rung("reader"),
+        "writer": rack.rung("writer"),
+        "struck": [[entry[word] for word in COUNTED] for entry in entries],
+        "statistics": {
+            name: getattr(statistics, name) for name in statistics.__slots__ if name != "forger"
+        },
+        "ends": [
+            writer.serial,
+            writer.bus_errors,
+            reader.serial,
+            reader.accesses,
+            reader.transfers,
+        ],
+    }
 
 
 def struck(entry: FaultEntry) -> int:

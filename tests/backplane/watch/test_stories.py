@@ -1,0 +1,44 @@
+"""Faults of messages on one mailbox, by every protocol and at several rates: what is written, read
+and reported stays as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from rack.backplane.layout import PROTOCOLS, Protocol
+from tests.link import MakeLink, links, story
+from tests.snapshots import Snapshots
+
+SNAPSHOTS = Snapshots(__file__)
+RATES = ((1, 1), (4, 1), (1, 8))
+FAULTS: dict[str, tuple[float, ...]] = {
+    "mute": (),
+    "drop": (0.4,),
+    "delay": (),
+    "reorder": (0.4,),
+    "corrupt": (0.4,),
+    "babble": (),
+}
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    with links(rack_name) as make:
+        yield make
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("rates", RATES, ids=str)
+@pytest.mark.parametrize("reader_first", [False, True])
+def test_a_link_lives_through_faults_as_it_did(
+    link: MakeLink, fault: str, protocol: Protocol, rates: tuple[int, int], reader_first: bool
+) -> None:
+    rack = link(protocol, rates, reader_first)
+    first = "reader" if reader_first else "writer"
+    SNAPSHOTS.check(
+        f"{fault}, {protocol}, {rates[0]} to {rates[1]}, {first} first",
+        story(rack, fault, *FAULTS[fault]),
+    )
