@@ -57,56 +57,44 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     expired.
     """
     now = datetime.now(UTC)
-    wanted = [path.name for name in names for path in _pair(folder, name)]
-    if taken := [name for name in wanted if os.path.lexists(folder / name)]:
+    wanted = [Credentials(folder, name) for name in names]
+    pairs = [path for own in wanted for path in (own.certificate, own.key)]
+    if taken := [path.name for path in pairs if os.path.lexists(path)]:
         raise Failure(f"{folder}: {', '.join(taken)} exist already; nothing is overwritten", 2)
-    own = (AUTHORITY, AUTHORITY_KEY, SECRET)
-    there = [name for name in own if os.path.lexists(folder / name)]
-    if there and len(there) < len(own):
-        lost = ", ".join(name for name in own if name not in there)
+    shared = (AUTHORITY, AUTHORITY_KEY, SECRET)
+    there = [name for name in shared if os.path.lexists(folder / name)]
+    if there and len(there) < len(shared):
+        lost = ", ".join(name for name in shared if name not in there)
         raise Failure(
             f"{folder}: {lost} missing; a set is added to where its authority, with its key, and"
             " secret are",
             2,
         )
     files: dict[str, bytes] = {}
+    expires = now + timedelta(days=days)
     if there:
         authority = _found(folder, now)
     else:
-        authority = _made(now, days)
+        authority = _made(now, expires)
         files |= {AUTHORITY: _pem(authority.certificate), AUTHORITY_KEY: _key_pem(authority.key)}
         files[SECRET] = secrets.token_bytes(SECRET_BYTES)
-    expires = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
+    expires = min(expires, authority.certificate.not_valid_after_utc)
     for name, addresses in names.items():
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = _signed(_for_rack(name, addresses, key, authority), authority, now, expires)
-        for path, content in zip(
-            _pair(folder, name), (_pem(certificate), _key_pem(key)), strict=True
-        ):
-            files[path.name] = content
+        certificate = _for_rack(name, addresses, key, authority, now, expires)
+        own = Credentials(folder, name)
+        files |= {own.certificate.name: _pem(certificate), own.key.name: _key_pem(key)}
     _write(folder, files)
     return Made(files, expires)
 
 
-def _pair(folder: Path, name: str) -> tuple[Path, Path]:
-    own = Credentials(folder, name)
-    return own.certificate, own.key
-
-
-def _made(now: datetime, days: int) -> _Authority:
+def _made(now: datetime, expires: datetime) -> _Authority:
     key = ec.generate_private_key(ec.SECP256R1())
+    own = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
     name = _named(AUTHORITY_NAME)
-    builder = (
-        x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
-    )
-    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-    builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
-    builder = builder.add_extension(
-        x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False
-    )
-    return _Authority(
-        _dated(builder, now, now + timedelta(days=days)).sign(key, hashes.SHA256()), key
-    )
+    builder = _builder(name, key, name, now, expires, signs_certificates=True)
+    builder = builder.add_extension(own, critical=False)
+    return _Authority(builder.sign(key, hashes.SHA256()), key)
 
 
 def _found(folder: Path, now: datetime) -> _Authority:
@@ -133,36 +121,45 @@ def _found(folder: Path, now: datetime) -> _Authority:
 
 
 def _for_rack(
-    name: str, addresses: Sequence[str], key: ec.EllipticCurvePrivateKey, authority: _Authority
-) -> x509.CertificateBuilder:
-    builder = x509.CertificateBuilder().subject_name(_named(name)).public_key(key.public_key())
-    builder = builder.add_extension(
-        x509.BasicConstraints(ca=False, path_length=None), critical=True
-    )
-    builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
-    both = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
-    builder = builder.add_extension(both, critical=False)
-    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
-    builder = builder.add_extension(issuer, critical=False)
-    if addresses:
-        builder = builder.add_extension(
-            x509.SubjectAlternativeName(map(_address, addresses)), critical=False
-        )
-    return builder
-
-
-def _signed(
-    builder: x509.CertificateBuilder, authority: _Authority, now: datetime, expires: datetime
+    name: str,
+    addresses: Sequence[str],
+    key: ec.EllipticCurvePrivateKey,
+    authority: _Authority,
+    now: datetime,
+    expires: datetime,
 ) -> x509.Certificate:
-    issued = _dated(builder.issuer_name(authority.certificate.subject), now, expires)
-    return issued.sign(authority.key, hashes.SHA256())
+    issuer = authority.certificate.subject
+    builder = _builder(_named(name), key, issuer, now, expires, signs_certificates=False)
+    both = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
+    signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
+    builder = builder.add_extension(both, critical=False).add_extension(signer, critical=False)
+    if addresses:
+        names = x509.SubjectAlternativeName(map(_address, addresses))
+        builder = builder.add_extension(names, critical=False)
+    return builder.sign(authority.key, hashes.SHA256())
 
 
-def _dated(
-    builder: x509.CertificateBuilder, now: datetime, expires: datetime
+def _builder(
+    name: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    issuer: x509.Name,
+    now: datetime,
+    expires: datetime,
+    signs_certificates: bool,
 ) -> x509.CertificateBuilder:
-    numbered = builder.serial_number(x509.random_serial_number())
-    return numbered.not_valid_before(now - EARLIER).not_valid_after(expires)
+    path_length = 0 if signs_certificates else None
+    constraints = x509.BasicConstraints(ca=signs_certificates, path_length=path_length)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - EARLIER)
+        .not_valid_after(expires)
+        .add_extension(constraints, critical=True)
+        .add_extension(_usage(signs_certificates), critical=True)
+    )
 
 
 def _usage(signs_certificates: bool) -> x509.KeyUsage:
@@ -225,7 +222,8 @@ def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
         try:
             proper_name.validate_python(name)
             for address in addresses:
-                Endpoint.of(f"tls/[{address}]:1" if ":" in address else f"tls/{address}:1")
+                host = f"[{address}]" if ":" in address else address
+                Endpoint.of(f"tls/{host}:1")
         except ValidationError:
             raise Failure(
                 f'--for = "{entry}": permitted names: a-z, 0-9, _ and -, at most 40', 2

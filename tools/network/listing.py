@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.protocols import open_observer
@@ -40,11 +41,8 @@ class FoundRack:
 def racks_at(hosts: Sequence[HostAddress], asker: Asker) -> list[FoundRack]:
     """Return the racks at these hosts, in their order."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        return [
-            found
-            for at_host in pool.map(lambda host: list(_at(host, asker)), hosts)
-            for found in at_host
-        ]
+        found = pool.map(lambda host: list(_at(host, asker)), hosts)
+        return list(chain.from_iterable(found))
 
 
 def known_hosts() -> list[HostAddress]:

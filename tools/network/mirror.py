@@ -13,7 +13,6 @@ CLOCK_MONOTONIC.
 from __future__ import annotations
 
 import mmap
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -32,7 +31,6 @@ from rack.backplane.address_map import (
     slot_stride,
 )
 from rack.backplane.errors import SegmentError
-from rack.backplane.layout import Layout
 from rack.backplane.operator_table import OperatorTable, RequestStage
 from rack.backplane.segment import MAGIC, VERSION, Segment
 from rack.backplane.words import Block, Box, Head, System
@@ -56,8 +54,8 @@ class MirroredRing:
     """A ring of records: the bus addresses of its head word and its records; `taken` records were
     fetched so far.
 
-    `most` of the newest are fetched; `oldest` is the number of the oldest that is here with all
-    after it.
+    `most` of the newest are fetched, `again` of them each time; `oldest` is the number of the
+    oldest that is here with all after it.
     """
 
     head: int
@@ -65,7 +63,7 @@ class MirroredRing:
     stride: int
     depth: int
     most: int
-    is_mailbox: bool
+    again: int = 0
     taken: int = 0
     oldest: int = 0
 
@@ -87,7 +85,7 @@ class MirroredRing:
 
     def took(self, count: int) -> None:
         """Note that `count` records have been fetched, or were skipped."""
-        self.taken = max(0, count - 1) if self.is_mailbox else count
+        self.taken = max(0, count - self.again)
 
 
 class Mirror(Segment):
@@ -110,16 +108,17 @@ class Mirror(Segment):
         super().__init__(rack, mmap.mmap(-1, words[Head.SIZE]))
         self.is_there = True
         self._note(answer)
-        texts = [
-            _cut(words[at], words[at + 1], len(self.bytes))
-            for at in (Head.LAYOUT_AT, Head.CONFIG_AT)
-        ]
-        self._fill([WORDS, *texts[0], *texts[1]])
+        layout = self._cut(words[Head.LAYOUT_AT], words[Head.LAYOUT_SIZE])
+        config = self._cut(words[Head.CONFIG_AT], words[Head.CONFIG_SIZE])
+        self._fill([WORDS, *layout, *config])
         self.read_head()
-        self._rings = {ring.head: ring for ring in _rings(self)}
+        self._rings = {ring.head: ring for ring in self._all_rings()}
+        # The heads of all rings: in control blocks, in the words of mailboxes, and before alarms.
         self._watched = [
             WORDS,
-            *_merged([*_heads(self), *(Stretch(head, 8) for head in self._rings)]),
+            *(Stretch(address, BLOCK_SIZE) for address in self.map.blocks.values()),
+            *(Stretch(address, 8 * len(Box)) for address in self.map.mailboxes.values()),
+            *(Stretch(address, 8) for address in self.map.alarms.values()),
         ]
         self._requests = OperatorTable(self).entries
 
@@ -133,7 +132,7 @@ class Mirror(Segment):
         news, answer = self._fetch(self._watched)
         self._note(answer)
         heads = _words_of(self._watched, news)
-        fresh = [*self._tables(heads)]
+        fresh = list(self._tables(heads))
         hurried = [ring for at, ring in self._rings.items() if ring.is_hurried(heads[at])]
         for at, ring in self._rings.items():
             fresh += ring.wanted(heads[at])
@@ -149,13 +148,13 @@ class Mirror(Segment):
     def _tables(self, heads: dict[int, int]) -> Iterator[Stretch]:
         """Yield the entries of the fault and the operator table to fetch."""
         injected = min(heads[8 * System.INJECTED], FAULT_ENTRIES)
-        yield from _cut(self.map.faults, injected * FAULT_ENTRY_SIZE, len(self.bytes))
+        yield from self._cut(self.map.faults, injected * FAULT_ENTRY_SIZE)
         requested = heads[8 * System.REQUESTED]
         # An entry is changed until it is issued; issued at once, it never waited here.
         is_open = any(entry.stage == RequestStage.WAITING for entry in self._requests)
         if is_open or requested != self.words[System.REQUESTED]:
             used = min(requested, OPERATOR_ENTRIES) * operator_entry_size(self.layout)
-            yield from _cut(self.map.operator, used, len(self.bytes))
+            yield from self._cut(self.map.operator, used)
 
     def _fill(self, stretches: Sequence[Stretch]) -> None:
         if stretches:
@@ -167,12 +166,8 @@ class Mirror(Segment):
 
     def _note(self, answer: DeskAnswer) -> None:
         self._hosts = answer.hosts
-        self.realtime_offset_ns = answer.realtime_ns - answer.monotonic_ns
-        """CLOCK_REALTIME of its machine less CLOCK_MONOTONIC there."""
         self.realtime_ns = answer.realtime_ns
         """CLOCK_REALTIME of its machine when it answered."""
-        self.monotonic_offset_ns = answer.monotonic_ns - time.monotonic_ns()
-        """CLOCK_MONOTONIC of its machine less that of this one, to within the way of an answer."""
 
     @property
     def launcher_is_alive(self) -> bool:
@@ -189,55 +184,30 @@ class Mirror(Segment):
         address."""
         return self._rings[ring].oldest
 
-    @property
-    def has_its_name(self) -> bool:
-        """Whether it is still the same launch."""
-        return self.is_there
+    def _cut(self, address: int, size: int) -> list[Stretch]:
+        """Return a stretch in pieces that fit an answer. Raises `SegmentError` when it is not in
+        the segment."""
+        last = address + size
+        if not 0 <= address <= last <= len(self.bytes):
+            raise SegmentError(
+                f"{size} bytes at {address}: outside the segment, which has {len(self.bytes)} bytes"
+            )
+        places = range(address, last, MOST_CONTENT)
+        return [Stretch(place, min(MOST_CONTENT, last - place)) for place in places]
 
-
-def _cut(address: int, size: int, end: int) -> list[Stretch]:
-    """Return a stretch in pieces that fit an answer. Raises `SegmentError` when it is not in the
-    segment."""
-    if not 0 <= address <= address + size <= end:
-        raise SegmentError(f"{size} bytes at {address}: outside the segment, which has {end} bytes")
-    return [
-        Stretch(at, min(MOST_CONTENT, address + size - at))
-        for at in range(address, address + size, MOST_CONTENT)
-    ]
-
-
-def _heads(segment: Segment) -> Iterator[Stretch]:
-    """Yield the control blocks and the words of mailboxes."""
-    yield from (Stretch(address, BLOCK_SIZE) for address in segment.map.blocks.values())
-    yield from (Stretch(address, 8 * len(Box)) for address in segment.map.mailboxes.values())
-
-
-def _rings(segment: Segment) -> Iterator[MirroredRing]:
-    layout: Layout = segment.layout
-    for task in layout.processes:
-        head = segment.map.blocks[task.name] + 8 * Block.TRACE_HEAD
-        first = segment.map.traces[task.name]
-        yield MirroredRing(head, first, TRACE_RECORD_SIZE, task.depth, task.depth, is_mailbox=False)
-    for address in segment.map.alarms.values():
-        yield MirroredRing(
-            address, address + LINE, ALARM_RECORD_SIZE, ALARM_DEPTH, ALARM_DEPTH, is_mailbox=False
-        )
-    for box in layout.mailboxes:
-        address = segment.map.mailboxes[box.name]
-        most = box.depth if box.name.endswith(".operator") else NEWEST
-        first = address + MAILBOX_HEAD_SIZE
-        yield MirroredRing(
-            address + 8 * Box.HEAD, first, slot_stride(box), box.depth, most, is_mailbox=True
-        )
-
-
-def _merged(stretches: Iterable[Stretch]) -> list[Stretch]:
-    """Return stretches in the order of their addresses, those that lie in another one left out."""
-    found: list[Stretch] = []
-    for stretch in sorted(stretches, key=lambda s: (s.address, -s.size)):
-        if not found or stretch.address >= sum(found[-1]):
-            found.append(stretch)
-    return found
+    def _all_rings(self) -> Iterator[MirroredRing]:
+        places = self.map
+        for task in self.layout.processes:
+            head = places.blocks[task.name] + 8 * Block.TRACE_HEAD
+            first = places.traces[task.name]
+            yield MirroredRing(head, first, TRACE_RECORD_SIZE, task.depth, task.depth)
+        for head in places.alarms.values():
+            yield MirroredRing(head, head + LINE, ALARM_RECORD_SIZE, ALARM_DEPTH, ALARM_DEPTH)
+        for box in self.layout.mailboxes:
+            most = box.depth if box.name.endswith(".operator") else NEWEST
+            head = places.mailboxes[box.name] + 8 * Box.HEAD
+            first = places.mailboxes[box.name] + MAILBOX_HEAD_SIZE
+            yield MirroredRing(head, first, slot_stride(box), box.depth, most, again=1)
 
 
 def _words_of(stretches: Sequence[Stretch], contents: Iterable[bytes]) -> dict[int, int]:

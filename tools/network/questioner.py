@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from rack.backplane.segment import VERSION
-from rack.boards.lan.config import LanTable
+from rack.boards.lan.config import LanTable, Right
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE
@@ -86,7 +86,6 @@ class Questioner:
         self._token = self._link.session.liveliness().declare_subscriber(
             ALL_ALIVE, zenoh.handlers.Callback(self._note, indirect=False), history=True
         )
-        self._until = threading.Event()
 
     def __enter__(self) -> Self:
         return self
@@ -127,26 +126,21 @@ class Questioner:
         hint = "" if self._asker.certificates else "; one with TLS needs --certificates"
         return f"none that knows '{self._asker.name}'{hint}"
 
-    def is_there(self, rack: str, launch: int) -> bool:
-        """Say whether a launch has not ended yet, as far as is known."""
-        return self._launches.get(rack) == launch
-
     def ask(self, asked: FarLaunch, what: What, payloads: Sequence[bytes]) -> Iterator[DeskAnswer]:
         """Yield the answers to questions of one kind, in their order. Raises `Failure` when one has
         none, or a refusal.
 
         All are on their way at once; one that comes back without an answer is asked again.
         """
-        pending = [
-            self._question(asked.rack, what, payload, self._number + 1) for payload in payloads
-        ]
+        pending = [self._question(asked.rack, what, payload) for payload in payloads]
         for payload, question in zip(payloads, pending, strict=True):
             yield self._granted(asked.rack, what, self._answer(asked, what, payload, question))
 
-    def _question(self, rack: str, what: What, payload: bytes, first: int) -> _Question:
+    def _question(self, rack: str, what: What, payload: bytes, first: int = 0) -> _Question:
         """Ask; `first` is the number under which this was asked for the first time: nothing is done
-        twice."""
+        twice. 0: it is the first time."""
         self._number += 1
+        first = first or self._number
         key = question_key(rack, what, self._asker.name)
         head = Envelope(VERSION, self._session, self._number, first, 0, 0, 0)
         replies = self._link.session.get(
@@ -175,17 +169,15 @@ class Questioner:
                     return answer
             timed_out = timed_out or time.monotonic() - began > ANSWER_S / 2
             returned += 1
-            if not self.is_there(*asked):
-                raise Failure(f"rack '{asked.rack}' at {self._at} has ended, or is out of reach")
+            rack = f"rack '{asked.rack}' at {self._at}"
+            if self._launches.get(asked.rack) != asked.launch:
+                raise Failure(f"{rack} has ended, or is out of reach")
             if returned >= DENIED and not timed_out:
-                raise Failure(f"rack '{asked.rack}' {self._denied(what)}")
+                raise Failure(f"rack '{asked.rack}' {not_permitted(self._asker, NEEDED[what])}")
             if time.monotonic() > deadline:
                 why = "its adapter does not cycle; does `rack step` hold it?"
-                raise Failure(
-                    f"rack '{asked.rack}' at {self._at} has not answered for {PATIENCE_S:g} s:"
-                    f" {why}"
-                )
-            self._until.wait(PAUSE_S)
+                raise Failure(f"{rack} has not answered for {PATIENCE_S:g} s: {why}")
+            time.sleep(PAUSE_S)
             question = self._question(asked.rack, what, payload, question.first)
 
     def _opened(self, question: _Question, launch: int, reply: Any) -> DeskAnswer | None:
@@ -199,17 +191,11 @@ class Questioner:
             return None
         return DeskAnswer.unpacked(payload)
 
-    def _denied(self, what: What) -> str:
-        return (
-            f"does not permit '{self._asker.name}' to {NEEDED[what]}; its config:"
-            " adapter.lan.permit"
-        )
-
     def _granted(self, rack: str, what: What, answer: DeskAnswer) -> DeskAnswer:
         if answer.code is Code.GRANTED:
             return answer
         reasons = {
-            Code.NOT_PERMITTED: self._denied(what),
+            Code.NOT_PERMITTED: not_permitted(self._asker, NEEDED[what]),
             Code.OTHER_VERSION: (
                 f"is of another version; this program asks racks of version {VERSION}"
             ),
@@ -220,6 +206,11 @@ class Questioner:
             Code.FULL: "has too many commands waiting; permitted: once one of them is given",
         }
         raise Failure(f"rack '{rack}' {reasons[answer.code]}")
+
+
+def not_permitted(asker: Asker, right: Right) -> str:
+    """Return why a rack refuses what its config does not permit."""
+    return f"does not permit '{asker.name}' to {right}; its config: adapter.lan.permit"
 
 
 def check_reach(at: HostAddress, asker: Asker) -> None:
@@ -239,12 +230,11 @@ def check_reach(at: HostAddress, asker: Asker) -> None:
     except TimeoutError:
         raise Failure(f"{at}: no answer at port {at.port} within {CONNECT_S:g} s") from None
     except OSError as error:
-        why = (
-            os.strerror(error.errno)
-            if isinstance(error.errno, int) and error.errno > 0
-            else error.strerror
-        )
-        raise Failure(f"{at}: cannot connect to port {at.port}: {why or error}") from None
+        why = error.strerror or str(error)
+        # The resolver's errors have negative numbers, and a text of their own.
+        if error.errno is not None and error.errno > 0:
+            why = os.strerror(error.errno)
+        raise Failure(f"{at}: cannot connect to port {at.port}: {why}") from None
     if not asker.certificates and not address.is_loopback:
         raise Failure(f"{at}: not this machine, so it needs certificates; see --certificates", 2)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from typing import Self
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
@@ -21,7 +22,7 @@ from rack.boards.lan.questions import (
 from rack.tools.console.address import Asker, RackAddress
 from rack.tools.console.answer import Failure
 from rack.tools.network.mirror import Mirror
-from rack.tools.network.questioner import Questioner
+from rack.tools.network.questioner import Questioner, not_permitted
 
 AT_ONCE = 4
 """Questions on their way at once: as many as a desk answers in one cycle."""
@@ -34,10 +35,10 @@ class RemoteRack:
     cannot be reached, or does not permit this user to watch.
     """
 
-    def __init__(self, address: RackAddress, asker: Asker | None = None) -> None:
+    def __init__(self, address: RackAddress, asker: Asker) -> None:
         self.address = address
-        self._asker = asker or Asker.default()
-        self._racks = Questioner(address.at, self._asker)
+        self._asker = asker
+        self._racks = Questioner(address.at, asker)
         try:
             self._launch = self._racks.launch(address.rack)
             self.segment = Mirror(str(address), self._fetch)
@@ -85,7 +86,9 @@ class RemoteRack:
     def claim(self, request: Request) -> Iterator[RequestEntry]:
         """Give a request to the rack, and withdraw it at the end of the `with` block unless it has
         been issued."""
-        self._check_right("command")
+        permit = tomllib.loads(self.segment.config)["adapter"]["lan"].get("permit", {})
+        if "command" not in permit.get(self._asker.name, ()):
+            raise Failure(f"rack '{self.address.rack}' {not_permitted(self._asker, 'command')}")
         (answer,) = self._racks.ask(self._launch, "give", [packed_request(request)])
         ticket = Ticket.unpacked(answer.content)
         if ticket is None or ticket.entry >= OPERATOR_ENTRIES:
@@ -100,13 +103,6 @@ class RemoteRack:
                 # If the rack is out of reach, it withdraws the request by itself.
                 with suppress(Failure):
                     list(self._racks.ask(self._launch, "withdraw", [ticket.packed()]))
-
-    def _check_right(self, right: str) -> None:
-        permit = tomllib.loads(self.segment.config)["adapter"]["lan"].get("permit", {})
-        name = self._asker.name
-        if right not in permit.get(name, ()):
-            why = f"does not permit '{name}' to {right}; its config: adapter.lan.permit"
-            raise Failure(f"rack '{self.address.rack}' {why}")
 
 
 def stop(address: RackAddress, asker: Asker) -> int:
@@ -137,7 +133,6 @@ def _parts(content: bytes, stretches: Sequence[Stretch]) -> Iterator[bytes]:
     short or too long."""
     if len(content) != sum(stretch.size for stretch in stretches):
         raise Failure("an answer is not as long as what was asked for")
-    at = 0
+    parts = BytesIO(content)
     for stretch in stretches:
-        yield content[at : at + stretch.size]
-        at += stretch.size
+        yield parts.read(stretch.size)
