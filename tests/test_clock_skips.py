@@ -48,7 +48,7 @@ def ran(config: RackConfig) -> Skipped:
     guards = [task.task for task in resolve(config).tasks if task.guards_clock]
     with Rack(config, share=True) as rack:
         rack.run((FIRST + APART * len(LENGTHS) + AFTER) * config.clock_ns * 1e-9)
-        layout, struck = rack.segment.layout, strikes(rack.segment, (), ())
+        layout, struck = rack.segment.layout, strikes(rack.segment, ())
     misses = [event for event in rack.events if event.kind == "miss"]
     alarms = {
         guard: [e for e in misses if (e.board, e.code) == (guard, "clock_skipped")]

@@ -169,16 +169,17 @@ def campaign(
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
     """Write campaign.json, campaign.md and, unless interrupted or without matplotlib, campaign.png;
     return the first two."""
-    from rack.tools.faults.campaigns.report import document, markdown
+    from rack.tools.faults.campaigns.report import CampaignReport
 
     work.folder.mkdir(parents=True, exist_ok=True)
-    report = document(work, results, wall_s)
-    text = markdown(report)
-    (work.folder / "campaign.json").write_text(json.dumps(report, indent=2) + "\n")
+    report = CampaignReport(work, results, wall_s)
+    document = report.document()
+    text = report.markdown()
+    (work.folder / "campaign.json").write_text(json.dumps(document, indent=2) + "\n")
     (work.folder / "campaign.md").write_text(text)
     # An interrupted campaign has no time for it.
     if not results.is_interrupted and can_draw():
         from rack.tools.faults.campaigns.plot import plot
 
         plot(report, work.folder / "campaign.png")
-    return report, text
+    return document, text

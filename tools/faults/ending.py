@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection, Stage
+from rack.backplane.layout import Layout
 from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.boards.events import statuses
@@ -26,16 +27,8 @@ AT_REST = 0.02
 
 def record_of(kind: str) -> Kind:
     """Return the record of a kind in reports; a kill from outside is like any other."""
-    return KINDS["kill" if kind == EXTERNAL else kind]
-
-
-@dataclass(frozen=True)
-class Killed:
-    """A kill from outside, at `tick` and at CLOCK_MONOTONIC `time_ns`."""
-
-    board: str
-    tick: int
-    time_ns: int
+    name = "kill" if kind == EXTERNAL else kind
+    return KINDS[name]
 
 
 @dataclass(frozen=True)
@@ -64,6 +57,16 @@ class Strike:
     injection: Injection | None = None
 
     @property
+    def first(self) -> int:
+        """The tick at which it first acted; at which it began, if it never did."""
+        return self.tick if self.tick >= 0 else self.began
+
+    @property
+    def affected(self) -> tuple[str, ...]:
+        """The mailboxes whose messages it affects."""
+        return self.mailboxes if self.record.takes_mailbox else ()
+
+    @property
     def record(self) -> Kind:
         """The kind's record."""
         return record_of(self.kind)
@@ -79,14 +82,26 @@ class ArmEnd:
     is_at_rest: bool = True
 
 
-def strikes(segment: Segment, joints: Sequence[str], kills: Sequence[Killed]) -> tuple[Strike, ...]:
-    """Return everything injected into a rack, in the order of the fault table, kills from outside
-    last."""
-    table = FaultTable(segment)
-    found = [
-        _strike(segment, e.index, joints, table) for e in table.entries if e.stage != Stage.FREE
-    ]
-    return (*found, *(_killed(segment, kill) for kill in kills))
+def strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
+    """Return everything injected into a rack, in the order of the fault table."""
+    entries = FaultTable(segment).entries
+    return tuple(
+        _strike(entry, segment.layout, joints) for entry in entries if entry.stage != Stage.FREE
+    )
+
+
+def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
+    """Return the kill of a board at `tick` and at CLOCK_MONOTONIC `time_ns`."""
+    return Strike(
+        fault=-1,
+        kind=EXTERNAL,
+        board=board,
+        began=tick,
+        ends=tick,
+        tick=tick,
+        time_ns=time_ns,
+        mailboxes=tuple(box.name for box in struck_mailboxes(layout, -1, board)),
+    )
 
 
 def arm_of(segment: Segment) -> ArmEnd:
@@ -104,9 +119,8 @@ def levels_of(segment: Segment) -> str:
     """Return the last state of each level, with its reason, as one readable text."""
     states = []
     for writer, status in statuses(segment, "reason"):
-        state = State(status.state).name.lower()
-        reason = status.reason
-        states.append(f"{writer} {state}{f' ({reason})' if reason else ''}")
+        reason = f" ({status.reason})" if status.reason else ""
+        states.append(f"{writer} {State(status.state).name.lower()}{reason}")
     return ", ".join(states)
 
 
@@ -117,26 +131,25 @@ def is_late(segment: Segment) -> bool:
     )
 
 
-def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTable) -> Strike:
-    entry = table.entries[index]
-    layout = segment.layout
+def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
     kind = KINDS[entry[Entry.KIND]]
     values = kind.values(entry)
     board = board_of(entry, layout)
+    began = -1 if entry.stage == Stage.WAITING else entry[Entry.FROM]
     joint = int(values.get("joint", -1))
-    begun = entry.stage != Stage.WAITING
+    joint_name = joints[joint] if 0 <= joint < len(joints) else ""
     return Strike(
-        fault=index,
+        fault=entry.index,
         kind=kind.name,
         board=board,
-        began=entry[Entry.FROM] if begun else -1,
+        began=began,
         ends=entry[Entry.UNTIL],
         tick=entry[Entry.STRUCK_TICK],
         time_ns=entry[Entry.STRUCK_NS],
         count=entry[Entry.COUNT],
         hidden=entry[Entry.HIDDEN],
         mailboxes=tuple(box.name for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board)),
-        joint=joints[joint] if 0 <= joint < len(joints) else "",
+        joint=joint_name,
         size=values.get("size"),
         injection=Injection(
             kind=entry[Entry.KIND],
@@ -145,19 +158,6 @@ def _strike(segment: Segment, index: int, joints: Sequence[str], table: FaultTab
             ticks=entry[Entry.TICKS],
             phase=entry[Entry.PHASE],
             seed=entry[Entry.SEED],
-            parameters=tuple(entry.parameters[: len(kind.parameters)]),
+            parameters=tuple(values.values()),
         ),
-    )
-
-
-def _killed(segment: Segment, kill: Killed) -> Strike:
-    return Strike(
-        fault=-1,
-        kind=EXTERNAL,
-        board=kill.board,
-        began=kill.tick,
-        ends=kill.tick,
-        tick=kill.tick,
-        time_ns=kill.time_ns,
-        mailboxes=tuple(box.name for box in struck_mailboxes(segment.layout, -1, kill.board)),
     )

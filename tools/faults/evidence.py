@@ -3,6 +3,7 @@ to it."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -74,13 +75,12 @@ def fits(event: Event, strike: Strike) -> bool:
     A fault may strike a moment before its tick is given out; a process that reads the tick then
     sees the one before.
     """
-    if (
-        event.kind not in FOUND
-        or strike.tick < 0
-        or event.tick < strike.tick - (event.kind == DIED)
-    ):
-        return False
-    return event.code in strike.record.codes and is_about(event, strike)
+    return (
+        event.kind in FOUND
+        and 0 <= strike.tick <= event.tick + (event.kind == DIED)
+        and event.code in strike.record.codes
+        and is_about(event, strike)
+    )
 
 
 def explains(strike: Strike, event: Event) -> bool:
@@ -117,19 +117,16 @@ class SkippedTicks:
 
     def __init__(self, events: Sequence[Event]) -> None:
         name = Alarm.CLOCK_SKIPPED.name.lower()
-        self._skips: dict[str, list[tuple[int, int]]] = {}
-        for event in events:
-            if event.kind == "miss" and event.code == name:
-                self._skips.setdefault(event.board, []).append((event.tick, int(event.value)))
+        self._skips = [event for event in events if event.kind == "miss" and event.code == name]
 
     def between(self, first: int, last: int) -> int:
         """Return how many ticks after `first`, up to `last`, did not happen: as many as any one
         task has missed."""
-        sums = (
-            sum(count for tick, count in skips if first < tick <= last)
-            for skips in self._skips.values()
-        )
-        return min(max(sums, default=0), max(0, last - first))
+        by_task = Counter[str]()
+        for event in self._skips:
+            if first < event.tick <= last:
+                by_task[event.board] += int(event.value)
+        return min(max(by_task.values(), default=0), max(0, last - first))
 
 
 class Aftermath(NamedTuple):
@@ -158,28 +155,30 @@ def aftermath(
     if strike.tick < 0:
         return Aftermath()
     after = [event for event in events if event.tick >= strike.tick]
-    struck = {e.tick for e in after if e.code == COLLISION}
-    to_fault = (
-        e for e in after if e.kind == "reaction" and not (e.code == BRAKES and e.tick in struck)
-    )
-    reactions = [e for e in to_fault if e.tick < horizon and _can_react(strike, e)]
+    collisions = {event.tick for event in after if event.code == COLLISION}
+    reactions = [
+        event
+        for event in after
+        if event.kind == "reaction"
+        and event.tick < horizon
+        and not (event.code == BRAKES and event.tick in collisions)
+        and _can_react(strike, event)
+    ]
     undone = [_undone(reaction, after) for reaction in reactions]
     flows = {
         e.subject: e.tick for e in reversed(after) if e.code == "flows" and e.tick >= strike.ends
     }
     undone += [flows.get(mailbox) for mailbox in owed]
     names = tuple(dict.fromkeys(event.code for event in reactions))
-    required = strike.record.consequence.reactions
     lacking = tuple(
-        c
-        for c in required
-        if c not in names and not (c == BRAKES and _are_engaged(strike.tick, events))
+        code
+        for code in strike.record.consequence.reactions
+        if code not in names and not (code == BRAKES and _are_engaged(strike.tick, events))
     )
-    is_undone = None not in undone
-    last = max(filter(None, undone), default=strike.tick)
-    return Aftermath(
-        names, is_undone, last - strike.tick if is_undone and undone else None, lacking
-    )
+    ticks = [tick for tick in undone if tick is not None]
+    is_undone = len(ticks) == len(undone)
+    recovery = max(ticks) - strike.tick if ticks and is_undone else None
+    return Aftermath(names, is_undone, recovery, lacking)
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
@@ -213,9 +212,12 @@ def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
         # They were engaged for the cycles without torque; the event comes when there is torque
         # again.
         return reaction.tick
-    code = UNDONE_BY.get(reaction.code)
-    board = reaction.board if reaction.code == "restart" else None
-    later = (
-        e for e in after if e.kind == "recovery" and e.code == code and e.tick >= reaction.tick
+    recoveries = (
+        event.tick
+        for event in after
+        if event.kind == "recovery"
+        and event.code == UNDONE_BY.get(reaction.code)
+        and event.tick >= reaction.tick
+        and (reaction.code != "restart" or event.board == reaction.board)
     )
-    return min((event.tick for event in later if board in (None, event.board)), default=None)
+    return min(recoveries, default=None)

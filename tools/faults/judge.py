@@ -18,6 +18,7 @@ from rack.boards.faults.kind import DIED
 from rack.tools.faults.ending import EXTERNAL, Strike
 from rack.tools.faults.evidence import (
     COLLISION,
+    FOUND,
     LATCHED,
     MAILBOX_ALARMS,
     Detection,
@@ -70,6 +71,14 @@ class Judgement:
     lacking: tuple[str, ...] = ()
     is_latched: bool = False
 
+    @property
+    def part_of_bound(self) -> float | None:
+        """The delay as a part of its bound, in time where time is bounded; None without a bound, or
+        with bound 0."""
+        if self.bound_ms is not None and self.delay_ms is not None:
+            return self.delay_ms / self.bound_ms
+        return self.delay / self.bound if self.bound and self.delay is not None else None
+
 
 @dataclass(frozen=True)
 class FaultVerdict:
@@ -114,7 +123,7 @@ class _Judge:
         self._events = events
         self._run = run
         self._layout = run.layout
-        self._strikes = sorted(strikes, key=lambda s: (s.tick if s.tick >= 0 else s.began, s.fault))
+        self._strikes = sorted(strikes, key=lambda s: (s.first, s.fault))
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._skipped = SkippedTicks(events)
@@ -127,9 +136,8 @@ class _Judge:
         windows = [self._window(strike) for strike in self._strikes]
         for place, strike in enumerate(self._strikes):
             found = self._detections(strike, windows[place][1], used)
-            best = min(
-                (d for d in found if not self._is_of(d, place)), key=lambda d: d.order, default=None
-            )
+            own = [detection for detection in found if not self._is_of(detection, place)]
+            best = min(own, key=lambda detection: detection.order, default=None)
             if best:
                 used.add(id(best.event))
             elif self._is_brief(strike):
@@ -143,12 +151,13 @@ class _Judge:
                 judgement = self._judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]
-        detections = tuple(event for event in stray if event.kind != "miss")
         return FaultVerdict(
-            tuple(judged), detections, tuple(event for event in stray if event.kind == "miss")
+            faults=tuple(judged),
+            unexplained=tuple(event for event in stray if event.kind != "miss"),
+            misses=tuple(event for event in stray if event.kind == "miss"),
         )
 
-    def _bound(self, strike: Strike, reader: str | None) -> int | None:
+    def _bound(self, strike: Strike, reader: str | None = None) -> int | None:
         """Return the ticks from its strike within which a fault must be found, by a reader or,
         None, by any process.
 
@@ -164,14 +173,13 @@ class _Judge:
 
     def _window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick at which an event may come of a fault."""
-        first = strike.tick if strike.tick >= 0 else strike.began
+        first = strike.first
         if strike.record.takes_mailbox and self._layout.task(strike.board).role == "planner":
             # The plan's writer itself may find the fault, when it makes the next plan.
             return first - 1, self._last
-        over = max(self._ends(strike), first + (self._bound(strike, None) or 0))
-        return first - 1, over + self._recovery(strike) + last_read(
-            strike.mailboxes, self._layout
-        ) + self._settle
+        over = max(self._ends(strike), first + (self._bound(strike) or 0))
+        read = last_read(strike.mailboxes, self._layout)
+        return first - 1, over + self._recovery(strike) + read + self._settle
 
     def _ends(self, strike: Strike) -> int:
         # A task that hangs is killed as soon as that is found, however long it was to hang.
@@ -191,8 +199,7 @@ class _Judge:
     def _owed(self, strike: Strike) -> tuple[str, ...]:
         """Return the mailboxes that must have a new message after a fault: those that are periodic,
         or else all."""
-        struck = strike.mailboxes if strike.record.takes_mailbox else ()
-        return tuple(filter(self._is_periodic, struck)) or struck
+        return tuple(filter(self._is_periodic, strike.affected)) or strike.affected
 
     def _is_periodic(self, mailbox: str) -> bool:
         """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a
@@ -218,30 +225,25 @@ class _Judge:
         if strike.record.where != "arm":
             return False
         until = strike.hidden + strike.count * self._cycles[strike.board]
-        return not strike.count or until < (self._bound(strike, None) or 0)
+        return not strike.count or until < (self._bound(strike) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
         delay = max(0, event.tick - strike.tick)
-        delay_ms = self._delay_ms(event, strike)
         if event.code != "clock_skipped":
             delay -= self._skipped.between(strike.tick, event.tick)
-        if event.kind == DIED:
+        reader = event.board if event.code in MAILBOX_ALARMS else None
+        bound = self._bound(strike, reader)
+        if self._run.is_lockstep:
             # Lockstep waits for the end of a process that its own clock has killed. It knows
             # nothing of any other, and runs as fast as it can: neither ticks nor time are a
             # measure.
-            unbounded = self._run.is_lockstep and strike.kind == EXTERNAL
-            bound_ms = None if self._run.is_lockstep else (RACK_NS + MEMORY_NS) * 1e-6
-            return Detection(
-                event, delay, None if unbounded else self._bound(strike, None), delay_ms, bound_ms
-            )
-        reader = event.board if event.code in MAILBOX_ALARMS else None
-        return Detection(event, delay, self._bound(strike, reader), delay_ms)
-
-    def _delay_ms(self, event: Event, strike: Strike) -> float | None:
-        if self._run.is_lockstep:
-            return None
+            if event.kind == DIED and strike.kind == EXTERNAL:
+                bound = None
+            return Detection(event, delay, bound)
         # A fault of the arm is counted after the cycle that has already found it.
-        return max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
+        delay_ms = max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
+        bound_ms = (RACK_NS + MEMORY_NS) * 1e-6 if event.kind == DIED else None
+        return Detection(event, delay, bound, delay_ms, bound_ms)
 
     def _horizon(self, place: int, last: int) -> int:
         """Return the tick up to which reactions are of this fault: the next one strikes then, or it
@@ -256,44 +258,44 @@ class _Judge:
         found = best.event.tick if best else strike.tick
         # Ticks from the strike within which every reaction must be undone.
         bound = max(self._ends(strike), found) - strike.tick + self._recovery(strike)
-        # Some kinds may end the task with an error.
-        is_latched = (
-            record.consequence.latches and self._run.has_failed and LATCHED in after.reactions
-        )
+        # Only a kind that may end the task with an error has this reaction.
+        is_latched = self._run.has_failed and LATCHED in after.reactions
         if not all(map(self._is_periodic, owed)):
             # Nothing says when its writer has something to write.
             bound = self._last + 1 - strike.tick
         is_undone = after.is_undone and (after.recovery or 0) <= bound
+        mailbox = strike.affected[0] if len(strike.affected) == 1 else ""
+        seen: Seen = "not struck" if strike.tick < 0 else "missed"
         judgement = Judgement(
             kind=strike.kind,
             board=strike.board,
-            mailbox=strike.mailboxes[0]
-            if record.takes_mailbox and len(strike.mailboxes) == 1
-            else "",
+            mailbox=mailbox,
             joint=strike.joint,
             size=strike.size,
             began=strike.began,
             struck=strike.tick,
-            seen="not struck" if strike.tick < 0 else "missed",
+            seen=seen,
             is_judged=record.visible_from is None or (strike.size or 0.0) >= record.visible_from,
             cycle=cycle_ticks(self._layout, strike.board),
-            bound=self._bound(strike, None),
+            bound=self._bound(strike),
             reactions=after.reactions,
             is_recovered=is_latched or is_undone,
             recovery=after.recovery,
             recovery_bound=bound,
-            lacking=() if strike.tick < 0 else after.lacking,
+            lacking=after.lacking,
             is_latched=is_latched,
         )
         if best is None:
             return judgement
+        found_by = "the Rack" if best.event.kind == DIED else best.event.board
+        delay_ms = None if best.delay_ms is None else round(best.delay_ms, 3)
         return replace(
             judgement,
             seen="detected",
-            found_by="the Rack" if best.event.kind == DIED else best.event.board,
+            found_by=found_by,
             found_as=best.event.code or best.event.kind,
             delay=best.delay,
-            delay_ms=None if best.delay_ms is None else round(best.delay_ms, 3),
+            delay_ms=delay_ms,
             bound=best.bound,
             bound_ms=best.bound_ms,
             is_within=best.is_within,
@@ -301,16 +303,15 @@ class _Judge:
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Return whether no fault explains a detection, a death or a miss."""
-        if event.kind not in ("detection", DIED, "miss") or self._is_met(event):
+        if event.kind not in FOUND or self._is_met(event):
             return False
         # An event of a task has the tick of its release, and may come of anything until the end of
         # its cycle.
         until = event.tick + self._cycles.get(event.board, 1) - 1
-        windowed = zip(self._strikes, windows, strict=True)
-        around = [
-            strike for strike, (first, last) in windowed if first <= until and event.tick <= last
-        ]
-        return not any(explains(strike, event) for strike in around if strike.tick >= 0)
+        return not any(
+            strike.tick >= 0 and first <= until and event.tick <= last and explains(strike, event)
+            for strike, (first, last) in zip(self._strikes, windows, strict=True)
+        )
 
     def _is_met(self, event: Event) -> bool:
         """Return whether an obstacle has hit an arm that a fault has stopped, or that waits for
@@ -353,12 +354,17 @@ def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
 
 def _row(found: Judgement, layout: Layout) -> Report:
     tick_ms = layout.clock_ns * 1e-6
-    cycle = found.cycle
+    recovery_ms = None if found.recovery is None else round(found.recovery * tick_ms, 6)
     return {
         **asdict(found),
+        # Lists, as they are when read back from JSON.
         "reactions": list(found.reactions),
         "lacking": list(found.lacking),
-        "delay_cycles": None if found.delay is None else round(found.delay / cycle, 3),
-        "bound_cycles": None if found.bound is None else round(found.bound / cycle, 3),
-        "recovery_ms": None if found.recovery is None else round(found.recovery * tick_ms, 6),
+        "delay_cycles": _in_cycles(found.delay, found.cycle),
+        "bound_cycles": _in_cycles(found.bound, found.cycle),
+        "recovery_ms": recovery_ms,
     }
+
+
+def _in_cycles(ticks: int | None, cycle: int) -> float | None:
+    return None if ticks is None else round(ticks / cycle, 3)

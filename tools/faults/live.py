@@ -50,7 +50,7 @@ class LiveRack:
         With `wait`, return when it is over. Raises `ConfigError` with every mistake, and `Failure`
         when it does not begin, or is not over within `timeout_s` of wall-clock time.
         """
-        if self._is_over:
+        if self._segment.run_is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
         fault = self._fault({key: value for key, value in given.items() if value is not None})
         checked = injection(fault, self._config, self._segment.layout)
@@ -58,8 +58,7 @@ class LiveRack:
         entry = self._table.add(checked)
         if KINDS[fault.kind].where == "core":
             # This very process takes the core.
-            if entry.stage == Stage.WAITING:
-                print(self._state(entry), file=sys.stderr, flush=True)
+            self._print_waiting(entry)
             act_on_core(self._segment, entry)
         elif fault.tick is None and fault.when is None:
             self._await_begin(entry)
@@ -91,23 +90,18 @@ class LiveRack:
 
     def text(self, width: int | None = None) -> Iterator[str]:
         """Yield the faults injected so far, as a table that fits into `width`."""
-        numbers = ("begins", "struck_tick", "until", "acted")
-        rows = [
-            [
-                *(str(fault["fault"]), fault["text"], fault["stage"]),
-                *(
-                    "-" if fault[key] is None or fault[key] < 0 else str(fault[key])
-                    for key in numbers
-                ),
-                fault["waits_for"],
-            ]
-            for fault in self.faults()
-        ]
-        yield from table(
-            ["no", "fault", "stage", "begins", "first acted", "until", "acted", "waits for"],
-            rows,
-            width,
-        )
+        columns = {
+            "no": "fault",
+            "fault": "text",
+            "stage": "stage",
+            "begins": "begins",
+            "first acted": "struck_tick",
+            "until": "until",
+            "acted": "acted",
+            "waits for": "waits_for",
+        }
+        rows = [[_cell(fault[key]) for key in columns.values()] for fault in self.faults()]
+        yield from table(list(columns), rows, width)
 
     def _fault(self, given: dict[str, Any]) -> FaultConfig:
         """Return a fault as in a config. Raises `ConfigError`."""
@@ -131,30 +125,22 @@ class LiveRack:
             )
             raise ConfigError([Mistake("kind", fault.kind, why)])
         if fault.tick is not None and fault.tick <= tick:
-            raise ConfigError(
-                [Mistake("tick", fault.tick, f"has passed; the rack is at tick {tick}")]
-            )
+            why = f"has passed; the rack is at tick {tick}"
+            raise ConfigError([Mistake("tick", fault.tick, why)])
         if where != "core":
             return
         if fault.lasts is None and fault.cycles is None:
-            raise ConfigError(
-                [
-                    Mistake(
-                        "for", None, f"missing; a {fault.kind} must have an end: --for or --cycles"
-                    )
-                ]
-            )
+            why = f"missing; a {fault.kind} must have an end: --for or --cycles"
+            raise ConfigError([Mistake("for", None, why)])
         if not set_priority(1):
-            raise Failure(
-                f"{fault.kind}: SCHED_FIFO is refused to this user; no core can be taken from a"
-                " board"
-            )
+            why = "SCHED_FIFO is refused to this user; no core can be taken from a board"
+            raise Failure(f"{fault.kind}: {why}")
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until a condition holds, or the run is over; return False after `timeout_s`."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
-        while not holds() and not self._is_over:
+        while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:
                 return False
             time.sleep(LOOK_S)
@@ -162,45 +148,46 @@ class LiveRack:
 
     def _await_begin(self, entry: FaultEntry) -> None:
         if not self._wait_until(lambda: entry.stage != Stage.WAITING, BEGIN_S):
-            raise Failure(
-                f"{self._described(entry)}: the clock has not begun it within {BEGIN_S:g} s"
-            )
+            why = f"the clock has not begun it within {BEGIN_S:g} s"
+            raise Failure(f"{self._described(entry)}: {why}")
         self._check_begun(entry)
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
         """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it
         never began."""
-        if entry.stage == Stage.WAITING:
-            print(self._state(entry), file=sys.stderr, flush=True)
+        self._print_waiting(entry)
         if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
             raise Failure(f"timed out after {timeout_s:g} s: {self._state(entry)}")
         self._check_begun(entry)
+
+    def _print_waiting(self, entry: FaultEntry) -> None:
+        if entry.stage == Stage.WAITING:
+            print(self._state(entry), file=sys.stderr, flush=True)
 
     def _check_begun(self, entry: FaultEntry) -> None:
         if entry.stage == Stage.WAITING:
             raise Failure(f"{self._described(entry)}: the run ended before it began")
 
     def _state(self, entry: FaultEntry) -> str:
-        begun = entry[Entry.FROM]
-        until = entry[Entry.UNTIL]
+        fault = self._described(entry)
+        first = entry[Entry.FROM]
+        last = entry[Entry.UNTIL] - 1
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
-            return f"{self._described(entry)}: armed, waits for {self._awaited(entry)}; {how}"
+            return f"{fault}: armed, waits for {self._awaited(entry)}; {how}"
         if entry.stage == Stage.OVER:
             acted = "once" if entry[Entry.COUNT] == 1 else f"{entry[Entry.COUNT]} times"
-            return f"{self._described(entry)}: ticks {begun} to {until - 1}, acted {acted}"
-        end = "to the end of the run" if until == NEVER else f"to tick {until - 1}"
-        return f"{self._described(entry)}: from tick {begun} {end}"
+            return f"{fault}: ticks {first} to {last}, acted {acted}"
+        end = "the end of the run" if entry[Entry.UNTIL] == NEVER else f"tick {last}"
+        return f"{fault}: from tick {first} to {end}"
 
     def _awaited(self, entry: FaultEntry) -> str:
         """Return the tick or the condition that a fault waits for."""
         if entry[Entry.WHEN_BOX] < 0:
+            if entry[Entry.FROM] <= 0:
+                return "the next tick"
             now = self._segment.words[System.TICK]
-            return (
-                f"tick {entry[Entry.FROM]}; the rack is at tick {now}"
-                if entry[Entry.FROM] > 0
-                else "the next tick"
-            )
+            return f"tick {entry[Entry.FROM]}; the rack is at tick {now}"
         when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])
         return condition_text(when, self._segment.layout)
 
@@ -212,6 +199,7 @@ class LiveRack:
     def _described(self, entry: FaultEntry) -> str:
         return describe(entry, self._segment.layout, self._joints)
 
-    @property
-    def _is_over(self) -> bool:
-        return self._segment.run_is_over
+
+def _cell(value: str | int | None) -> str:
+    """Return a cell of the table of faults: "-" for a tick that is not known."""
+    return "-" if value is None or value == -1 else str(value)

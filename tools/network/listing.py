@@ -12,7 +12,7 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Head, Run, System
-from rack.levels.peer import PEER, Presence, peer_port
+from rack.levels.peer import Presence, peer_port
 from rack.tools.console.address import Asker, HostAddress, RackAddress
 from rack.tools.console.answer import Failure
 from rack.tools.network.questioner import Questioner
@@ -63,7 +63,7 @@ def known_hosts() -> list[HostAddress]:
 def _at(host: HostAddress, asker: Asker) -> Iterator[FoundRack]:
     try:
         with Questioner(host, asker) as questioner:
-            names = [launch.rack for launch in questioner.launches()]
+            names = questioner.racks()
     except Failure as failure:
         yield FoundRack(str(host), "", "", str(failure))
         return
@@ -90,14 +90,9 @@ def _described(host: str, rack: RemoteRack) -> FoundRack:
 
 def _peers(segment: Segment) -> Iterator[tuple[str, str]]:
     """Yield the racks that this one works with, and where each is."""
-    ports = {
-        box.name.partition(".")[2]: box.name
-        for box in segment.layout.mailboxes
-        if box.message == PEER.name
-    }
     lan = tomllib.loads(segment.config)["adapter"]["lan"]
     others = [entry["from"].partition("/")[0] for entry in lan.get("import", {}).values()]
     for name in dict.fromkeys([*others, *lan.get("peers", ())]):
-        reading = open_observer(segment, ports[peer_port(name)]).peek()
+        reading = open_observer(segment, f"lan.{peer_port(name)}").peek()
         presence = Presence(int(reading.value.presence)) if reading.is_there else Presence.AWAITED
         yield name, presence.name.lower()

@@ -56,6 +56,12 @@ class FarLaunch(NamedTuple):
 
 
 class _Question(NamedTuple):
+    """A question on its way; `first` is the number under which it was asked for the first time:
+    nothing is done twice."""
+
+    asked: FarLaunch
+    what: What
+    payload: bytes
     number: int
     first: int
     key: str
@@ -115,12 +121,12 @@ class Questioner:
             there = ", ".join(sorted(self._launches))
         raise Failure(f"no rack '{rack}' at {self._at}; racks there: {there or self._nobody()}")
 
-    def launches(self) -> list[FarLaunch]:
+    def racks(self) -> list[str]:
         """Return the racks there, once one has shown itself. Raises `Failure` when none does."""
         with self._changed:
             if not self._changed.wait_for(lambda: bool(self._launches), CONNECT_S):
                 raise Failure(f"{self._at}: racks there: {self._nobody()}")
-            return [FarLaunch(*found) for found in sorted(self._launches.items())]
+            return sorted(self._launches)
 
     def _nobody(self) -> str:
         hint = "" if self._asker.certificates else "; one with TLS needs --certificates"
@@ -132,16 +138,17 @@ class Questioner:
 
         All are on their way at once; one that comes back without an answer is asked again.
         """
-        pending = [self._question(asked.rack, what, payload) for payload in payloads]
-        for payload, question in zip(payloads, pending, strict=True):
-            yield self._granted(asked.rack, what, self._answer(asked, what, payload, question))
+        pending = [self._question(asked, what, payload) for payload in payloads]
+        for question in pending:
+            yield self._granted(asked.rack, what, self._answer(question))
 
-    def _question(self, rack: str, what: What, payload: bytes, first: int = 0) -> _Question:
-        """Ask; `first` is the number under which this was asked for the first time: nothing is done
-        twice. 0: it is the first time."""
+    def _question(
+        self, asked: FarLaunch, what: What, payload: bytes, first: int | None = None
+    ) -> _Question:
+        """Ask, or, with `first`, ask again."""
         self._number += 1
-        first = first or self._number
-        key = question_key(rack, what, self._asker.name)
+        first = self._number if first is None else first
+        key = question_key(asked.rack, what, self._asker.name)
         head = Envelope(VERSION, self._session, self._number, first, 0, 0, 0)
         replies = self._link.session.get(
             key,
@@ -151,20 +158,19 @@ class Questioner:
             payload=payload,
             attachment=self._link.sealer.seal(key, head, payload),
         )
-        return _Question(self._number, first, key, replies)
+        return _Question(asked, what, payload, self._number, first, key, replies)
 
-    def _answer(
-        self, asked: FarLaunch, what: What, payload: bytes, question: _Question
-    ) -> DeskAnswer:
+    def _answer(self, question: _Question) -> DeskAnswer:
         """Return the answer to a question. Raises `Failure` when there is none within the
         patience."""
+        asked = question.asked
         deadline = time.monotonic() + PATIENCE_S
         returned = 0
         timed_out = False
         while True:
             began = time.monotonic()
             for reply in question.replies:
-                answer = self._opened(question, asked.launch, reply)
+                answer = self._opened(question, reply)
                 if answer is not None and answer.code is not Code.BUSY:
                     return answer
             timed_out = timed_out or time.monotonic() - began > ANSWER_S / 2
@@ -173,29 +179,32 @@ class Questioner:
             if self._launches.get(asked.rack) != asked.launch:
                 raise Failure(f"{rack} has ended, or is out of reach")
             if returned >= DENIED and not timed_out:
-                raise Failure(f"rack '{asked.rack}' {not_permitted(self._asker, NEEDED[what])}")
+                raise Failure(f"rack '{asked.rack}' {self._denied(question.what)}")
             if time.monotonic() > deadline:
                 why = "its adapter does not cycle; does `rack step` hold it?"
                 raise Failure(f"{rack} has not answered for {PATIENCE_S:g} s: {why}")
             time.sleep(PAUSE_S)
-            question = self._question(asked.rack, what, payload, question.first)
+            question = self._question(asked, question.what, question.payload, question.first)
 
-    def _opened(self, question: _Question, launch: int, reply: Any) -> DeskAnswer | None:
+    def _opened(self, question: _Question, reply: Any) -> DeskAnswer | None:
         if (sample := reply.ok) is None:
             return None
         payload = sample.payload.to_bytes()
         envelope = None if sample.attachment is None else sample.attachment.to_bytes()
         head = self._link.sealer.opened(answer_key(question.key), envelope, payload)
-        wanted = self._session, question.number, launch
+        wanted = self._session, question.number, question.asked.launch
         if isinstance(head, Flaw) or (head.number, head.serial, head.launch) != wanted:
             return None
         return DeskAnswer.unpacked(payload)
+
+    def _denied(self, what: What) -> str:
+        return not_permitted(self._asker, NEEDED[what])
 
     def _granted(self, rack: str, what: What, answer: DeskAnswer) -> DeskAnswer:
         if answer.code is Code.GRANTED:
             return answer
         reasons = {
-            Code.NOT_PERMITTED: not_permitted(self._asker, NEEDED[what]),
+            Code.NOT_PERMITTED: self._denied(what),
             Code.OTHER_VERSION: (
                 f"is of another version; this program asks racks of version {VERSION}"
             ),

@@ -83,7 +83,7 @@ def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
     )
     with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
         assert rack.run(0.5).cause == "time over"
-        assert [strike.tick for strike in strikes(rack.segment, (), ())] == [-1]
+        assert [strike.tick for strike in strikes(rack.segment, ())] == [-1]
 
 
 @pytest.mark.parametrize(("computing", "arrived"), [(0, 4), (100, 40), (102.5, 44)])

@@ -15,7 +15,15 @@ from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.kind import KINDS
 from rack.levels.messages import ARM_STATE, SERVO_STATUS, TASK_STATUS, Error
-from rack.tools.faults.ending import AT_REST, EXTERNAL, Killed, arm_of, is_late, levels_of, strikes
+from rack.tools.faults.ending import (
+    AT_REST,
+    EXTERNAL,
+    arm_of,
+    is_late,
+    kill_from_outside,
+    levels_of,
+    strikes,
+)
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 
@@ -100,7 +108,7 @@ def test_the_arm_is_as_its_board_last_reported_it(
     assert (end.violations, end.touches, end.is_at_rest) == (3, 2, rests)
 
 
-def test_strikes_are_the_table_s_and_kills_from_outside_come_last(
+def test_strikes_are_the_table_s_and_a_kill_from_outside_is_one_too(
     make_bus: MakeBus,  # noqa: F811
 ) -> None:
     segment = make_bus(*BOXES, *TASKS)
@@ -111,7 +119,7 @@ def test_strikes_are_the_table_s_and_kills_from_outside_come_last(
     begun, waits = table.add(injected), table.add(Injection(mute.number, 0, mailbox=0, tick=90))
     begun.words[Entry.STAGE] = Stage.ACTIVE
     begun.acted(43)
-    first, second, last = strikes(segment, JOINTS, [Killed("task", 60, 5_000)])
+    first, second = strikes(segment, JOINTS)
     assert (first.kind, first.board, first.began, first.tick, first.count) == (
         "sensor-bias",
         "servo",
@@ -125,7 +133,8 @@ def test_strikes_are_the_table_s_and_kills_from_outside_come_last(
     # It waits, so it has not begun.
     assert (second.kind, second.began, second.tick, second.count) == ("mute", -1, -1, 0)
     assert (second.fault, second.joint) == (waits.index, "")
-    assert (last.fault, last.kind, last.board, last.began, last.ends, last.tick) == (
+    kill = kill_from_outside(segment.layout, "task", 60, 5_000)
+    assert (kill.fault, kill.kind, kill.board, kill.began, kill.ends, kill.tick) == (
         -1,
         EXTERNAL,
         "task",
@@ -133,4 +142,4 @@ def test_strikes_are_the_table_s_and_kills_from_outside_come_last(
         60,
         60,
     )
-    assert last.mailboxes == ("task.status",)
+    assert (kill.time_ns, kill.mailboxes) == (5_000, ("task.status",))

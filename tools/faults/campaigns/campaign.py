@@ -7,8 +7,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_rea
 from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult, kept
 from rack.tools.faults.campaigns.trial import restart_s
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
+from rack.tools.faults.ending import EXTERNAL
 
 LAUNCH_S = 2.0
 """About the time of a launch and an end, for the progress bar."""
@@ -93,13 +94,17 @@ class Campaign:
             if nominal.shortfalls or nominal.ended != "task done":
                 why = "; ".join(nominal.shortfalls)
                 raise Failure(f"{order.name}: the task is not done even without faults: {why}")
-            results = Results(nominal)
             self._ticks = nominal.ticks
-            self._inject(results)
+            results = Results(nominal)
+            for lockstep in order.modes:
+                self._inject(results, lockstep)
+            # Runs of kills alternate between the modes.
+            rack = self._under_test(False not in order.modes)
+            kills = kill_plans(rack, order.kills, order.seed, order.modes, self._number + 1)
+            results.trials += self._made(kills)
             rack = self._under_test(True)
-            results.sizes += self._made(
-                size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1)
-            )
+            sizes = size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1)
+            results.sizes += self._made(sizes)
             self._run_faultless(results)
         results.is_interrupted = INTERRUPT.number != 0
         return results
@@ -120,136 +125,118 @@ class Campaign:
         path.write_text(json.dumps(wanted, indent=2) + "\n")
 
     def _under_test(self, lockstep: bool) -> RackUnderTest:
-        return RackUnderTest(
-            self._targets, self._ticks, self._second, restart_s(self._config, lockstep)
-        )
+        restart = restart_s(self._config, lockstep)
+        return RackUnderTest(self._targets, self._ticks, self._second, restart)
 
-    def _inject(self, results: Results) -> None:
-        """Make trials until every kind has struck as often as ordered; in real time those that
-        lockstep cannot have."""
+    def _inject(self, results: Results, lockstep: bool) -> None:
+        """Make trials until every kind has struck as often as ordered."""
         order = self.order
-        both = len(self.order.modes) > 1
-        for lockstep in order.modes:
-            kinds = (
-                [k for k in self.kinds if needs_real_time(k) != lockstep]
-                if both or lockstep
-                else self.kinds
-            )
-            lacking = dict.fromkeys(kinds if order.injections else (), order.injections)
-            for turn in range(ROUNDS):
-                rack = self._under_test(lockstep)
-                seed = f"{order.seed} {turn}"
-                found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
-                results.trials += found
-                struck = Counter(
-                    f.kind
-                    for run in found
-                    for f in run.faults
-                    if f.is_judged and f.seen != "not struck"
-                )
-                lacking = {
-                    kind: left
-                    for kind, count in lacking.items()
-                    if (left := count - struck[kind]) > 0
-                }
-                if not lacking or INTERRUPT.number:
-                    break
-            wanted = order.injections
-            results.lacking += [
-                f"{k}: struck {wanted - n} of {wanted} times, in {ROUNDS} draws"
-                for k, n in lacking.items()
-            ]
-        # Runs of kills alternate between the modes.
-        rack = self._under_test(False not in order.modes)
-        kills = kill_plans(rack, order.kills, order.seed, order.modes, self._number + 1)
-        results.trials += self._made(list(kills))
+        kinds = self.kinds
+        if lockstep or len(order.modes) > 1:
+            # Real time repeats nothing that lockstep can have.
+            kinds = [kind for kind in kinds if needs_real_time(kind) != lockstep]
+        # Unary plus leaves out the kinds that lack nothing.
+        lacking = +Counter(dict.fromkeys(kinds, order.injections))
+        rack = self._under_test(lockstep)
+        for turn in range(ROUNDS):
+            seed = f"{order.seed} {turn}"
+            found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
+            results.trials += found
+            faults = [fault for run in found for fault in run.faults]
+            lacking -= Counter(f.kind for f in faults if f.is_judged and f.seen != "not struck")
+            if not lacking or INTERRUPT.number:
+                break
+        wanted = order.injections
+        results.lacking += [
+            f"{kind}: struck {wanted - count} of {wanted} times, in {ROUNDS} draws"
+            for kind, count in lacking.items()
+        ]
 
     def _made(self, plans: Sequence[Plan]) -> list[TrialResult]:
         """Return the results of these plans, in their order: made now, or kept from before."""
         self._number = max([self._number, *(plan.number for plan in plans)])
         if plans:
             self._progress.total(self._guess_s(plans))
+        jobs = [self._job(plan) for plan in plans]
         for lockstep in (True, False):
-            jobs = [self._job(plan) for plan in plans if plan.lockstep is lockstep]
-            jobs = [job for job in jobs if self._kept(job) is None]
-            if jobs:
-                self._progress.begin(f"{len(jobs)} in {'lockstep' if lockstep else 'real time'}")
-            for job in self._workers.run(jobs, alone=not lockstep):
+            waiting = [job for job in jobs if job.plan.lockstep is lockstep and not _kept(job)]
+            if waiting:
+                mode = "lockstep" if lockstep else "real time"
+                self._progress.begin(f"{len(waiting)} in {mode}")
+            for job in self._workers.run(waiting, alone=not lockstep):
                 self._show(job)
-        return [found for plan in plans if (found := self._kept(self._job(plan))) is not None]
+        return [found for job in jobs if (found := _kept(job))]
 
-    def _job(self, plan: Plan, seconds: float | None = None) -> TrialJob:
+    def _job(self, plan: Plan) -> TrialJob:
         name = f"{plan.number:04}" if plan.number else plan.purpose
-        seconds = self.order.seconds if seconds is None else seconds
-        return TrialJob(plan, self.folder / TRIALS / f"{name}.json", self._ticks, seconds)
-
-    def _kept(self, job: TrialJob) -> TrialResult | None:
-        """Return the result that is kept of a trial; None for one of another plan, drawn by another
-        version."""
-        found = kept(job.path)
-        return found if found is not None and found.plan == job.plan else None
+        path = self.folder / TRIALS / f"{name}.json"
+        return TrialJob(plan, path, self._ticks, self.order.seconds)
 
     def _show(self, job: TrialJob) -> None:
         """Show how a trial ended; where it falls short, leave a plan that repeats it."""
-        if (found := self._kept(job)) is None:
+        plan = job.plan
+        if (found := _kept(job)) is None:
             return
-        if found.shortfalls and job.plan.number:
-            (self.folder / f"trial-{job.plan.number:04}.toml").write_text(
-                job.plan.toml(self.order.name)
-            )
-        self._progress.end(
-            self._guess_s([job.plan]), f"{_text(job.plan)}: {found.ended}", found.shortfalls
-        )
+        if found.shortfalls and plan.number:
+            path = self.folder / f"trial-{plan.number:04}.toml"
+            path.write_text(plan.toml(self.order.name))
+        ended = f"{_text(plan)}: {found.ended}"
+        self._progress.end(self._guess_s([plan]), ended, found.shortfalls)
 
     def _run_faultless(self, results: Results) -> None:
         """Run without faults, alone or under load, for as long as ordered."""
-        for place, is_loaded in enumerate(self.order.loads if self.order.faultless_s else ()):
+        if not self.order.faultless_s:
+            return
+        for place, is_loaded in enumerate(self.order.loads):
             if INTERRUPT.number:
                 return
-            with ExitStack() as stack:
-                under = stack.enter_context(load()) if is_loaded else ""
-                runs = list(self._calm(place, under))
-            results.faultless.append(
-                Faultless(under, sum(run.ticks for run in runs) / self._second, tuple(runs))
-            )
+            with load() if is_loaded else nullcontext("") as under:
+                runs = tuple(self._calm(place, under))
+            seconds = sum(run.ticks for run in runs) / self._second
+            results.faultless.append(Faultless(under, seconds, runs))
 
     def _calm(self, place: int, under: str) -> Iterator[TrialResult]:
         """Yield faultless runs in real time."""
+        faultless = self._job(Plan(0, "faultless", lockstep=False))
+        name = f"faultless under {under}" if under else "faultless"
         left = self.order.faultless_s
         nth = 0
         while left >= SHORTEST_S and not INTERRUPT.number:
-            self._progress.begin(
-                f"faultless{f' under {under}' if under else ''}, {left:.0f} s left"
-            )
+            self._progress.begin(f"{name}, {left:.0f} s left")
             seconds = left if left < self._ticks / self._second else self.order.seconds
-            plan = Plan(0, "faultless", lockstep=False)
-            job = self._job(plan, seconds)
-            job = TrialJob(
-                plan, job.path.with_stem(f"faultless-{place}-{nth:03}"), job.ticks, seconds
-            )
-            if self._kept(job) is None:
+            path = faultless.path.with_stem(f"faultless-{place}-{nth:03}")
+            job = replace(faultless, path=path, seconds=seconds)
+            if _kept(job) is None:
                 list(self._workers.run([job], alone=True))
-            if (found := self._kept(job)) is None:
+            if (found := _kept(job)) is None:
                 return
             yield found
             # A run that has not ended would not end the next time either.
             ran_s = found.ticks / self._second or left
-            left = left - ran_s
-            nth = nth + 1
+            left -= ran_s
+            nth += 1
             self._progress.end(ran_s, found.ended, found.shortfalls)
 
     def _guess_s(self, plans: Sequence[Plan]) -> float:
         """Estimate the time that runs take: in lockstep a core simulates the default rack in a
         third of real time."""
         real_s = self._ticks / self._second
-        cores = len(os.sched_getaffinity(0))
-        return sum(LAUNCH_S + (real_s / 3.0 / cores if plan.lockstep else real_s) for plan in plans)
+        lockstep_s = real_s / 3.0 / len(os.sched_getaffinity(0))
+        run_s = {True: lockstep_s, False: real_s}
+        return sum(LAUNCH_S + run_s[plan.lockstep] for plan in plans)
+
+
+def _kept(job: TrialJob) -> TrialResult | None:
+    """Return the result that is kept of a trial; None for one of another plan, drawn by another
+    version."""
+    found = kept(job.path)
+    return found if found is not None and found.plan == job.plan else None
 
 
 def _text(plan: Plan) -> str:
     """Return a plan in a few words."""
-    kinds = Counter(
-        [*(table["kind"] for table in plan.faults), *(["external kill"] * len(plan.kills))]
-    )
-    found = ", ".join(f"{count} {kind}" if count > 1 else kind for kind, count in kinds.items())
-    return f"trial {plan.number}, {found}" if plan.number else plan.purpose
+    if not plan.number:
+        return plan.purpose
+    kinds = Counter([*(table["kind"] for table in plan.faults), *[EXTERNAL] * len(plan.kills)])
+    counts = [f"{count} {kind}".removeprefix("1 ") for kind, count in kinds.items()]
+    return f"{plan.name}, {', '.join(counts)}"

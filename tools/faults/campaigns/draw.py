@@ -3,9 +3,9 @@ plans."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate
 from random import Random
 from typing import Any
 
@@ -62,22 +62,16 @@ class RackUnderTest:
         kind = target.record
         tasks = [task.name for task in layout.tasks]
         boxes = [box.name for box in layout.mailboxes]
-        entry = Injection(
-            kind.number,
-            tasks.index(target.board) if target.board in tasks else -1,
-            -1 if target.mailbox is None else boxes.index(target.mailbox),
-            parameters=tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters),
-        )
+        task = tasks.index(target.board) if target.board in tasks else -1
+        box = boxes.index(target.mailbox) if target.mailbox else -1
+        values = tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters)
+        entry = Injection(kind.number, task, box, parameters=values)
         lasts = kind.bound_ticks(entry, layout) or 0
         if not kind.is_over_when_found:
-            lasts = max(
-                lasts, ticks, 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS
-            )
-        return (
-            lasts
-            + kind.recovery_ticks(target.board, layout, self.restart_s)
-            + round(SETTLE_S * self.second)
-        )
+            least = 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS
+            lasts = max(lasts, ticks, least)
+        recovery = kind.recovery_ticks(target.board, layout, self.restart_s)
+        return lasts + recovery + round(SETTLE_S * self.second)
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,8 @@ class Card:
         ticks = record.lasts(drawing) if record.lasts is not None else 0
         parameters = {p.name: p.drawn(drawing) for p in record.parameters if p.drawn is not None}
         if size is not None:
-            parameters |= {"joint": rng.randrange(joints)} if "joint" in parameters else {}
+            if "joint" in parameters:
+                parameters["joint"] = rng.randrange(joints)
             parameters["size"] = size
         window = rack.window(target, ticks, parameters)
         return cls(target, ticks, parameters, window, rng.randrange(SEEDS), _phase(rng))
@@ -111,17 +106,15 @@ class Card:
     @property
     def quiet(self) -> int:
         """Ticks from the last message that a fault has touched to the next fault."""
-        held = (
-            self.parameters.get("by", 0) * self.target.cycle
-            if self.target.record.where == "writer"
-            else 0
-        )
+        held = 0.0
+        if self.target.record.where == "writer":
+            held = self.parameters.get("by", 0) * self.target.cycle
         return self.window - self.ticks - round(held)
 
     def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> dict[str, Any]:
         """Return the fault as a `[[fault]]` table that begins at `tick`."""
         target = self.target
-        kind = self.target.record
+        kind = target.record
         table: dict[str, Any] = {"kind": kind.name, "board": target.board}
         if kind.where != "start":
             table["tick"] = tick
@@ -141,33 +134,31 @@ def fault_plans(
 
     Faults come in random order, as many in a trial as fit into the task, one after the other.
     """
-    rng = Random(f"{seed} {'lockstep' if lockstep else 'realtime'}")
+    mode = "lockstep" if lockstep else "realtime"
+    rng = Random(f"{seed} {mode}")
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     rng.shuffle(kinds)
-    return _packed(
-        rack, first, lockstep, "faults", [Card.draw(rack, kind, rng) for kind in kinds], rng
-    )
+    cards = [Card.draw(rack, kind, rng) for kind in kinds]
+    return _packed(rack, first, lockstep, "faults", cards, rng)
 
 
 def kill_plans(
     rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int
-) -> Iterator[Plan]:
-    """Yield plans of kills from outside, `count` in all, in these modes by turns, numbered from
+) -> list[Plan]:
+    """Return plans of kills from outside, `count` in all, in these modes by turns, numbered from
     `first`."""
     rng = Random(f"{seed} kills")
+    targets = rack.targets.by_kind[EXTERNAL]
     gap = KILL_GAP_S * rack.second
     a_run = max(1, int((rack.last() - rack.first()) / gap))
-    for place, done in enumerate(range(0, count, a_run)):
-        kills = []
-        for _ in range(min(a_run, count - done)):
-            kills.append(rng.choice(rack.targets.by_kind[EXTERNAL]).board)
-        starts = _starts(rack, [round(gap)] * len(kills), rng)
-        yield Plan(
-            number=first + place,
-            purpose="kills",
-            lockstep=modes[place % len(modes)],
-            kills=tuple(Kill(b, t, _phase(rng)) for b, t in zip(kills, starts, strict=True)),
-        )
+    plans = list[Plan]()
+    for done in range(0, count, a_run):
+        boards = [rng.choice(targets).board for _ in range(min(a_run, count - done))]
+        starts = _starts(rack, [round(gap)] * len(boards), rng)
+        kills = [Kill(b, tick, _phase(rng)) for b, tick in zip(boards, starts, strict=True)]
+        lockstep = modes[len(plans) % len(modes)]
+        plans.append(Plan(first + len(plans), "kills", lockstep, kills=tuple(kills)))
+    return plans
 
 
 def size_plans(
@@ -203,11 +194,10 @@ def _packed(
     waiting = list(cards)
     while waiting:
         chosen = _chosen(rack, waiting)
+        starts = _starts(rack, [card.window for card in chosen], rng)
         faults = list[dict[str, Any]]()
         kills = list[Kill]()
-        for card, start in zip(
-            chosen, _starts(rack, [card.window for card in chosen], rng), strict=True
-        ):
+        for card, start in zip(chosen, starts, strict=True):
             if card.target.kind == EXTERNAL:
                 kills.append(Kill(card.target.board, start, card.phase))
             else:
@@ -222,25 +212,21 @@ def _chosen(rack: RackUnderTest, waiting: list[Card]) -> list[Card]:
         return [waiting.pop(0)]
     chosen: list[Card] = []
     free = rack.last() - rack.first()
-    busy = set[str]()
+    busy = set[str | None]()
     for card in waiting[:AHEAD]:
         target = card.target
-        is_first = not chosen
-        is_reported = target.mailbox is None or target.mailbox not in busy
         fits = (
             card.window <= free
-            and is_reported
+            and target.mailbox not in busy
             and target.record.recoverable
             and len(chosen) < MOST_FAULTS
         )
-        if is_first or fits:
+        if not chosen or fits:
             chosen.append(card)
             waiting.remove(card)
             free -= card.window
-            if (
-                target.mailbox is not None
-                and EPISODE * max(target.reader, target.cycle) > card.quiet
-            ):
+            is_quiet = card.quiet >= EPISODE * max(target.reader, target.cycle)
+            if target.mailbox is not None and not is_quiet:
                 busy.add(target.mailbox)
     return chosen
 
@@ -250,13 +236,9 @@ def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[in
     random."""
     free = max(0, rack.last() - rack.first() - sum(windows))
     cuts = sorted(rng.randint(0, free) for _ in windows)
-    gaps = [later - earlier for earlier, later in pairwise([0, *cuts])]
-    starts = []
-    at = rack.first()
-    for gap, window in zip(gaps, windows, strict=True):
-        starts.append(at + gap)
-        at += gap + window
-    return starts
+    # Each without a gap before it; after the last one comes the end.
+    earliest = accumulate(windows, initial=rack.first())
+    return [cut + tick for cut, tick in zip(cuts, earliest, strict=False)]
 
 
 def _phase(rng: Random) -> float:

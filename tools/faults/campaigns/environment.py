@@ -46,9 +46,9 @@ def left_behind(rack: str, before: set[int]) -> list[str]:
     `before`: descendants of this process that were there before the rack.
     """
     _await_end({*_named(rack), *(children() - before)})
-    files = [f"/dev/shm/{path.name}" for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
-    processes = sorted({*_named(rack), *(children() - before)})
-    return files + [f"process {pid} ({_name(pid)})" for pid in processes]
+    processes = _named(rack) | (children() - before)
+    files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
+    return files + [f"process {pid} ({_name(pid)})" for pid in sorted(processes)]
 
 
 def _named(rack: str) -> set[int]:
@@ -121,11 +121,13 @@ def load() -> Iterator[str]:
     Uses `stress-ng` where it is installed.
     """
     cores = sorted(os.sched_getaffinity(0))
-    stress = ["stress-ng", "--cpu", str(len(cores)), "--io", "1"]
-    has_stress = shutil.which(stress[0]) is not None
+    parts = [*([str(core)] for core in cores), [DISKS]]
+    words = f"{len(cores)} busy processes and one that writes"
+    if shutil.which("stress-ng") is not None:
+        words = f"stress-ng --cpu {len(cores)} --io 1"
+        parts = [words.split()]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-m", "rack.tools.faults.campaigns.environment", str(os.getpid())]
-    parts = [stress] if has_stress else [*([str(core)] for core in cores), [DISKS]]
     busy = [
         subprocess.Popen(
             [*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -133,7 +135,7 @@ def load() -> Iterator[str]:
         for part in parts
     ]
     try:
-        yield " ".join(stress) if has_stress else f"{len(cores)} busy processes and one that writes"
+        yield words
     finally:
         for process in busy:
             # Terminated, not killed: stress-ng then ends its own processes.

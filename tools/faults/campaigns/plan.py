@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from rack.backplane.address_map import CLOCK
@@ -42,10 +43,17 @@ class Plan:
     faults: tuple[Mapping[str, Any], ...] = ()
     kills: tuple[Kill, ...] = ()
 
+    @property
+    def name(self) -> str:
+        """The trial by its number; a run without one by its purpose."""
+        return f"trial {self.number}" if self.number else f"{self.purpose} run"
+
     def config(self, config: RackConfig, rack: str) -> RackConfig:
         """Return the config that runs this plan, as a rack of another name."""
-        # Only real time has a speed.
-        clock = {"mode": "lockstep", "speed": 1.0} if self.lockstep else {"mode": "realtime"}
+        clock: dict[str, Any] = {"mode": "realtime"}
+        if self.lockstep:
+            # Only real time has a speed.
+            clock = {"mode": "lockstep", "speed": 1.0}
         faults = tuple(FaultConfig.model_validate(table) for table in self.faults)
         return config.model_copy(
             update={
@@ -59,12 +67,13 @@ class Plan:
         """Return the faults as a file for `--faults`; kills from outside, which no file can hold,
         as comments."""
         mode = " --lockstep" if self.lockstep else ""
-        lines = [f"# Trial {self.number}: rack run {config}{mode} --faults THIS_FILE"]
-        lines += [
+        faults = to_toml({"fault": [dict(table) for table in self.faults]})
+        kills = [
             f"# {EXTERNAL}: {kill.board} at tick {kill.tick} + {kill.phase:g}"
             for kill in self.kills
         ]
-        return "\n".join([*lines, "", to_toml({"fault": [dict(table) for table in self.faults]})])
+        head = f"# Trial {self.number}: rack run {config}{mode} --faults THIS_FILE"
+        return "\n".join([head, *kills, "", faults])
 
 
 def needs_real_time(kind: str) -> bool:
@@ -103,22 +112,20 @@ class Targets:
         }
         self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
         # The clock's process can be killed like any other.
-        self.by_kind[EXTERNAL] = [
-            Target(EXTERNAL, task, self._cycle(task)) for task in [*self._roles, CLOCK]
-        ]
+        self.by_kind[EXTERNAL] = self._at(EXTERNAL, [*self._roles, CLOCK])
 
     def _of(self, kind: Kind) -> list[Target]:
         if not kind.takes_mailbox:
-            return [Target(kind.name, task, self._cycle(task)) for task in self._tasks(kind)]
-        seen = [box for box in self.layout.mailboxes if self._is_seen(kind, box)]
-        readers = [
-            min(between_reads(self.layout, box, reader) for reader in box.readers) for box in seen
-        ]
-        targets = zip(seen, readers, strict=True)
-        return [
-            Target(kind.name, box.writer, self._cycle(box.writer), box.name, reader)
-            for box, reader in targets
-        ]
+            return self._at(kind.name, self._tasks(kind))
+        targets = []
+        for box in filter(partial(self._is_seen, kind), self.layout.mailboxes):
+            cycle = cycle_ticks(self.layout, box.writer)
+            reader = min(between_reads(self.layout, box, reader) for reader in box.readers)
+            targets.append(Target(kind.name, box.writer, cycle, box.name, reader))
+        return targets
+
+    def _at(self, kind: str, tasks: Iterable[str]) -> list[Target]:
+        return [Target(kind, task, cycle_ticks(self.layout, task)) for task in tasks]
 
     def _tasks(self, kind: Kind) -> list[str]:
         if kind.where == "clock":
@@ -141,9 +148,6 @@ class Targets:
             return False
         return role in kind.tasks and (kind.where != "writer" or role == "executor")
 
-    def _cycle(self, task: str) -> int:
-        return cycle_ticks(self.layout, task)
-
 
 def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]:
     """Return the kinds of a campaign, `wanted` as in "kill,mute"; None: all that the rack can have.
@@ -156,21 +160,16 @@ def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]
     ]
     if wanted is None:
         return permitted
-    named = [name.strip() for name in wanted.split(",") if name.strip()]
+    named = dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip())
+    kinds = f"kinds: {', '.join(permitted)}"
     for name in named:
+        if name not in known:
+            raise Failure(f"--kinds {name}: no such kind; {kinds}", 2)
+        if known[name] and not realtime:
+            why = f"{name} needs real time, and the campaign is in lockstep"
+            raise Failure(f"--kinds {name}: {why}; {kinds}", 2)
         if name not in permitted:
-            raise Failure(
-                f"--kinds {name}: {_why_not(name, known, realtime)}; kinds: {', '.join(permitted)}",
-                2,
-            )
+            raise Failure(f"--kinds {name}: nothing in this rack can have it; {kinds}", 2)
     if not named:
-        raise Failure(f"--kinds: names no kind; kinds: {', '.join(permitted)}", 2)
-    return list(dict.fromkeys(named))
-
-
-def _why_not(name: str, known: Mapping[str, bool], realtime: bool) -> str:
-    if name not in known:
-        return "no such kind"
-    if known[name] and not realtime:
-        return f"{name} needs real time, and the campaign is in lockstep"
-    return "nothing in this rack can have it"
+        raise Failure(f"--kinds: names no kind; {kinds}", 2)
+    return list(named)

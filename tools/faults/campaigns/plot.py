@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from matplotlib.ticker import NullFormatter
 
 from rack.tools.console.pictures import picture
-from rack.tools.faults.campaigns.statistics import part_of_bound
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
-Report = dict[str, Any]
+    from rack.tools.faults.campaigns.report import CampaignReport
+    from rack.tools.faults.judge import Judgement
+
 SIZE_IN = (13.0, 8.0)
 DOT = "#4477aa"
 MIDDLE = "#222222"
@@ -27,16 +28,14 @@ WIDEST = 1.5
 """Part of a bound up to which delays are drawn; later ones are arrows at the edge."""
 
 
-def plot(report: Report, path: Path) -> None:
-    """Draw a campaign's document into a PNG file: delays against bounds, curves of size, recovery
-    times."""
-    trials = f"{report['summary']['trials']} trials, {' and '.join(dict.fromkeys(report['modes']))}"
+def plot(report: CampaignReport, path: Path) -> None:
+    """Draw a campaign into a PNG file: delays against bounds, curves of size, recovery times."""
+    order = report.order
     with picture([path], *SIZE_IN) as figure:
         for place, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
             draw(figure.add_subplot(place), report)
-        figure.suptitle(
-            f"Faults injected into {report['config']}: {trials}, seed {report['seed']}", fontsize=11
-        )
+        title = f"Faults injected into {order.name}: {report.trials}, seed {order.seed}"
+        figure.suptitle(title, fontsize=11)
 
 
 def _places(figure: Figure) -> Iterator[SubplotSpec]:
@@ -57,27 +56,24 @@ def _places(figure: Figure) -> Iterator[SubplotSpec]:
     yield from (grid[:, 0], grid[0, 1], grid[1, 1])
 
 
-def _delays(axes: Axes, report: Report) -> None:
+def _delays(axes: Axes, report: CampaignReport) -> None:
     """Draw each fault's time to detection as a part of its own bound; note median and longest in
     cycles."""
-    kinds = list(report["by_kind"])[::-1]
+    kinds = list(report.by_kind)[::-1]
     for row, kind in enumerate(kinds):
-        found = [f for f in report["faults"] if f["kind"] == kind and f["seen"] == "detected"]
-        parts = [part for fault in found if (part := _part(fault)) is not None]
+        found = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
+        parts = [part for part in map(_part, found) if part is not None]
         _row(axes, row, [part for part in parts if part <= WIDEST])
-        late = [part for part in parts if part > WIDEST]
-        axes.scatter(
-            [WIDEST] * len(late), [row] * len(late), marker=">", s=40, color=BOUND, clip_on=False
-        )
+        late = sum(part > WIDEST for part in parts)
+        axes.scatter([WIDEST] * late, [row] * late, marker=">", s=40, color=BOUND, clip_on=False)
         if parts:
             axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
-        place = (1.02, row)
+        figures = report.by_kind[kind]
+        numbers = f"{figures.detected} of {figures.injected}"
+        if figures.cycles is not None:
+            numbers += f"; {figures.cycles.median:.3g}, {figures.cycles.max:.3g}"
         frame = ("axes fraction", "data")
-        figures = report["by_kind"][kind]
-        cycles = report["by_kind"][kind]["cycles"]
-        numbers = f"{figures['detected']} of {figures['injected']}"
-        numbers += "" if cycles is None else f"; {cycles['median']:.3g}, {cycles['max']:.3g}"
-        axes.annotate(numbers, place, xycoords=frame, fontsize=8, va="center")
+        axes.annotate(numbers, (1.02, row), xycoords=frame, fontsize=8, va="center")
     axes.axvline(1.0, color=BOUND, linewidth=1.2)
     axes.set_xlim(-0.03, WIDEST)
     _name_rows(axes, kinds)
@@ -96,36 +92,33 @@ def _name_rows(axes: Axes, names: list[str]) -> None:
     axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
 
-def _part(fault: Report) -> float | None:
+def _part(fault: Judgement) -> float | None:
     """Return a fault's delay as a part of its bound; a bound of the same cycle is met exactly or
     not at all."""
-    if fault["bound"] == 0 and fault["bound_ms"] is None:
-        return 0.0 if fault["delay"] == 0 else 2 * WIDEST
-    return part_of_bound(fault["delay"], fault["bound"], fault["delay_ms"], fault["bound_ms"])
+    if fault.bound == 0 and fault.bound_ms is None:
+        return 0.0 if fault.delay == 0 else 2 * WIDEST
+    return fault.part_of_bound
 
 
-def _sizes(axes: Axes, report: Report) -> None:
+def _sizes(axes: Axes, report: CampaignReport) -> None:
     """Draw the size of a sensor's error against the time to its detection."""
     edge = axes.get_xaxis_transform()
-    clock_ms = report["clock_ms"]
-    longest = 10 * clock_ms
-    for (kind, found), marker in zip(report["sizes"].items(), "os", strict=False):
-        seen = [point for point in found["curve"] if point["delay_ms"] is not None]
-        unseen = [point["size"] for point in found["curve"] if point["delay_ms"] is None]
-        sizes = [point["size"] for point in seen]
-        delays = [point["delay_ms"] for point in seen]
+    longest = 10 * report.clock_ms
+    for (kind, found), marker in zip(report.curves.items(), "os", strict=False):
+        sizes = [point.size for point in found.curve if point.delay_ms is not None]
+        delays = [point.delay_ms for point in found.curve if point.delay_ms is not None]
+        unseen = [point.size for point in found.curve if point.delay_ms is None]
         longest = max([longest, *delays])
         (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
-        axes.plot(
-            unseen, [1.0] * len(unseen), "x", color=line.get_color(), transform=edge, clip_on=False
-        )
-        axes.axvline(found["judged_from"], color=line.get_color(), linewidth=0.9, linestyle=":")
-    if report["sizes"]:
+        color = line.get_color()
+        axes.plot(unseen, [1.0] * len(unseen), "x", color=color, transform=edge, clip_on=False)
+        axes.axvline(found.judged_from, color=color, linewidth=0.9, linestyle=":")
+    if report.curves:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
         # Linear up to a tick: most delays are 0.
-        axes.set_yscale("symlog", linthresh=clock_ms)
-        axes.set_ylim(-0.5 * clock_ms, 1.5 * longest)
+        axes.set_yscale("symlog", linthresh=report.clock_ms)
+        axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
         axes.legend(fontsize=8)
     else:
         axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes)
@@ -133,23 +126,14 @@ def _sizes(axes: Axes, report: Report) -> None:
     axes.set_ylabel("time to detection, ms")
 
 
-def _recoveries(axes: Axes, report: Report) -> None:
+def _recoveries(axes: Axes, report: CampaignReport) -> None:
     """Draw the time from each strike until every reaction was undone."""
-    times = {
-        kind: [f for f in report["faults"] if f["kind"] == kind]
-        for kind in reversed(report["by_kind"])
-    }
-    seconds = {
-        kind: [
-            fault["recovery"] * report["clock_ms"] * 1e-3
-            for fault in faults
-            if fault["recovery"] is not None
-        ]
-        for kind, faults in times.items()
-    }
-    rows = {kind: found for kind, found in seconds.items() if found}
-    for row, found in enumerate(rows.values()):
-        _row(axes, row, found)
-    _name_rows(axes, list(rows))
+    kinds: list[str] = []
+    for kind in reversed(report.by_kind):
+        ticks = [fault.recovery for fault in report.faults_of(kind) if fault.recovery is not None]
+        if ticks:
+            _row(axes, len(kinds), [tick * report.clock_ms * 1e-3 for tick in ticks])
+            kinds.append(kind)
+    _name_rows(axes, kinds)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("from the strike until every reaction is undone, s of simulated time")

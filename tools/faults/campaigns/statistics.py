@@ -3,26 +3,91 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from math import exp, lgamma, log, sqrt
 from statistics import median
-from typing import Any
 
 from rack.boards.faults.kind import KINDS
 from rack.tools.faults.ending import EXTERNAL, record_of
 from rack.tools.faults.judge import Judgement
 
-Figures = dict[str, Any]
+
+@dataclass(frozen=True)
+class FaultCounts:
+    """Numbers of the faults that must be found: all that were drawn, and what became of them."""
+
+    drawn: int
+    injected: int
+    detected: int
+    missed: int
+    not_struck: int
+    within_bound: int
+    reacted_to: int
+    recovered: int
+    latched: int
 
 
-def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, Figures]:
+@dataclass(frozen=True)
+class Spread:
+    """Median and maximum of some values."""
+
+    median: float
+    max: float
+
+
+@dataclass(frozen=True)
+class KindFigures(FaultCounts):
+    """The figures of one kind.
+
+    `wilson`: bounds of the 95 % intervals of shares of the injected, None where there are none.
+    `bound` in words; `bound_ticks`: the least and the most of its ticks. `cycles`, `ticks`, `ms`:
+    times to detection; `part_of_bound`: 1 is the bound.
+    """
+
+    wilson: dict[str, tuple[float, float] | None]
+    bound: str
+    cycles: Spread | None
+    ticks: Spread | None
+    bound_ticks: dict[str, int] | None
+    part_of_bound: Spread | None
+    ms: Spread | None
+    reactions: list[str]
+    recovery_ms: Spread | None
+
+
+@dataclass(frozen=True)
+class EventRate:
+    """Events an hour, and the rate that they stay below with 95 % confidence."""
+
+    an_hour: float
+    below: float
+
+
+@dataclass(frozen=True)
+class SizePoint:
+    """A point of a curve of size against delay; delay None: it was not found."""
+
+    size: float
+    joint: str
+    delay_ms: float | None
+    delay: int | None
+
+
+@dataclass(frozen=True)
+class SizeCurve:
+    """A curve of size against delay; errors must be found from the size `judged_from`."""
+
+    judged_from: float
+    curve: list[SizePoint]
+
+
+def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures]:
     """Return the figures of each kind, in the order of `KINDS`; only faults that must be found
     count."""
-    order = [*KINDS.names, EXTERNAL]
-    kinds = sorted({fault.kind for fault in faults if fault.is_judged}, key=order.index)
-    return {
-        kind: _figures(kind, [f for f in faults if f.kind == kind and f.is_judged], clock_ns)
-        for kind in kinds
-    }
+    judged = [fault for fault in faults if fault.is_judged]
+    kinds = dict.fromkeys([*KINDS.names, EXTERNAL])
+    found = {kind: [fault for fault in judged if fault.kind == kind] for kind in kinds}
+    return {kind: _figures(kind, those, clock_ns) for kind, those in found.items() if those}
 
 
 Z95 = 1.959964
@@ -41,9 +106,8 @@ def wilson(count: int, of: int) -> tuple[float, float] | None:
     return max(0.0, round(middle - half, 6)), min(1.0, round(middle + half, 6))
 
 
-def rate(count: int, seconds: float) -> Figures | None:
-    """Return events an hour, and the rate that they stay below with 95 % confidence; None where
-    there is no time.
+def rate(count: int, seconds: float) -> EventRate | None:
+    """Return the rate of events; None where there is no time.
 
     The bound is the rate at which so few events have a probability of 5 % (Poisson).
     """
@@ -53,84 +117,63 @@ def rate(count: int, seconds: float) -> Figures | None:
     high = count + 10.0 + 5.0 * sqrt(count)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        chance = (
-            sum(exp(k * log(middle) - middle - lgamma(k + 1)) for k in range(count + 1))
-            if middle
-            else 1.0
-        )
-        low, high = (middle, high) if chance > RULE_95 else (low, middle)
+        chance = sum(exp(k * log(middle) - middle - lgamma(k + 1)) for k in range(count + 1))
+        if chance > RULE_95:
+            low = middle
+        else:
+            high = middle
     hours = seconds / 3600.0
-    return {"an_hour": round(count / hours, 3), "below": round(high / hours, 3)}
+    return EventRate(round(count / hours, 3), round(high / hours, 3))
 
 
-def totals(faults: Iterable[Judgement]) -> Figures:
+def totals(faults: Iterable[Judgement]) -> FaultCounts:
     """Return how many faults struck, were found, were found in time, and so on."""
     judged = [fault for fault in faults if fault.is_judged]
     struck = [fault for fault in judged if fault.seen != "not struck"]
-    return {
-        "drawn": len(judged),
-        "injected": len(struck),
-        "detected": sum(fault.seen == "detected" for fault in struck),
-        "missed": sum(fault.seen == "missed" for fault in struck),
-        "not_struck": len(judged) - len(struck),
-        "within_bound": sum(fault.is_within for fault in struck),
-        "reacted_to": sum(not fault.lacking for fault in struck),
-        "recovered": sum(fault.is_recovered for fault in struck),
-        "latched": sum(fault.is_latched for fault in struck),
-    }
-
-
-def curve(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[Figures]:
-    """Return size against delay of one kind, smallest size first; delay None: it was not found."""
-    found = sorted(
-        (f for f in faults if f.kind == kind and f.struck >= 0), key=lambda f: f.size or 0.0
+    return FaultCounts(
+        drawn=len(judged),
+        injected=len(struck),
+        detected=sum(fault.seen == "detected" for fault in struck),
+        missed=sum(fault.seen == "missed" for fault in struck),
+        not_struck=len(judged) - len(struck),
+        within_bound=sum(fault.is_within for fault in struck),
+        reacted_to=sum(not fault.lacking for fault in struck),
+        recovered=sum(fault.is_recovered for fault in struck),
+        latched=sum(fault.is_latched for fault in struck),
     )
-    return [
-        {"size": f.size, "joint": f.joint, "delay_ms": _ms(f.delay, clock_ns), "delay": f.delay}
-        for f in found
-    ]
 
 
-def spread(values: Sequence[float]) -> Figures | None:
-    """Return median and max; None where there are no values."""
-    return {"median": round(median(values), 3), "max": round(max(values), 3)} if values else None
+def curve(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoint]:
+    """Return size against delay of one kind, smallest size first."""
+    found = [fault for fault in faults if fault.kind == kind and fault.struck >= 0]
+    points = [SizePoint(f.size or 0.0, f.joint, _ms(f.delay, clock_ns), f.delay) for f in found]
+    return sorted(points, key=lambda point: point.size)
 
 
-def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> Figures:
+def spread(values: Iterable[float | None]) -> Spread | None:
+    """Return median and maximum of the values that there are; None where there are none."""
+    known = [value for value in values if value is not None]
+    return Spread(round(median(known), 3), round(max(known), 3)) if known else None
+
+
+def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigures:
     seen = [fault for fault in faults if fault.seen == "detected"]
-    counts = totals(faults)
-    parts = [
-        part_of_bound(fault.delay, fault.bound, fault.delay_ms, fault.bound_ms) for fault in seen
-    ]
+    counts = vars(totals(faults))
+    shares = ("detected", "within_bound", "recovered")
     bounds = [fault.bound for fault in faults if fault.bound is not None]
-    return {
+    bound_ticks = {"least": min(bounds), "most": max(bounds)} if bounds else None
+    return KindFigures(
         **counts,
-        "wilson": {
-            key: wilson(counts[key], counts["injected"])
-            for key in ("detected", "within_bound", "recovered")
-        },
-        "bound": str(record_of(kind).bound),
-        "cycles": spread([f.delay / f.cycle for f in seen if f.delay is not None]),
-        "ticks": spread([f.delay for f in seen if f.delay is not None]),
-        "bound_ticks": {"least": min(bounds), "most": max(bounds)} if bounds else None,
-        # How near to its bound each came: 1 is the bound.
-        "part_of_bound": spread([part for part in parts if part is not None]),
-        "ms": spread([f.delay_ms for f in seen if f.delay_ms is not None]),
-        "reactions": sorted({name for fault in faults for name in fault.reactions}),
-        "recovery_ms": spread(
-            [_ms(f.recovery, clock_ns) or 0.0 for f in seen if f.recovery is not None]
-        ),
-    }
-
-
-def part_of_bound(
-    delay: int | None, bound: int | None, delay_ms: float | None, bound_ms: float | None
-) -> float | None:
-    """Return a delay as a part of its bound, in time where time is bounded; None without a bound,
-    or with bound 0."""
-    if bound_ms is not None and delay_ms is not None:
-        return delay_ms / bound_ms
-    return delay / bound if bound and delay is not None else None
+        wilson={share: wilson(counts[share], counts["injected"]) for share in shares},
+        bound=str(record_of(kind).bound),
+        cycles=spread(fault.delay / fault.cycle for fault in seen if fault.delay is not None),
+        ticks=spread(fault.delay for fault in seen),
+        bound_ticks=bound_ticks,
+        part_of_bound=spread(fault.part_of_bound for fault in seen),
+        ms=spread(fault.delay_ms for fault in seen),
+        reactions=sorted({name for fault in faults for name in fault.reactions}),
+        recovery_ms=spread(_ms(fault.recovery, clock_ns) for fault in seen),
+    )
 
 
 def _ms(ticks: int | None, clock_ns: int) -> float | None:

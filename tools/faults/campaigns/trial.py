@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
-from rack.backplane.layout import Layout
 from rack.backplane.process import is_alive, start_time
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
@@ -21,7 +20,16 @@ from rack.boards.errors import BoardError, ConfigError
 from rack.boards.events import Event, Outcome
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
-from rack.tools.faults.ending import ArmEnd, Killed, Strike, arm_of, is_late, levels_of, strikes
+from rack.tools.faults.ending import (
+    ArmEnd,
+    Strike,
+    arm_of,
+    is_late,
+    kill_from_outside,
+    levels_of,
+    strikes,
+)
+from rack.tools.faults.judge import Circumstances
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
@@ -52,7 +60,7 @@ class Killer:
         self._words = segment.words
         self._waiting = list(kills)
         self._retry_at = 0.0
-        self.done: list[Killed] = []
+        self.done: list[Strike] = []
 
     def due_in_s(self) -> float:
         """Return the time until the next kill, at most half a second."""
@@ -65,26 +73,21 @@ class Killer:
 
     def advance(self) -> None:
         """Kill the board whose instant has come; one that is not running, as soon as it is."""
-        if (
-            not self._waiting
-            or self._words[System.TICK] < self._waiting[0].tick
-            or time.monotonic() < self._retry_at
-        ):
+        words = self._words
+        if not self._waiting or time.monotonic() < self._retry_at:
             return
-        self._await_phase()
         kill = self._waiting[0]
+        if words[System.TICK] < kill.tick:
+            return
+        wait_ns = self._instant_ns() - time.monotonic_ns()
+        if words[System.LOCKSTEP]:
+            # Here the phase only spreads kills over what boards do in their ticks.
+            wait_ns = round(kill.phase * words[System.PERIOD_NS])
+        time.sleep(max(0, wait_ns) * 1e-9)
         if self._kill(kill.board):
             self._waiting.pop(0)
         else:
             self._retry_at = time.monotonic() + RETRY_S
-
-    def _await_phase(self) -> None:
-        # In lockstep the phase only spreads kills over what boards do in their ticks.
-        kill = self._waiting[0]
-        period = self._words[System.PERIOD_NS]
-        lockstep = self._words[System.LOCKSTEP]
-        until = time.monotonic_ns() + round(kill.phase * period) if lockstep else self._instant_ns()
-        time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)
 
     def _instant_ns(self) -> int:
         kill = self._waiting[0]
@@ -92,30 +95,32 @@ class Killer:
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
 
     def _kill(self, board: str) -> bool:
-        pid, is_up = self._process(board)
-        if not is_up or not is_alive(pid):
-            return False
+        pid = self._pid(board)
         started = start_time(pid)
+        if not started:
+            return False
         with suppress(ProcessLookupError):
             descriptor = os.pidfd_open(pid)
             try:
                 # The number may have become another process's between the two looks.
-                if (pid, True) == self._process(board) and is_alive(pid, started):
+                if self._pid(board) == pid and is_alive(pid, started):
+                    layout = self._segment.layout
                     tick = self._words[System.TICK]
-                    now = time.monotonic_ns()
+                    kill = kill_from_outside(layout, board, tick, time.monotonic_ns())
                     signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-                    self.done.append(Killed(board, tick, now))
+                    self.done.append(kill)
                     return True
             finally:
                 os.close(descriptor)
         return False
 
-    def _process(self, board: str) -> tuple[int, bool]:
-        """Return a board's process, and whether it is running."""
+    def _pid(self, board: str) -> int:
+        """Return the process of a board that is running; 0 for another."""
         if board == CLOCK:
-            return self._words[System.CLOCK_PID], True
+            return self._words[System.CLOCK_PID]
         block = self._segment.block(board)
-        return block[Block.PID], block[Block.STATE] == TaskState.RUNNING and not block[Block.LOST]
+        is_up = block[Block.STATE] == TaskState.RUNNING and not block[Block.LOST]
+        return block[Block.PID] if is_up else 0
 
 
 @dataclass(frozen=True)
@@ -124,12 +129,11 @@ class Trial:
 
     `again`: how a run without its faults ended, right after it was refused. `left` is everything
     that it left behind. `levels` holds the last state of each level; `is_late`: one gave up because
-    it could not meet a time. `moving` are obstacles that move. `offset_ns` turns CLOCK_MONOTONIC
-    into the events' CLOCK_REALTIME.
+    it could not meet a time. `run`: what the judge must know of it; None where it was refused.
     """
 
     plan: Plan
-    layout: Layout | None
+    run: Circumstances | None
     outcome: Outcome | None
     refused: str
     events: tuple[Event, ...]
@@ -137,11 +141,8 @@ class Trial:
     arm: ArmEnd
     left: tuple[str, ...]
     wall_s: float
-    offset_ns: int
-    restart_s: float = RESTART_S
     levels: str = ""
     is_late: bool = False
-    moving: tuple[str, ...] = ()
     again: Outcome | None = None
 
 
@@ -166,7 +167,7 @@ def run_trial(
             killer = Killer(rack.segment, plan.kills)
             _watch(rack, killer, ticks, seconds)
             joints = config.robot.joints if config.robot is not None else ()
-            found = strikes(rack.segment, joints, killer.done)
+            found = (*strikes(rack.segment, joints), *killer.done)
             arm = arm_of(rack.segment)
             levels = levels_of(rack.segment)
             late = is_late(rack.segment)
@@ -175,11 +176,21 @@ def run_trial(
     except (BackplaneError, BoardError) as error:
         refused = str(error)
     again = None
-    if refused and plan.faults:
+    run = None
+    if not refused:
+        run = Circumstances(
+            layout=rack.segment.layout,
+            offset_ns=time.time_ns() - time.monotonic_ns(),
+            is_lockstep=plan.lockstep,
+            restart_s=restart_s(config, plan.lockstep),
+            has_failed=rack.outcome is not None and not rack.outcome.worked,
+            moving=tuple(motion.body for motion in config.scene.motion),
+        )
+    elif plan.faults:
         again = run_trial(config, replace(plan, faults=()), rack_name, ticks, AGAIN_S).outcome
     return Trial(
         plan=plan,
-        layout=rack.segment.layout if hasattr(rack, "segment") else None,
+        run=run,
         outcome=rack.outcome,
         refused=refused,
         events=tuple(rack.events),
@@ -187,11 +198,8 @@ def run_trial(
         arm=arm,
         left=tuple(left_behind(rack_name, before)),
         wall_s=time.monotonic() - started,
-        offset_ns=time.time_ns() - time.monotonic_ns(),
-        restart_s=restart_s(config, plan.lockstep),
         levels=levels,
         is_late=late,
-        moving=tuple(motion.body for motion in config.scene.motion),
         again=again,
     )
 
@@ -206,23 +214,20 @@ def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> Non
     """Watch a run to its end, and kill its boards as planned; no run lasts for ever."""
     rack.start(seconds)
     words = rack.segment.words
-    most_s = NOMINAL_S if not ticks else GRACE_S
+    most_s = GRACE_S if ticks else NOMINAL_S
     most_ticks = MAX_LENGTH * ticks + max(most_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
     seen = -1
     deadline = 0.0
     stopped = False
     while rack.watch(killer.due_in_s()):
         killer.advance()
-        if not stopped and (tick := words[System.TICK]) != seen:
-            seen = tick
+        if words[System.TICK] != seen and not stopped:
+            seen = words[System.TICK]
             deadline = time.monotonic() + STILL_S
-        if not stopped and (why := _why_stop(seen > most_ticks, deadline)):
-            rack.stop(why)
+        is_overdue = time.monotonic() > deadline
+        if stopped and is_overdue:
+            return
+        if not stopped and (is_overdue or seen > most_ticks):
+            rack.stop("the trial takes too long")
             stopped = True
             deadline = time.monotonic() + STUCK_S
-        elif stopped and time.monotonic() > deadline:
-            return
-
-
-def _why_stop(too_long: bool, deadline: float) -> str:
-    return "the trial takes too long" if too_long or time.monotonic() > deadline else ""

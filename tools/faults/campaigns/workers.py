@@ -22,7 +22,7 @@ from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.plan import Plan
-from rack.tools.faults.campaigns.results import Judged, keep
+from rack.tools.faults.campaigns.results import keep
 from rack.tools.faults.campaigns.trial import run_trial
 
 LOOK_S = 0.2
@@ -69,12 +69,13 @@ class Workers:
         """
         waiting = list(jobs)
         busy = dict[Any, TrialJob]()
-        most = 1 if alone else len(self._cores)
+        cores = [set(self._cores)] if alone else [{core} for core in self._cores]
         while (waiting or busy) and not INTERRUPT.number:
-            for place, line in enumerate(self._some(min(most, len(waiting) + len(busy)))):
+            lines = self._some(min(len(cores), len(waiting) + len(busy)))
+            for line, its_cores in zip(lines, cores, strict=False):
                 if line not in busy and waiting:
                     busy[line] = waiting.pop(0)
-                    line.send((busy[line], set(self._cores) if alone else {self._cores[place]}))
+                    line.send((busy[line], its_cores))
             ready: list[Any] = wait(list(busy), LOOK_S)
             for line in ready:
                 yield self._done(line, busy.pop(line))
@@ -109,11 +110,10 @@ class Workers:
             ]
             # In a process group of its own: Ctrl-C on the terminal reaches only the campaign, which
             # stops its workers.
-            self._processes.append(
-                subprocess.Popen(
-                    command, env=environment, pass_fds=[there.fileno()], process_group=0
-                )
+            process = subprocess.Popen(
+                command, env=environment, pass_fds=[there.fileno()], process_group=0
             )
+            self._processes.append(process)
             there.close()
             here.send(self._config)
             self._lines.append(here)
@@ -133,7 +133,7 @@ def main() -> None:
             os.sched_setaffinity(0, cores)
             try:
                 trial = run_trial(config, job.plan, f"camp-{os.getpid()}x", job.ticks, job.seconds)
-                keep(Judged.of(trial), job.path)
+                keep(trial, job.path)
             except Exception as error:  # whatever it is, the campaign must hear of it
                 line.send(f"{type(error).__name__}: {error}")
             else:

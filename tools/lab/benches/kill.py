@@ -67,7 +67,8 @@ def run_killing(
             killer.advance()
         lasted_ns = time.monotonic_ns() - began_ns
         assert rack.outcome is not None, "the run is over"
-        struck = [strike for strike in strikes(rack.segment, (), killer.done) if strike.tick >= 0]
+        injected = (*strikes(rack.segment, ()), *killer.done)
+        struck = [strike for strike in injected if strike.tick >= 0]
         ends = [*(strike.tick for strike in struck[1:]), rack.outcome.ticks]
         return KilledRun(
             kills=tuple(

@@ -9,7 +9,7 @@ import pytest
 
 from rack.tools.faults.campaigns.campaign import Campaign, Order
 from rack.tools.faults.campaigns.plan import Plan
-from rack.tools.faults.campaigns.report import SHOWN, document, markdown
+from rack.tools.faults.campaigns.report import SHOWN, CampaignReport
 from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult
 from tests.tools.fault_events import LAYOUT, TICK_NS, found
 from tests.tools.faults.campaigns.test_statistics import judgement
@@ -61,11 +61,16 @@ class Made:
     order = cast(Order, None)
 
 
-@pytest.fixture
-def report() -> dict[str, Any]:
-    """Return the document of three trials, one run with a known size, and one without faults."""
+def report_of(results: Results) -> CampaignReport:
+    """Return the report of these results."""
     campaign = Made()
     campaign.order = cast(Order, Ordered())
+    return CampaignReport(cast(Campaign, campaign), results, 61.26)
+
+
+@pytest.fixture
+def made() -> CampaignReport:
+    """Return the report of three trials, one run with a known size, and one without faults."""
     trip = found(7, "gap", "upper", "lower.status")
     calm = run(0, ticks=20 * SECOND, unexplained=(trip,), misses={"plan_late": 2}, stray_misses=9)
     swept = run(4, faults=(judgement("sensor-bias", delay=None, size=0.01, struck=40),))
@@ -76,7 +81,13 @@ def report() -> dict[str, Any]:
         [Faultless("a load", 20.0, (calm,))],
         ["overrun: did not strike"],
     )
-    return document(cast(Campaign, campaign), results, 61.26)
+    return report_of(results)
+
+
+@pytest.fixture
+def report(made: CampaignReport) -> dict[str, Any]:
+    """Return its document."""
+    return made.document()
 
 
 class Ordered:
@@ -139,8 +150,8 @@ def test_a_kind_counts_the_trials_in_which_it_struck(report: dict[str, Any]) -> 
     ]
 
 
-def test_the_text_says_what_the_document_holds(report: dict[str, Any]) -> None:
-    lines = markdown(report).splitlines()
+def test_the_text_says_what_the_document_holds(made: CampaignReport) -> None:
+    lines = made.markdown().splitlines()
     assert lines[0] == "# Campaign on small, seed 9: fell short"
     assert lines[2].startswith("3 trials, lockstep and realtime, in 61 s on ")
     assert lines[3] == "- no real time"
@@ -164,16 +175,23 @@ def test_the_text_says_what_the_document_holds(report: dict[str, Any]) -> None:
     assert lines[-3:] == ["", "- trial 2: late", "- overrun: did not strike"]
 
 
-def test_a_campaign_without_shortfalls_has_passed(report: dict[str, Any]) -> None:
-    passed = {**report, "shortfalls": [], "by_kind": {}, "sizes": {}, "faultless": []}
-    calm = {**report["summary"], "faultless_s": 0.0, "latched": 2, "recovered": 3}
-    text = markdown({**passed, "summary": calm, "interrupted": True})
+def test_a_campaign_without_shortfalls_has_passed() -> None:
+    text = report_of(Results(RUN, is_interrupted=True)).markdown()
     assert text.startswith("# Campaign on small, seed 9: passed\n")
     assert "Interrupted: results until then." in text
-    assert "3, of which 2 ended the task, as permitted" in text
     assert not any(
         word in text for word in ("Shortfalls", "Faults by kind", "Faultless", "of these without")
     )
-    many = markdown({**report, "shortfalls": [f"line {k}" for k in range(SHOWN + 1)]})
-    assert f"## Shortfalls: {SHOWN + 1}" in many
-    assert many.endswith(f"- line {SHOWN - 1}\n")
+
+
+def test_faults_that_ended_their_task_as_permitted_are_recovered_from() -> None:
+    faults = (judgement(is_latched=True), judgement(is_latched=True), judgement())
+    text = report_of(Results(RUN, [run(1, faults=faults)])).markdown()
+    assert "3, of which 2 ended the task, as permitted" in text
+
+
+def test_the_text_shows_the_first_of_many_shortfalls() -> None:
+    many = report_of(Results(RUN, lacking=[f"line {k}" for k in range(SHOWN + 1)]))
+    assert f"## Shortfalls: {SHOWN + 1}" in many.markdown()
+    assert many.markdown().endswith(f"- line {SHOWN - 1}\n")
+    assert len(many.document()["shortfalls"]) == SHOWN + 1

@@ -9,9 +9,17 @@ import pytest
 
 from rack.boards.events import Cause, Event, Outcome
 from rack.tools.faults.campaigns.plan import Plan
-from rack.tools.faults.campaigns.results import Faultless, Judged, Results, keep, kept, misses_of
+from rack.tools.faults.campaigns.results import (
+    Faultless,
+    Results,
+    TrialResult,
+    keep,
+    kept,
+    result_of,
+)
 from rack.tools.faults.campaigns.trial import Trial
 from rack.tools.faults.ending import ArmEnd, Strike
+from rack.tools.faults.judge import Circumstances
 from tests.tools.fault_events import LAYOUT, event, flows, found, strike
 
 FAULT = strike("mute", "lower", 100, 150)
@@ -26,7 +34,7 @@ def outcome(cause: Cause = "task done", *faults: str) -> Outcome:
 def trial(*events: Event, strikes: tuple[Strike, ...] = (FAULT,)) -> Trial:
     return Trial(
         plan=Plan(1, "faults", lockstep=False),
-        layout=LAYOUT,
+        run=Circumstances(LAYOUT, offset_ns=0),
         outcome=outcome(),
         refused="",
         events=(*events, event(9999, "end", "")),
@@ -34,18 +42,18 @@ def trial(*events: Event, strikes: tuple[Strike, ...] = (FAULT,)) -> Trial:
         arm=ArmEnd(),
         left=(),
         wall_s=1.0,
-        offset_ns=0,
     )
 
 
-def refused(kind: str, why: str, again: Outcome | None = None) -> Judged:
+def refused(kind: str, why: str, again: Outcome | None = None) -> TrialResult:
     plan = Plan(1, "faults", True, ({"kind": kind, "board": "lower"},))
-    return Judged.of(replace(trial(strikes=()), plan=plan, outcome=None, refused=why, again=again))
+    made = replace(trial(strikes=()), plan=plan, run=None, outcome=None, refused=why, again=again)
+    return result_of(made)
 
 
 def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_nothing() -> None:
-    good = Judged.of(trial(SEEN, FLOWS))
-    assert (good.ended, good.shortfalls) == ("task done", [])
+    good = result_of(trial(SEEN, FLOWS))
+    assert (good.ended, good.shortfalls) == ("task done", ())
 
 
 @pytest.mark.parametrize(
@@ -98,14 +106,14 @@ def test_a_trial_whose_fault_is_found_and_whose_task_is_done_falls_short_in_noth
     ],
 )
 def test_each_shortfall_is_a_line(bad: Trial, line: str) -> None:
-    assert Judged.of(bad).shortfalls == [line]
+    assert result_of(bad).shortfalls == (line,)
 
 
 def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated() -> None:
     lost = replace(trial(SEEN, FLOWS), outcome=outcome("board lost", "board 'lower' ended"))
-    assert Judged.of(lost).ended == "safely stopped"
-    assert Judged.of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
-    assert Judged.of(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
+    assert result_of(lost).ended == "safely stopped"
+    assert result_of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
+    assert result_of(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
 
 
 def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -> None:
@@ -113,19 +121,16 @@ def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -
     released = event(110, "recovery", "brakes_opened")
     braked = trial(*events, released, strikes=(strike("command-nan", "lower", 100, 110),))
     late = replace(braked, outcome=outcome("task refused"), is_late=True)
-    assert Judged.of(late).shortfalls == []
-    assert Judged.of(replace(late, is_late=False)).shortfalls != []
-    assert Judged.of(replace(late, strikes=(FAULT,), events=(SEEN, FLOWS))).shortfalls != []
+    assert result_of(late).shortfalls == ()
+    assert result_of(replace(late, is_late=False)).shortfalls != ()
+    assert result_of(replace(late, strikes=(FAULT,), events=(SEEN, FLOWS))).shortfalls != ()
 
 
 def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_it() -> None:
     good = refused("self-test", "board 'lower': the self-test fails", outcome("time over"))
-    assert (good.ended, good.shortfalls) == ("not armed", [])
-    assert good.verdict.faults[0].seen == "detected"
-    assert (
-        refused("self-test", "board 'upper': the self-test fails").verdict.faults[0].seen
-        == "missed"
-    )
+    assert (good.ended, good.shortfalls) == ("not armed", ())
+    assert good.faults[0].seen == "detected"
+    assert refused("self-test", "board 'upper': the self-test fails").faults[0].seen == "missed"
 
 
 @pytest.mark.parametrize(
@@ -135,54 +140,53 @@ def test_a_self_test_that_failed_is_recovered_from_when_the_rack_then_runs_witho
     again: Outcome | None,
 ) -> None:
     why = "board 'lower': the self-test fails"
-    assert refused("self-test", why, outcome("time over")).verdict.faults[0].is_recovered
-    assert refused("self-test", why, again).shortfalls == [
-        "self-test of lower, struck at tick 0: not armed never undone; bound None"
-    ]
+    assert refused("self-test", why, outcome("time over")).faults[0].is_recovered
+    assert refused("self-test", why, again).shortfalls == (
+        "self-test of lower, struck at tick 0: not armed never undone; bound None",
+    )
 
 
 def test_a_self_test_that_fails_and_lets_the_rack_arm_is_missed() -> None:
-    launched = Judged.of(trial(strikes=(strike("self-test", "lower", 0),)))
-    assert launched.verdict.faults[0].seen == "missed"
+    launched = result_of(trial(strikes=(strike("self-test", "lower", 0),)))
+    assert launched.faults[0].seen == "missed"
 
 
 def test_a_rack_that_does_not_launch_without_a_reason_falls_short() -> None:
     judged = refused("kill", "boards lower: not ready within 60 s")
     assert judged.ended == "neither"
-    assert judged.verdict.faults[0].seen == "not struck"
+    assert judged.faults[0].seen == "not struck"
 
 
 def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     calm = [
-        Judged.of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())).result(),
-        Judged.of(trial(found(70, "stale", "upper", "lower.status"), strikes=())).result(),
+        result_of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())),
+        result_of(trial(found(70, "stale", "upper", "lower.status"), strikes=())),
     ]
-    document = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm)).document()
+    stretch = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm))
+    document = stretch.document()
     # One in half an hour: below 4.74 in that time, with 95 %.
     assert (document["trips"], document["trips_per_hour"]) == (1, {"an_hour": 2.0, "below": 9.488})
-    assert document["misses"] == misses_of(calm) == {"late": 2}
+    assert document["misses"] == stretch.misses == {"late": 2}
     assert [event["code"] for event in document["tripped"]] == ["stale"]
     assert [run.stray_misses for run in calm] == [2, 0]
 
 
 def test_what_any_run_breaks_counts_whatever_the_run_is_for() -> None:
-    nominal = Judged.of(trial(strikes=())).result()
-    swept = Judged.of(replace(trial(SEEN, FLOWS), arm=ArmEnd(violations=2))).result()
-    results = Results(nominal, trials=[Judged.of(trial(SEEN, FLOWS)).result()], sizes=[swept])
+    nominal = result_of(trial(strikes=()))
+    swept = result_of(replace(trial(SEEN, FLOWS), arm=ArmEnd(violations=2)))
+    results = Results(nominal, trials=[result_of(trial(SEEN, FLOWS))], sizes=[swept])
     assert sum(run.violations for run in results.runs) == 2
     assert len(results.faults) == 1
 
 
 def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
-    judged, path = (
-        Judged.of(trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status"))),
-        tmp_path / "trials" / "1.json",
-    )
+    made = trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status"))
+    path = tmp_path / "trials" / "1.json"
     assert kept(path) is None
-    keep(judged, path)
-    assert kept(path) == judged.result()
+    keep(made, path)
+    assert kept(path) == result_of(made)
     assert [file.name for file in path.parent.iterdir()] == ["1.json"]
 
 
 def test_the_time_of_a_trial_is_kept_to_a_millisecond() -> None:
-    assert Judged.of(replace(trial(SEEN, FLOWS), wall_s=1.23456)).result().wall_s == 1.235
+    assert result_of(replace(trial(SEEN, FLOWS), wall_s=1.23456)).wall_s == 1.235

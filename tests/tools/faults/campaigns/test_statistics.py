@@ -6,9 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 from rack.tools.faults.campaigns.statistics import (
+    EventRate,
+    Spread,
     by_kind,
     curve,
-    part_of_bound,
     rate,
     spread,
     totals,
@@ -49,8 +50,8 @@ def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> Non
         judgement(seen="not struck", struck=-1),
     ]
     found = totals(faults)
-    assert (found["drawn"], found["not_struck"], found["injected"]) == (4, 1, 3)
-    assert (found["detected"], found["missed"], found["within_bound"], found["recovered"]) == (
+    assert (found.drawn, found.not_struck, found.injected) == (4, 1, 3)
+    assert (found.detected, found.missed, found.within_bound, found.recovered) == (
         2,
         1,
         1,
@@ -60,17 +61,17 @@ def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> Non
 
 def test_a_size_that_need_not_be_found_counts_nowhere() -> None:
     small = judgement("sensor-bias", delay=None, is_judged=False, size=1e-4)
-    assert totals([small])["injected"] == 0
+    assert totals([small]).injected == 0
     assert by_kind([small], TICK_NS) == {}
 
 
 def test_cycles_are_of_the_task_concerned_and_parts_of_each_bound() -> None:
     faults = [judgement(delay=2), judgement(delay=4), judgement(delay=12, cycle=12, bound=12)]
     figures = by_kind(faults, TICK_NS)["mute"]
-    assert figures["ticks"] == {"median": 4, "max": 12}
-    assert figures["cycles"] == {"median": 1.0, "max": 2.0}
-    assert figures["part_of_bound"] == {"median": 0.4, "max": 1.0}
-    assert figures["bound_ticks"] == {"least": 10, "most": 12}
+    assert figures.ticks == Spread(4, 12)
+    assert figures.cycles == Spread(1.0, 2.0)
+    assert figures.part_of_bound == Spread(0.4, 1.0)
+    assert figures.bound_ticks == {"least": 10, "most": 12}
 
 
 def test_kinds_stand_in_the_order_of_the_table_of_kinds_and_kills_from_outside_last() -> None:
@@ -81,15 +82,15 @@ def test_kinds_stand_in_the_order_of_the_table_of_kinds_and_kills_from_outside_l
 def test_recovery_is_in_ms_of_simulated_time() -> None:
     faults = [judgement(recovery=100, reactions=("restart",)), judgement(recovery=200), judgement()]
     figures = by_kind(faults, TICK_NS)["mute"]
-    assert figures["recovery_ms"] == {"median": 375.0, "max": 500.0}
-    assert figures["reactions"] == ["restart"]
+    assert figures.recovery_ms == Spread(375.0, 500.0)
+    assert figures.reactions == ["restart"]
 
 
 def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:
-    assert part_of_bound(1, 2, 4.0, 5.0) == 0.8
-    assert part_of_bound(1, 2, 4.0, None) == 0.5
-    assert part_of_bound(0, 0, 0.0, None) is None
-    assert part_of_bound(None, 2, None, None) is None
+    assert judgement(delay=1, bound=2, delay_ms=4.0, bound_ms=5.0).part_of_bound == 0.8
+    assert judgement(delay=1, bound=2, delay_ms=4.0).part_of_bound == 0.5
+    assert judgement(delay=0, bound=0, delay_ms=0.0).part_of_bound is None
+    assert judgement(delay=None, bound=2).part_of_bound is None
 
 
 def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
@@ -98,9 +99,7 @@ def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
         judgement("sensor-bias", size=0.001, delay=None),
         judgement(),
     ]
-    assert [
-        (point["size"], point["delay_ms"]) for point in curve(faults, "sensor-bias", TICK_NS)
-    ] == [
+    assert [(point.size, point.delay_ms) for point in curve(faults, "sensor-bias", TICK_NS)] == [
         (0.001, None),
         (0.1, 12.5),
     ]
@@ -108,7 +107,7 @@ def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
 
 def test_nothing_has_no_median() -> None:
     assert spread([]) is None
-    assert by_kind([judgement(delay=None)], TICK_NS)["mute"]["ticks"] is None
+    assert by_kind([judgement(delay=None)], TICK_NS)["mute"].ticks is None
 
 
 def test_bounds_of_a_share_are_wilsons() -> None:
@@ -121,14 +120,14 @@ def test_bounds_of_a_share_are_wilsons() -> None:
 
 def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
     # Three in as much time as there was, with 95 %, is what none seen permits.
-    assert rate(0, 3600.0) == {"an_hour": 0.0, "below": 2.996}
-    assert rate(2, 7200.0) == {"an_hour": 1.0, "below": 3.148}
+    assert rate(0, 3600.0) == EventRate(0.0, 2.996)
+    assert rate(2, 7200.0) == EventRate(1.0, 3.148)
     assert rate(0, 0.0) is None
 
 
 def test_every_share_of_a_kind_has_its_bounds() -> None:
     faults = [judgement(), judgement(delay=12), judgement(is_recovered=False)]
-    assert by_kind(faults, TICK_NS)["mute"]["wilson"] == {
+    assert by_kind(faults, TICK_NS)["mute"].wilson == {
         "detected": wilson(3, 3),
         "within_bound": wilson(2, 3),
         "recovered": wilson(2, 3),

@@ -99,12 +99,13 @@ def test_a_trial_has_what_its_judgement_needs(small: Path, rack_name: str) -> No
     assert [(strike.kind, strike.board, strike.tick) for strike in found.strikes] == [
         ("mute", "lower", 40)
     ]
-    assert found.layout is not None
-    assert [task.name for task in found.layout.tasks] == ["upper", "lower", "lower.planner"]
+    assert found.run is not None
+    assert [task.name for task in found.run.layout.tasks] == ["upper", "lower", "lower.planner"]
     assert any(event.code == "mute" for event in found.events)
-    assert (found.left, found.moving, found.again, found.is_late) == ((), (), None, False)
-    assert found.restart_s == config.supervision.lockstep_restart_s
-    assert abs(time.time_ns() - time.monotonic_ns() - found.offset_ns) < 10**9
+    assert (found.left, found.again, found.is_late) == ((), None, False)
+    assert (found.run.moving, found.run.is_lockstep, found.run.has_failed) == ((), True, False)
+    assert found.run.restart_s == config.supervision.lockstep_restart_s
+    assert abs(time.time_ns() - time.monotonic_ns() - found.run.offset_ns) < 10**9
     assert 0.0 < found.wall_s < BOUND_S
     assert "upper" in found.levels
 
@@ -119,7 +120,7 @@ def test_a_rack_that_a_fault_keeps_from_launching_is_tried_without_it(
     assert found.again is not None
     # Two seconds of simulated time.
     assert (found.again.cause, found.again.ticks) == ("time over", 800)
-    assert found.strikes == ()
+    assert (found.strikes, found.run) == ((), None)
 
 
 class Run:
