@@ -186,7 +186,8 @@ class MoveTable(StateTableExecutor):
             self._command.object = -1
             return
         taught = self.table.plan.pose[pose]
-        joints = self._solve(self._tool_at(taught.height))
+        goal = self._tool_at(taught.height)
+        joints = None if goal is None else self._solve(goal)
         self._reached = joints is not None
         if joints is not None:
             self._send("move", joints, taught.speed)
@@ -200,9 +201,11 @@ class MoveTable(StateTableExecutor):
         """Close the gripper."""
         self._send("close", self._command.joints, 1.0)
 
-    def _tool_at(self, height: float) -> Pose:
+    def _tool_at(self, height: float) -> Pose | None:
         """Return the pose of the tool, pointing down, at a height above the object or place of the
-        command."""
+        command; None: a command without either, or none, is in force."""
+        if len(self.words) < 2:
+            return None
         verb, name = self.words
         command = self._command
         if verb == "place":

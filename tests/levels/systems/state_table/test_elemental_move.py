@@ -229,6 +229,16 @@ def test_a_pose_over_an_object_is_above_where_it_rests(arm: Arm) -> None:
     np.testing.assert_array_equal(arm.level._command.aim, arm.place)
 
 
+@pytest.mark.parametrize("words", ["", "home"])
+def test_a_pose_over_nothing_is_not_reached_and_ends_no_board(arm: Arm, words: str) -> None:
+    arm.level._taken = WordCommand(False, 3, words)
+    sent = arm.level._command.id
+    pose = next(iter(arm.level.table.plan.pose))
+    arm.level.do_move(pose)
+    assert not arm.level._reached
+    assert arm.level._command.id == sent
+
+
 def test_a_pose_out_of_reach_sends_nothing(arm: Arm) -> None:
     arm.world.position[0] = (9.0, 0.0, 0.0)
     arm.look()

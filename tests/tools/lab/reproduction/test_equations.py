@@ -14,7 +14,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
     NASREM,
     MeasuredVerdict,
     NasremRun,
-    Spread,
+    Percentiles,
     SystemResponse,
     WayResponse,
 )
@@ -24,7 +24,7 @@ from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
 from rack.tools.lab.reproduction.sections.statement import Findings
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
-WAY = WayResponse(4.0, Spread(1.0, 2.0, 3.0), ())
+WAY = WayResponse(4.0, Percentiles(1.0, 2.0, 3.0), ())
 RUN = NasremRun(
     *(800, 0, 0, {}, (), {}, {}, {}),
     SystemResponse(("task", "servo"), 4.0, 4.0, WAY, WAY),

@@ -32,7 +32,7 @@ MS = 1e-6
 
 
 @dataclass(frozen=True)
-class Spread:
+class Percentiles:
     """Median and longest of the times of a run; 99 of 100 are at most `p99`."""
 
     p50: float
@@ -44,10 +44,10 @@ class Spread:
 class Phases:
     """The stamped parts of an executor's cycle, C, R, X and W, us."""
 
-    exchange: Spread
-    read: Spread
-    process: Spread
-    write: Spread
+    exchange: Percentiles
+    read: Percentiles
+    process: Percentiles
+    write: Percentiles
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class ExecutorCycles:
     stalled: int
     missed: int
     skipped: int
-    used_ms: Spread
+    used_ms: Percentiles
     deviation_ms: float
-    lateness_ms: Spread
+    lateness_ms: Percentiles
     slice_ms: float
     largest_gap_ms: float
     phases: Phases
@@ -101,7 +101,7 @@ class WayResponse:
     """The response of a hierarchy one way, ms."""
 
     bound_ms: float
-    measured_ms: Spread
+    measured_ms: Percentiles
     beyond: tuple[Document, ...]
 
 
