@@ -349,6 +349,9 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
         return Verdict("killed")
     if status == 4 and "ERROR: not found" in text:
         return Verdict("not found")
+    if status is not None and status < 0:
+        # It has crashed the interpreter, in shared memory or MuJoCo: no test passes over that.
+        return Verdict("killed")
     if status is not None and not failed:
         # No test has failed: nothing was tested.
         raise SystemExit(f"pytest ended with status {status}:\n{text[-2000:]}")
