@@ -41,14 +41,19 @@ ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
 SMALL = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=$0 tmpfs /dev/shm && exec "$@"')
 """A command in a /dev/shm of its own, of the size that comes next."""
-USER = ("setpriv", "--reuid=65532", "--inh-caps=+dac_override", "--ambient-caps=+dac_override")
-"""A command as a user who may have no more processes than is permitted, and can read the
-interpreter all the same."""
+ONE_MAY, TWO_MAY, FOUR_MAY, FIVE_MAY = range(65_521, 65_525)
+"""Users of nobody else: processes are counted by user, and tests run side by side."""
 PLAIN_ROOT = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "--inh-caps=-sys_nice,-ipc_lock")
 """A command without the rights to real-time priorities and to locked memory."""
 as_root = pytest.mark.skipif(
     os.getuid() != 0 or not shutil.which("setpriv"), reason="needs root and util-linux"
 )
+
+
+def as_user(uid: int) -> tuple[str, ...]:
+    """Return a command as a user who may have no more processes than is permitted, and can read the
+    interpreter all the same."""
+    return "setpriv", f"--reuid={uid}", "--inh-caps=+dac_override", "--ambient-caps=+dac_override"
 
 
 def run(rack: Rack, seconds: float | None = None) -> Outcome:
@@ -290,18 +295,18 @@ def run_limited(
             r"rack '.*': at most 20 open files are permitted \(ulimit -n\); the rack needs 3\d",
         ),
         (
-            ("prlimit", "--nproc=1", *USER),
+            ("prlimit", "--nproc=1", *as_user(ONE_MAY)),
             r"Resource .* unavailable: at most 1 processes are permitted \(ulimit -u\)",
         ),
         (
-            ("prlimit", "--nproc=2", *USER),
+            ("prlimit", "--nproc=2", *as_user(TWO_MAY)),
             (
                 r"board 'wave' cannot be forked: Resource .* at most 2 processes are permitted .*;"
                 r" the rack needs 6"
             ),
         ),
         (
-            ("prlimit", "--nproc=4", *USER),
+            ("prlimit", "--nproc=4", *as_user(FOUR_MAY)),
             (
                 r"board 'clock' cannot be forked: Resource .* at most 4 processes are permitted .*;"
                 r" the rack needs 6"
@@ -373,20 +378,28 @@ def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(
     plain, out = config("clock.mode=realtime", text=PLAIN), tmp_path / "out"
 
     def run_long() -> None:
-        done = run_limited(plain, tmp_path, "prlimit", "--nproc=5", *USER, seconds="60")
+        done = run_limited(plain, tmp_path, "prlimit", "--nproc=5", *as_user(FIVE_MAY), seconds="60")
         out.write_text(f"{done.returncode} {done.stdout}")
 
     def occupy() -> None:
-        os.setuid(65_532)
+        os.setuid(FIVE_MAY)
         time.sleep(BOUND_S)
+
+    def is_full() -> bool:
+        assert not out.exists(), out.read_text()
+        return users_processes(FIVE_MAY) >= 8
 
     with ExitStack() as stack:
         runner = stack.enter_context(forked(run_long))
         wait_until(lambda: named(f"{rack_name}:clock"))
+        segment = Segment.attach(rack_name)
+        stack.callback(segment.close)
+        # Before the clock runs, a board that cannot be forked is a launch that fails.
+        wait_until(lambda: segment.words[System.TICK] > 0)
         # More than the board that dies leaves room for.
         for _ in range(3):
             stack.enter_context(forked(occupy))
-        wait_until(lambda: users_processes(65_532) >= 8)
+        wait_until(is_full)
         os.kill(named(f"{rack_name}:wave")[0], signal.SIGKILL)
         assert exit_status(runner) == 0
     assert out.read_text().startswith("1 ")
