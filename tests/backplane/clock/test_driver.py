@@ -100,6 +100,33 @@ def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> N
     assert wake_semaphore(segment.rack, "sleeper").value == 2 + len(numbers) - 1
 
 
+def test_the_controller_works_before_and_after_the_releases_of_each_tick(
+    make_bus: MakeBus,
+) -> None:
+    segment = make_bus(task("poller", wake="poll"))
+    start(segment)
+    driver = RealtimeDriver(segment, lambda tick: 20 if tick >= 20 else None)
+    work: list[tuple[str, int, bool]] = []
+
+    class Noting:
+        def note(self, step: str, tick: int) -> None:
+            is_released = segment.block("poller")[Block.RELEASED] == tick
+            work.append((step, tick, is_released))
+
+        def begin(self, tick: int) -> None:
+            self.note("begin", tick)
+
+        def released(self, tick: int) -> None:
+            self.note("released", tick)
+
+    driver.controller = Noting()
+    driver.run()
+    ticks = [tick for step, tick, _ in work if step == "begin"]
+    both = [[("begin", tick, False), ("released", tick, True)] for tick in ticks]
+    assert len(ticks) > 1
+    assert work == [step for steps in both for step in steps]
+
+
 def test_a_task_that_polls_is_released_without_posts(make_bus: MakeBus) -> None:
     segment = make_bus(task("poller", wake="poll"))
     start(segment)

@@ -194,6 +194,18 @@ def test_one_message_more_than_releases_is_no_babble(
     assert [code for _, code in rack.alarms()] == alarms
 
 
+def test_after_a_lost_message_a_babble_is_counted_from_its_tick(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 20)
+    rack.reader.cycle(20)
+    rack.writer.ports.writers["point"].lose()
+    rack.reader.cycle(21)
+    for _ in range(3):
+        publish(rack, 21, 22)
+    rack.reader.cycle(22)
+    assert rack.alarms() == [(21, Alarm.GAP), (22, Alarm.BABBLE)]
+
+
 def test_of_a_babble_the_single_messages_are_not_judged(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
