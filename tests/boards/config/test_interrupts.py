@@ -14,10 +14,8 @@ from rack.boards.config.timing import without_interrupts
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
 from rack.levels.timing.verdicts import INBOX, verdicts
-from tests.boards.host.test_board import HOSTED
 from tests.boards.lan.racks import rack_text
 from tests.boards.run.test_interrupts import BOARDS, RACK
-from tests.boards.test_queues import QUEUES
 
 INTERRUPT = "protocol.default=interrupt"
 LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=9")
@@ -26,14 +24,6 @@ LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=9")
 def layout_of(small: Path, *settings: str) -> Layout:
     """Return the layout of the small rack under this protocol."""
     return wire(load(small, [INTERRUPT, *settings]))
-
-
-def mistake(text: str, *settings: str) -> str:
-    """Return the one mistake of a config."""
-    with pytest.raises(ConfigError) as error:
-        resolve(validated(override(parse(text), settings)))
-    (found,) = error.value.mistakes
-    return str(found)
 
 
 def sent(box: MailboxSpec) -> tuple[int, int, int]:
@@ -115,23 +105,6 @@ def test_what_does_not_fit_is_refused(setting: str, why: str) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(validated(override(parse(RACK), [setting])))
     assert why in str(error.value)
-
-
-def test_a_queue_and_mailboxes_beyond_the_boards_are_refused() -> None:
-    assert "sends any number of messages in a cycle; permitted: queue" in mistake(
-        QUEUES, "protocol.mailbox={ 'upper.requests' = 'interrupt' }"
-    )
-    for mailbox in ("program.numbers", "bridge.sum"):
-        found = mistake(HOSTED, f"protocol.mailbox={{ '{mailbox}' = 'interrupt' }}")
-        assert found.startswith(
-            f'protocol.mailbox.{mailbox} = "interrupt": it is on the host side, where nothing is'
-        )
-    network = rack_text("here", "tcp/127.0.0.1:7001", (), "there")
-    found = mistake(network, "protocol.mailbox={ 'lan.other' = 'interrupt' }")
-    assert (
-        "the network adapter writes it as messages come in; permitted: time-slice, double-buffer"
-        in found
-    )
 
 
 def test_the_network_adapter_reads_without_interrupts() -> None:

@@ -378,7 +378,9 @@ def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(
     plain, out = config("clock.mode=realtime", text=PLAIN), tmp_path / "out"
 
     def run_long() -> None:
-        done = run_limited(plain, tmp_path, "prlimit", "--nproc=5", *as_user(FIVE_MAY), seconds="60")
+        done = run_limited(
+            plain, tmp_path, "prlimit", "--nproc=5", *as_user(FIVE_MAY), seconds="60"
+        )
         out.write_text(f"{done.returncode} {done.stdout}")
 
     def occupy() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,9 @@ def test_each_trial_leaves_a_file_and_no_process_stays(config: RackConfig, tmp_p
         done = list(workers.run(jobs, alone=False))
         processes = list(workers._processes)
         assert 1 <= len(processes) <= len(workers._cores)
+        # Each has a core of its own.
+        cores = [os.sched_getaffinity(process.pid) for process in processes]
+        assert cores == [{core} for core in workers._cores[: len(processes)]]
         # The same processes make later trials.
         done += list(workers.run([job(tmp_path, 3)], alone=True))
         assert workers._processes == processes

@@ -1,0 +1,38 @@
+"""Rules on mailboxes: which messages may interrupt the boards that read them."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.boards.config import resolve
+from rack.boards.config.resolved import validated
+from rack.boards.config.toml import override, parse
+from rack.boards.errors import ConfigError
+from tests.boards.host.test_board import HOSTED
+from tests.boards.lan.racks import rack_text
+from tests.boards.test_queues import QUEUES
+
+
+def mistake(text: str, *settings: str) -> str:
+    """Return the one mistake of a config."""
+    with pytest.raises(ConfigError) as error:
+        resolve(validated(override(parse(text), settings)))
+    (found,) = error.value.mistakes
+    return str(found)
+
+
+def test_a_queue_and_mailboxes_beyond_the_boards_are_refused() -> None:
+    assert "sends any number of messages in a cycle; permitted: queue" in mistake(
+        QUEUES, "protocol.mailbox={ 'upper.requests' = 'interrupt' }"
+    )
+    for mailbox in ("program.numbers", "bridge.sum"):
+        found = mistake(HOSTED, f"protocol.mailbox={{ '{mailbox}' = 'interrupt' }}")
+        assert found.startswith(
+            f'protocol.mailbox.{mailbox} = "interrupt": it is on the host side, where nothing is'
+        )
+    network = rack_text("here", "tcp/127.0.0.1:7001", (), "there")
+    found = mistake(network, "protocol.mailbox={ 'lan.other' = 'interrupt' }")
+    assert (
+        "the network adapter writes it as messages come in; permitted: time-slice, double-buffer"
+        in found
+    )
