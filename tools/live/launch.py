@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ from rack.tools.live.holds import Standstill
 from rack.tools.live.queues import Queues
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.recording.recorder_process import RecorderProcess
-from rack.tools.viewer.window import ViewerWindow, free_port, url
 
 COUNTED = (
     *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
@@ -33,6 +33,8 @@ COUNTED = (
 )
 """Words of a task's control block that a result keeps."""
 NO_TIME = "no time for the report: 'rack report {}' makes it"
+VIEWER = "rack.tools.viewer.window"
+"""What shows a run while it is recorded, by name: running and recording need none of it."""
 NO_RECORDER = "the recorder has not begun yet: real time begins without it, lockstep waits"
 
 News = Callable[[], list[str]]
@@ -130,7 +132,7 @@ def run_rack(
                     log.open(folder / "events.jsonl")
                 except OSError as error:
                     raise Failure(f"{folder}: {error.strerror}") from None
-                port = free_port() if view else None
+                port = import_module(VIEWER).free_port() if view else None
                 if not recorder.attach(config.name, folder, port, rack.segment.words):
                     log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
                 news = [recorder.news, *([] if port is None else [_viewer(port)])]
@@ -175,8 +177,10 @@ def run_rack(
 def _viewer(port: int) -> News:
     """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs
     all the same."""
+    window = import_module(VIEWER)
     try:
-        return ViewerWindow(url(port)).news
+        opened: News = window.ViewerWindow(window.url(port)).news
+        return opened
     except Failure as failure:
         news = [f"no viewer: {failure}"]
         return lambda: [news.pop()] if news else []
