@@ -11,6 +11,7 @@ Every process of a rack imports the modules of its levels, so all of them know t
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +24,9 @@ from rack.backplane.fault_table import PARAMETERS, FaultEntry, Injection
 from rack.backplane.layout import Layout
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, struck_mailboxes
-from rack.boards.faults.drawing import Draw, DrawTicks
+
+if typing.TYPE_CHECKING:
+    from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
 """The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rack.tools.console.answer import Failure
+from rack.tools.console.parameters import CERTIFICATES
 
 PORT = 7447
 OPERATOR = "operator"
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-CERTIFICATES = "RACK_CERTIFICATES"
-"""Environment variable with the default of --certificates."""
 AT_THE_RACK = "resets an emergency stop on its own machine alone: rack estop {} --reset"
 """Why a rack refuses a reset from afar."""
 _NAME = r"[a-z0-9][a-z0-9_-]{0,39}"

@@ -11,8 +11,10 @@ from typing import Annotated
 
 import typer
 
-from rack.tools.console.address import CERTIFICATES
 from rack.tools.console.answer import Failure
+
+CERTIFICATES = "RACK_CERTIFICATES"
+"""Environment variable with the default of --certificates."""
 
 
 def config_names(start: str) -> list[str]:
