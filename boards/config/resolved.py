@@ -29,10 +29,9 @@ from rack.boards.config.faults import injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.rules import broken_rules
+from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.rules.faults import fault_mistakes
-from rack.boards.config.rules.lan import at_adapter, credential_mistakes, network_notes
 from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical
@@ -89,7 +88,9 @@ def loads(text: str) -> RackConfig:
 def resolve(config: RackConfig) -> Resolved:
     """Check and wire a config to run on this machine, now. Raises `ConfigError` with every
     mistake."""
-    return _examined(config, credential_mistakes(config)).resolved()
+    network = network_rules(config)
+    further = () if network is None else network.credential_mistakes(config)
+    return _examined(config, further).resolved()
 
 
 def wire(config: RackConfig) -> Layout:
@@ -193,7 +194,9 @@ class Resolved:
         """Return notes for the launch to report: cores replaced, priorities refused, idle cores
         held awake, ..."""
         refused = self._refused(segment)
-        found = [*self.config.changed, *shared_out(self.config), *network_notes(self.config)]
+        found = [*self.config.changed, *shared_out(self.config)]
+        if (network := network_rules(self.config)) is not None:
+            found += network.network_notes(self.config)
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
         found += self._unlocked(segment)
         if self.clock(None).keeps_awake:
@@ -285,7 +288,8 @@ class _Examined:
             self._layout = None if self.mistakes else layout
         self.mistakes += fault_mistakes(faults, config, self._layout, self._wiring.broken_boards)
         self.mistakes += command_mistakes(commands, config, self._wiring.broken_boards)
-        self.mistakes = [at_adapter(mistake, config) for mistake in self.mistakes]
+        if (network := network_rules(config)) is not None:
+            self.mistakes = [network.at_adapter(mistake, config) for mistake in self.mistakes]
 
     def resolved(self) -> Resolved:
         """Return everything derived from a config without mistakes."""

@@ -9,10 +9,33 @@ are already reported. Faults and commands, which may come live too, have rules o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from importlib import import_module
+from types import ModuleType
 
-from rack.boards.config.rules import boards, lan, levels, mailboxes
+from rack.boards.config.files import LAN_ADAPTER
+from rack.boards.config.rules import boards, levels, mailboxes
+from rack.boards.config.schema import RackConfig
 from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake
+
+NETWORK = "rack.boards.config.rules.lan"
+"""The rules of `[adapter.lan]`, by name: a rack without a network loads neither them nor what they
+know of certificates."""
+
+
+def network_rules(config: RackConfig) -> ModuleType | None:
+    """Return the module with the rules of a rack's network; None for a rack without one."""
+    is_wanted = config.adapter.lan is not None or any(
+        board.executor == LAN_ADAPTER for board in config.board.values()
+    )
+    return import_module(NETWORK) if is_wanted else None
+
+
+def _of_network(name: str, wiring: Wiring) -> Iterator[Mistake]:
+    if (rules := network_rules(wiring.config)) is not None:
+        yield from getattr(rules, name)(wiring)
+
 
 Rule = Callable[[Wiring], Iterator[Mistake]]
 RULES: tuple[Rule, ...] = (
@@ -21,8 +44,8 @@ RULES: tuple[Rule, ...] = (
     boards.circles,
     boards.slots,
     boards.ends,
-    lan.lan,
-    lan.network,
+    partial(_of_network, "lan"),
+    partial(_of_network, "network"),
     levels.scene,
     levels.robot,
     boards.clock,
@@ -37,7 +60,7 @@ RULES: tuple[Rule, ...] = (
     mailboxes.reads,
     mailboxes.mailboxes,
     mailboxes.statuses,
-    lan.entries,
+    partial(_of_network, "entries"),
     mailboxes.sides,
     mailboxes.queues,
     mailboxes.asynchronous,
