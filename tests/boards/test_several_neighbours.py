@@ -14,7 +14,8 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.recovery import Supervision
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
-from rack.levels.timing.system_response import command_paths, mailboxes_along
+from rack.levels.timing.command_path import command_paths
+from rack.levels.timing.system_response import mailboxes_along
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
 from tests.boards.vector_racks import JOINTED

@@ -17,7 +17,7 @@ import numpy as np
 
 from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
-from rack.levels.timing.system_response import CommandPath, command_paths
+from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width

@@ -10,12 +10,12 @@ import pytest
 
 from rack.boards.config import load, resolve
 from rack.boards.config.timing import rack_timing
+from rack.levels.timing.command_path import command_paths
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.frames import core_frames
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.response_time import load_of, response_times
 from rack.levels.timing.schedule import simulate
-from rack.levels.timing.system_response import command_paths
 from rack.levels.timing.tasks import Budget
 from tests.snapshots import ROOT, SHIPPED, Snapshots
 

@@ -10,7 +10,7 @@ import pytest
 
 from rack.backplane.layout import TickGrid
 from rack.boards.config import load, rack_timing, wire
-from rack.levels.timing.system_response import CommandPath, command_paths
+from rack.levels.timing.command_path import CommandPath, command_paths
 
 
 def path_of(

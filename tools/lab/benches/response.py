@@ -20,7 +20,7 @@ import numpy as np
 
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.levels.timing.system_response import CommandPath, command_paths
+from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import BenchResult, plain

@@ -11,7 +11,7 @@ import pytest
 
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.config.schema import CommandConfig
-from rack.levels.timing.system_response import command_paths
+from rack.levels.timing.command_path import command_paths
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.response import (
     RUN_S,

@@ -10,8 +10,8 @@ from rack.boards.config import RackConfig
 from rack.boards.config.schema import CommandConfig
 from rack.boards.config.wiring import commandable
 from rack.levels.operator import Operation
+from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.system_response import CommandPath, command_paths
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
 
