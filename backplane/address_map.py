@@ -64,7 +64,7 @@ class AddressMap:
 
     def _place_clock(self, start: int, layout: Layout) -> int:
         self.alarms[CLOCK] = self.operator + OPERATOR_ENTRIES * operator_entry_size(layout)
-        end = _up(self._place_mailboxes({CLOCK}, layout, self.alarms[CLOCK] + ALARM_SIZE), PAGE)
+        end = pages(self._place_mailboxes({CLOCK}, layout, self.alarms[CLOCK] + ALARM_SIZE))
         self.windows.append(Window(CLOCK, start, end - start))
         return end
 
@@ -76,7 +76,7 @@ class AddressMap:
             self.traces[task.name] = address + BLOCK_SIZE
             self.alarms[task.name] = _up(address + BLOCK_SIZE + trace_size(task), LINE)
             address = self.alarms[task.name] + ALARM_SIZE
-        end = _up(self._place_mailboxes({task.name for task in tasks}, layout, address), PAGE)
+        end = pages(self._place_mailboxes({task.name for task in tasks}, layout, address))
         self.windows.append(Window(board, start, end - start))
         return end
 

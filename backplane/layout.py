@@ -212,6 +212,10 @@ class Layout:
         """Return the mailbox of that name. Raises `KeyError`."""
         return {m.name: m for m in self.mailboxes}[name]
 
+    def index(self, mailbox: str) -> int:
+        """Return the place of the mailbox of that name among all. Raises `ValueError`."""
+        return [box.name for box in self.mailboxes].index(mailbox)
+
     def task(self, name: str) -> TaskSpec:
         """Return the task, or the host board, of that name. Raises `KeyError`."""
         return {t.name: t for t in self.processes}[name]

@@ -175,6 +175,13 @@ class Message:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
 
 
+def copied(message: Message) -> Message:
+    """Return a copy of a message, in memory of its own."""
+    copy = Message(message.record.dtype)
+    copy.copy_from(message)
+    return copy
+
+
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
     """Fill the fields of a record; an integer stays at the greatest that its field holds, whoever
     drives it."""
@@ -189,17 +196,13 @@ def _greatest(kind: np.dtype) -> float:
     return np.iinfo(kind).max if kind.kind in "iu" else np.inf
 
 
-_CLASSES: dict[np.dtype, type[Message]] = {}
-
-
+@cache
 def _class_for(dtype: np.dtype) -> type[Message]:
     """Return the subclass of `Message` with one property per field, made once per dtype."""
-    if dtype not in _CLASSES:
-        names = dtype.names or ()
-        properties = {name: _property(f"_{name}", dtype[name]) for name in names}
-        slots = tuple(f"_{name}" for name in names)
-        _CLASSES[dtype] = type("Message", (Message,), {"__slots__": slots, **properties})
-    return _CLASSES[dtype]
+    names = dtype.names or ()
+    properties = {name: _property(f"_{name}", dtype[name]) for name in names}
+    slots = tuple(f"_{name}" for name in names)
+    return type("Message", (Message,), {"__slots__": slots, **properties})
 
 
 def _property(slot: str, dtype: np.dtype) -> property:
@@ -221,13 +224,11 @@ def _property(slot: str, dtype: np.dtype) -> property:
     return property(lambda self: view(self).item(), store)
 
 
-def sending(
-    plain: Message, dtype: np.dtype, send: Callable[..., bool], room: Callable[[], int]
-) -> Message:
+def sending(plain: Message, send: Callable[..., bool], room: Callable[[], int]) -> Message:
     """Return a message on the bytes of `plain` that has these methods `send` and `room`."""
     kind = type("Message", (type(plain),), {"__slots__": ("room", "send")})
     message: Message = object.__new__(kind)
-    message.__init__(dtype, plain.raw)  # type: ignore[misc]
+    message.__init__(plain.record.dtype, plain.raw)  # type: ignore[misc]
     # Their slots hide the methods of `Message`.
     setattr(message, "send", send)  # noqa: B010
     setattr(message, "room", room)  # noqa: B010

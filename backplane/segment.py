@@ -30,7 +30,7 @@ from rack.backplane.layout import (
     TaskSpec,
 )
 from rack.backplane.process import is_alive, start_time
-from rack.backplane.words import Block, Head, Run, System
+from rack.backplane.words import Block, Box, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 14
@@ -220,6 +220,11 @@ class Segment:
         start = self.map.blocks[task] // 8
         return self.words[start : start + max(Block) + 1]
 
+    def box(self, mailbox: str) -> memoryview:
+        """Return the head of a mailbox, as words (`words.Box`). Raises `KeyError`."""
+        start = self.map.mailboxes[mailbox] // 8
+        return self.words[start : start + len(Box)]
+
     def is_locked(self, address: int) -> bool:
         """Say whether a process holds the lock on the byte at a bus address: see
         `rack.backplane.byte_lock`."""
@@ -326,7 +331,7 @@ def _shm_name(rack: str) -> str:
 
 def _field(entry: dict[str, Any]) -> FieldSpec:
     shape = tuple(entry["shape"])
-    fields = tuple(_field(f) for f in entry["fields"])
+    fields = tuple(map(_field, entry["fields"]))
     values = tuple((name, number) for name, number in entry["values"])
     length = entry.get("length") and tuple(entry["length"])
     return FieldSpec(
@@ -334,21 +339,20 @@ def _field(entry: dict[str, Any]) -> FieldSpec:
     )
 
 
-def mailbox_of(entry: dict[str, Any]) -> MailboxSpec:
-    """Return a mailbox from plain data, its `fields` excepted."""
+def _mailbox(entry: dict[str, Any]) -> MailboxSpec:
     # Recordings of earlier versions lack `rests_on` and what follows it.
     names = {key: tuple(entry.get(key, ())) for key in ("readers", "rests_on")}
+    fields = tuple(map(_field, entry["fields"]))
     exchanges = tuple(ExchangeSpec(**exchange) for exchange in entry.get("exchanges", ()))
     how = entry.get("interrupt")
     interrupt = None if how is None else InterruptSpec(**{**how, "slots": tuple(how["slots"])})
-    return MailboxSpec(**{**entry, **names, "exchanges": exchanges, "interrupt": interrupt})
+    return MailboxSpec(
+        **{**entry, **names, "fields": fields, "exchanges": exchanges, "interrupt": interrupt}
+    )
 
 
 def layout_of(entry: dict[str, Any]) -> Layout:
     """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
-    boxes = [
-        mailbox_of({**m, "fields": tuple(_field(f) for f in m["fields"])})
-        for m in entry["mailboxes"]
-    ]
+    boxes = tuple(_mailbox(box) for box in entry["mailboxes"])
     tasks, hosts = (tuple(TaskSpec(**t) for t in entry[key]) for key in ("tasks", "hosts"))
-    return Layout(**{**entry, "tasks": tasks, "hosts": hosts, "mailboxes": tuple(boxes)})
+    return Layout(**{**entry, "tasks": tasks, "hosts": hosts, "mailboxes": boxes})

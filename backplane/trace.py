@@ -33,15 +33,11 @@ RECORD = np.dtype(
         ("read_ns", "i8"),  # command, status and plan read
         ("process_ns", "i8"),  # process done
         ("end_ns", "i8"),  # command and status written
-        (
-            "flags",
-            "i8",
-        ),  # Flag in the low 16 bits; above them the number of releases skipped just before
+        # Flag in the low 16 bits; above them the number of releases skipped just before
+        ("flags", "i8"),
         ("state", "i8"),  # state of the level
-        (
-            "processor_ns",
-            "i8",
-        ),  # processor time of its thread since the last record: this cycle, and waking up for it
+        # processor time of its thread since the last record: this cycle, and waking up for it
+        ("processor_ns", "i8"),
         ("closed_ns", "i8"),  # the bookkeeping of the cycle before was done; 0: there was none
     ]
 )

@@ -54,9 +54,8 @@ class System(IntEnum):
     FOLLOWER_PID = 40  # of the recorder for which lockstep waits; 0: none
     FOLLOWER_TICK = 41  # everything up to here is recorded
     TICK_NS = 42  # CLOCK_MONOTONIC of the newest tick
-    FAULTS = (
-        43  # rises with every change in the fault table that concerns tasks; written by the clock
-    )
+    # rises with every change in the fault table that concerns tasks; written by the clock
+    FAULTS = 43
     DEMAND = 44  # Demand of the utility lines on the arm; written by the clock
     CLOCK_PID = 45
     INJECTED = 46  # faults put into the fault table so far
@@ -72,9 +71,8 @@ class System(IntEnum):
     # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
     PEER_STOP = 55
     SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
-    FOLLOWER_DRAINED = (
-        57  # the recorder has taken everything up to here, whether or not it is in its files
-    )
+    # the recorder has taken everything up to here, whether or not it is in its files
+    FOLLOWER_DRAINED = 57
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -122,22 +120,19 @@ class Block(IntEnum):
     TRACE_HEAD = 16  # trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
     PLANS = 18  # plans made
-    LOST = (
-        19  # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
-    )
+    # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
+    LOST = 19
     LEVEL_SINCE = 20  # tick of the cycle in which the level entered that state
     # of the network adapter in lockstep: the rack that its cycle awaits; 0: none. See
     # boards.lan.awaited
     AWAITS = 21
-    INTERRUPTS = (
-        22  # messages that have interrupted this board and were served, under protocol interrupt
-    )
+    # messages that have interrupted this board and were served, under protocol interrupt
+    INTERRUPTS = 22
     INTERRUPTS_LOST = 23  # those lost because too many waited
     INTERRUPTS_WAITING = 24  # the largest number that has waited
     CLOCK_SKIPPED = 25  # ticks skipped by the clock that this task has reported
-    WAITS_UNTIL = (
-        26  # of a host board in lockstep: tick until which its program waits; 0: a message has come
-    )
+    # of a host board in lockstep: tick until which its program waits; 0: a message has come
+    WAITS_UNTIL = 26
 
 
 class TaskState(IntEnum):
@@ -167,15 +162,13 @@ class Box(IntEnum):
     # of a queue: serial of the newest message of its own writer; HEAD is greater while another has
     # published
     SENT = 7
-    TAKEN = (
-        8  # in a host board's mailbox: serial of the newest message that its bus adapter has taken
-    )
+    # in a host board's mailbox: serial of the newest message that its bus adapter has taken
+    TAKEN = 8
     # of what comes from another rack, while that is lost: its writer counts as lost. See `switch`
     VOID = 9
     KEPT = 10  # the same, for racks that go on: its information does not grow too old. See `switch`
-    POSITION = (
-        11  # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
-    )
+    # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
+    POSITION = 11
 
 
 class Slot(IntEnum):

@@ -33,7 +33,7 @@ class MailboxRing(Ring):
         spec = segment.layout.mailbox(name)
         address = segment.map.mailboxes[name]
         self._stride = slot_stride(spec)
-        self._box = segment.words[address // 8 : address // 8 + len(Box)]
+        self._box = segment.box(name)
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
         oldest = partial(segment.oldest, address + 8 * Box.HEAD)
         super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1], oldest)

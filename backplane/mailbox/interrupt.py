@@ -50,10 +50,10 @@ def how_sent(spec: MailboxSpec) -> InterruptSpec:
     return spec.interrupt
 
 
-def sent_ns(spec: MailboxSpec, visible_at: int, clock_ns: int) -> int:
-    """Return the instant at which a message was sent that is visible from that tick at the
-    earliest."""
-    return (visible_at - spec.delay) * clock_ns + how_sent(spec).sent_ns
+def sent_ns(spec: MailboxSpec, clock_ns: int) -> int:
+    """Return the time from the tick from which a message is visible, at the earliest, to the
+    instant at which it was sent; negative."""
+    return how_sent(spec).sent_ns - spec.delay * clock_ns
 
 
 class InterruptWriter(Writer):
@@ -63,16 +63,6 @@ class InterruptWriter(Writer):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._due = how_sent(self.spec).due
-
-    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`, released at `tick`; return False when it is too late."""
-        self.publish(tick, self.visible_at(tick, now), tick if basis is None else basis)
-        return self.is_in_time(tick, now)
-
-    def is_in_time(self, tick: int, now: int | None) -> bool:
-        """Say whether a message released at `tick` and written now is there when it is to be
-        sent."""
-        return now is None or now < tick + self._due
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the earliest tick at which the message is visible; a late one is sent in the tick
@@ -96,7 +86,7 @@ class InterruptLine:
         self._heads = slots.heads
         self._mask = slots.mask
         self._clock_ns = segment.layout.clock_ns
-        self._sent_ns = sent_ns(spec, 0, self._clock_ns)
+        self._sent_ns = sent_ns(spec, self._clock_ns)
         self._passed = self._signature = self._missing = self._suspect = 0
         self._last_ns = 0
 

@@ -80,6 +80,7 @@ class Writer:
         self.spec = spec = segment.layout.mailbox(name)
         self._slots = Slots(segment, spec)
         self._delay = self._shown_after = spec.delay
+        self._due = spec.delay  # ticks from a release until its message must be written
         self.message = self._slots.message
         self.bus_errors = 0
         self.held_up = 0
@@ -108,15 +109,14 @@ class Writer:
         It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes
         visible at the next boundary of the writer's period.
         """
-        due = tick + self._delay
         visible_at = tick + self._shown_after if now is None else self.visible_at(tick, now)
         self.intruder = self._slots.publish(tick, visible_at, tick if basis is None else basis)
-        return now is None or now < due
+        return now is None or now < tick + self._due
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
         """Say whether a message released at `tick` and written now comes in time; `now` as in
         `write`."""
-        return now is None or now < tick + self._delay
+        return now is None or now < tick + self._due
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which a message released at `tick` and written now is visible."""
@@ -278,8 +278,11 @@ class Reader:
             # Serial 0: an empty slot, as at the start.
             self.statistics.corrupt += slots.serial != 0
         elif slots.serial == serial:
-            self.statistics.forged += 1
-            self.statistics.forger = pid_of(slots.signature)
+            self._count_forged()
+
+    def _count_forged(self) -> None:
+        self.statistics.forged += 1
+        self.statistics.forger = pid_of(self.slots.signature)
 
     def _cut_off(self) -> Reading:
         self.statistics.bus_errors += 1
@@ -288,9 +291,6 @@ class Reader:
 
     def peek(self) -> Reading:
         """Return the newest whole message at once, under any protocol: for the host side."""
-        return self._newest()
-
-    def _newest(self) -> Reading:
         self.found = head = self._box[0]
         if head == self.serial:
             return self._unchanged
@@ -319,4 +319,4 @@ class DoubleBufferReader(Reader):
     def read(self, tick: int) -> Reading:
         """Return the newest whole message, with its verdict."""
         self.accesses += 1
-        return self._newest()
+        return self.peek()

@@ -43,10 +43,9 @@ class MailboxLock:
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
-        address = segment.map.mailboxes[name]
         self._semaphore = lock_semaphore(segment.rack, name)
-        self._owner = ByteLock(segment.fd, address + 8 * Box.OWNER)
-        self._box = segment.words[address // 8 : address // 8 + len(Box)]
+        self._owner = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.OWNER)
+        self._box = segment.box(name)
         self._pid = os.getpid()
         self._wait_s = wait_s
         self.held_up = 0
@@ -132,7 +131,7 @@ class LockReader(Reader):
         if not obtained:
             return self._cut_off()
         try:
-            return self._newest()
+            return self.peek()
         finally:
             self.lock.release()
 

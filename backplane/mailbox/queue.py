@@ -98,7 +98,7 @@ class QueueWriter(Writer):
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before this.
         self._shared[_SENT] = self.serial
-        self.message = sending(slots.message, slots.dtype, self._send, self.room)
+        self.message = sending(slots.message, self._send, self.room)
         self.taken = 0
         self.refused = 0
         """Messages refused by this writer, because the queue was full."""
@@ -127,7 +127,7 @@ class QueueWriter(Writer):
         for _ in self.outgoing():
             self._slots.publish(tick, visible_at, tick if basis is None else basis)
         self.show()
-        return now is None or now < tick + self._delay
+        return self.is_in_time(tick, now)
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which messages released at `tick` and written now are visible, lost
@@ -249,10 +249,6 @@ class QueueReader(Reader):
             statistics.corrupt += 1
         else:
             self._count_forged()
-
-    def _count_forged(self) -> None:
-        self.statistics.forged += 1
-        self.statistics.forger = pid_of(self.slots.signature)
 
     def _blame_intruder(self, serial: int) -> None:
         """Count a message that is not the writer's, and that its next one will replace: it is not

@@ -29,7 +29,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.backplane.message import Message
+from rack.backplane.message import Message, copied
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -92,7 +92,7 @@ class Slots:
         self.dtype = message_dtype(spec.fields, spec.size)
         address = segment.map.mailboxes[spec.name]
         stride = slot_stride(spec)
-        self.box = segment.words[address // 8 : address // 8 + len(Box)]
+        self.box = segment.box(spec.name)
         self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
@@ -175,17 +175,13 @@ class Slots:
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.record[:] = self.places[serial & self.mask]
-        return self.words[_SERIAL] == serial and self.words[_CHECK] == xxh3(
-            self.covered, self.words[_CHAIN]
-        )
+        return self.words[_SERIAL] == serial and self.is_sound
 
     def between(self, before: int, newest: int) -> Iterator[Message]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
         for serial in range(max(before + 1, newest - self.mask), newest):
             if self.fetch(serial) and self.is_lawful(0):
-                message = Message(self.dtype)
-                message.copy_from(self.message)
-                yield message
+                yield copied(self.message)
 
     def copy(self, serial: int) -> bool:
         """Copy that serial's slot, without any check, into the local record; False when it was

@@ -67,9 +67,8 @@ class Alarm(IntEnum):
     DISORDER = 24  # [mailbox; ticks]  a later serial has an earlier tick
     DAMAGED = 25  # [mailbox; -]  a message failed its check
     BABBLE = 26  # [mailbox; serials per cycle]
-    MASQUERADE = (
-        27  # [mailbox; process id that the message names]  not from the writer that holds the claim
-    )
+    # [mailbox; process id that the message names]  not from the writer that holds the claim
+    MASQUERADE = 27
     LOCKED = 28  # [mailbox; -]  a dead or stopped process holds the lock
     # Raised by writers: mailboxes.
     # [mailbox; messages refused in the cycle] its reader does not take messages as fast as they
@@ -81,9 +80,8 @@ class Alarm(IntEnum):
     # [-1; lateness, ns] by the clock too: it woke so much later than the grid point of tick `since`
     CLOCK_LATE = 32
     # Raised by boards: what interrupts them.
-    INBOX_FULL = (
-        33  # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
-    )
+    # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
+    INBOX_FULL = 33
     # Raised by the servo level: the arm.
     SENSOR_RANGE = 40  # [joint; value]  NaN, or beyond the joint's range
     SENSOR_STUCK = 41  # [joint; cycles]  no change while the arm is driven
@@ -92,18 +90,15 @@ class Alarm(IntEnum):
     ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
     COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is NaN or infinite
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
-    BRAKES_CLOSED = (
-        47  # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
-    )
+    # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
+    BRAKES_CLOSED = 47
     BRAKES_OPENED = 48  # [as they engaged; ticks they were engaged]
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
     COLLISION = 50  # [geom; the other geom]  unintended contact of the arm or of what it holds
-    LATCHED = (
-        51  # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
-    )
-    MODIFICATION = (
-        52  # [number among the level's `names`; -]  a control modification failed and was taken out
-    )
+    # [joint, -1: several; value]  a fault has lasted too long: the brakes stay engaged
+    LATCHED = 51
+    # [number among the level's `names`; -]  a control modification failed and was taken out
+    MODIFICATION = 52
     # [-1; N] a contact's force beyond the arm's limit, or the end of the wrist sensor's range
     FORCE_LIMIT = 53
     MOMENT_LIMIT = 54  # [-1; N m]  a contact's torque, likewise
@@ -177,7 +172,7 @@ class Episodes:
     """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
-        self._subject = [spec.name for spec in segment.layout.mailboxes].index(name)
+        self._subject = segment.layout.index(name)
         self._clean_ticks = CLEAN_READS * segment.layout.mailbox(name).every
         self._alarms = alarms
         self._last: dict[Alarm, tuple[int, int]] = {}

@@ -44,7 +44,7 @@ class ReadFindings:
             self._episodes.find(Alarm.MASQUERADE, self._reader.accesses, tick, found.forger)
 
 
-class MessageWatch:
+class MessageWatch(ReadFindings):
     """Judges the messages of one mailbox for one reader; those before its first read are not
     judged.
 
@@ -53,10 +53,9 @@ class MessageWatch:
     """
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
+        super().__init__(reader, episodes)
         self.seen = -1
-        self._reader = reader
         self._spec = reader.spec
-        self._episodes = episodes
         self._slots = reader.slots
         self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
@@ -65,7 +64,6 @@ class MessageWatch:
         # From this delay on a message is late. A message visible at once carries the tick at which
         # it was written.
         self.late_from = self._spec.delay + self._is_sliced
-        self._findings = ReadFindings(reader, episodes)
         self._held_up = 0
 
     def judge(self, tick: int) -> None:
@@ -78,7 +76,7 @@ class MessageWatch:
                 self._begin(found)
             else:
                 self._walk(found, tick)
-        self._findings.report(tick)
+        self.report(tick)
         if self._reader.statistics.held_up != self._held_up:
             self._held_up = self._reader.statistics.held_up
             self._find(Alarm.LOCKED, tick)

@@ -53,7 +53,7 @@ class QueueWatch(MessageWatch):
             lost = queue.statistics.lost - self._lost
             self._lost = queue.statistics.lost
             self._find(Alarm.GAP, tick, lost)
-        self._findings.report(tick)
+        self.report(tick)
 
 
 class WatchedQueue:

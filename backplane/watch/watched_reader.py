@@ -96,7 +96,7 @@ class WatchedReader:
 
     def is_writer_lost(self, tick: int) -> bool:
         """Say whether the writer is lost, without a read."""
-        return self._writer[_LOST] > 0 and self._silence.is_writer_lost(tick)
+        return self._silence.is_writer_lost(tick)
 
 
 class SporadicReader:

@@ -77,7 +77,7 @@ def requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
 
 def _request(command: CommandConfig, layout: Layout) -> Request:
     name = f"{command.level}.operator"
-    index, spec = next((at, box) for at, box in enumerate(layout.mailboxes) if box.name == name)
+    spec = layout.mailbox(name)
     message = Message(message_dtype(spec.fields, spec.size))
     message.what = command.said
     message.goal = (command.goals or [Goal.NONE])[0]
@@ -90,4 +90,4 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
     if command.quaternion is not None:
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
     message.name = command.name or ""
-    return Request(index, bytes(message.raw), first_tick(command, layout.clock_ns))
+    return Request(layout.index(name), bytes(message.raw), first_tick(command, layout.clock_ns))

@@ -55,7 +55,7 @@ class DemandPort:
     is that message."""
 
     def __init__(self, writer: Writer) -> None:
-        self.message = sending(writer.message, writer.message.record.dtype, self._send, lambda: 1)
+        self.message = sending(writer.message, self._send, lambda: 1)
         self._is_sent = False
         self._basis: int | None = None
 

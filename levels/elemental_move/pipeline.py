@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import Message
+from rack.backplane.message import Message, copied
 from rack.levels.algebra import Array
 from rack.levels.messages import SEGMENTS, WINDOW, Error, SegmentKind, Verb
 from rack.levels.tables import Positive, Table
@@ -64,8 +64,7 @@ class PlanStore:
         """
         if not plan.is_new:
             return
-        message = Message(plan.value.record.dtype)
-        message.copy_from(plan.value)
+        message = copied(plan.value)
         if message.replan:
             self._answer = message
             return

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.message import Message
+from rack.backplane.message import Message, copied
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports, Program
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
@@ -97,8 +97,7 @@ class TaskPlanner(Planner):
             write.error = refused.code
             write.reason = self._reason(refused)
             write.count = 0
-        self._plan = Message(write.record.dtype)
-        self._plan.copy_from(write)
+        self._plan = copied(write)
 
     def _reason(self, refused: Refused) -> str:
         """Return why the program is refused, with the number of the action."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import Message, State, copied
 from rack.levels.algebra import Array
 from rack.levels.messages import WINDOW, Verb
 from rack.levels.operator import Answer, Goal, Operation, Orders, described, joints_of
@@ -134,8 +134,7 @@ class Detour:
     def begin(self, message: Message, is_new: bool) -> None:
         """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
         its id."""
-        goal = Message(message.record.dtype)
-        goal.copy_from(message)
+        goal = copied(message)
         try:
             if goal.goal == Goal.JOINTS:
                 self._joints(goal)

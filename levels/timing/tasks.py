@@ -28,9 +28,8 @@ class Budget:
 class Unit(StrEnum):
     """The unit functions of the paper's Gantt charts (section 3.4)."""
 
-    EXCHANGE = (
-        "C"  # communication with the planner's processor: a loosely coupled executor reads its plan
-    )
+    # communication with the planner's processor: a loosely coupled executor reads its plan
+    EXCHANGE = "C"
     READ = "R"  # command and status
     PROCESS = "X"  # the executor
     WRITE = "W"  # command and status

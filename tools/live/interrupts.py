@@ -98,7 +98,7 @@ def replayed(recording: Recording, slot: int) -> BoardInterrupts:
     boxes = layout.interrupting(slot)
     visible = [recording.signal(box.name, "visible_at").astype(np.int64) for box in boxes]
     # A message that comes after a later one of its mailbox is sent with that.
-    first = [sent_ns(box, 0, layout.clock_ns) for box in boxes]
+    first = [sent_ns(box, layout.clock_ns) for box in boxes]
     sent = [
         np.maximum.accumulate(at * layout.clock_ns) + ns
         for at, ns in zip(visible, first, strict=True)

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 from rack.backplane.mailbox.history import row_dtype
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.segment import Launch, Segment, layout_of, mailbox_of
+from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
@@ -153,12 +153,9 @@ class Recording:
         """The rack's layout, without the fields of its messages: see `fields` and `signal`."""
         with _naming(self.folder / "signals.parquet"):
             text = json.loads(self._schema.metadata[b"layout"])
-            boxes = [mailbox_of({**m, "fields": ()}) for m in text["mailboxes"]]
+            boxes = [{**box, "fields": ()} for box in text["mailboxes"]]
             # Earlier versions recorded no host boards.
-            tasks, hosts = (
-                tuple(TaskSpec(**task) for task in text.get(key, ())) for key in ("tasks", "hosts")
-            )
-            return Layout(text["rack"], text["clock_ns"], tasks, tuple(boxes), hosts)
+            return layout_of({"hosts": (), **text, "mailboxes": boxes})
 
     @cached_property
     def whole_layout(self) -> Layout:
@@ -182,11 +179,9 @@ class Recording:
     @cached_property
     def lost(self) -> dict[str, int]:
         """Rows that were written and are not in the files, by task and by mailbox."""
-        return (
-            dict(self.ended["rows_lost"])
-            if "rows_lost" in self.ended
-            else self._lost_before_the_end
-        )
+        if "rows_lost" in self.ended:
+            return dict(self.ended["rows_lost"])
+        return self._lost_before_the_end
 
     @cached_property
     def _lost_before_the_end(self) -> dict[str, int]:
