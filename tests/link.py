@@ -98,7 +98,7 @@ class Link:
     def __init__(self, segment: Segment, reader_first: bool = False) -> None:
         self.segment = segment
         self.writer, self.reader = WritingTask(segment), ReadingTask(segment)
-        self.active: list[tuple[str, FaultEntry]] = []
+        self.active: list[FaultEntry] = []
         self._reader_first = reader_first
         self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
 
@@ -124,7 +124,7 @@ class Link:
         entry = FaultTable(self.segment).add(
             Injection(KINDS[kind].number, 0, mailbox, seed=seed, parameters=given)
         )
-        self.active.append((kind, entry))
+        self.active.append(entry)
         self.writer.ports.apply(self.active)
         return entry
 

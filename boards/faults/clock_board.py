@@ -25,7 +25,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import kind_of
 from rack.boards.faults.messages import Babble, forge
 
 OPEN = (Stage.WAITING, Stage.ACTIVE)
@@ -163,7 +163,7 @@ ELSEWHERE = ClockStep()
 
 
 def _step(entry: FaultEntry) -> ClockStep:
-    step = KINDS[entry[Entry.KIND]].step
+    step = kind_of(entry).step
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
@@ -215,13 +215,10 @@ class FaultStage:
             self._finish(entry, tick)
         for entry in due:
             self._begin(entry, tick)
-        for entry in self.open:
-            if entry.stage == Stage.ACTIVE:
-                _step(entry).during(self._rack, entry, tick)
-        acting = [
-            KINDS[entry[Entry.KIND]].step for entry in self.open if entry.stage == Stage.ACTIVE
-        ]
-        self._rack.driver.is_flooded = Babble in acting
+        active = [entry for entry in self.open if entry.stage == Stage.ACTIVE]
+        for entry in active:
+            _step(entry).during(self._rack, entry, tick)
+        self._rack.driver.is_flooded = any(kind_of(entry).step is Babble for entry in active)
         for box, since in list(self.awaited.items()):
             observer = self._observer(box)
             if observer.read(tick - 1).is_there and observer.newest >= since:
@@ -241,7 +238,7 @@ class FaultStage:
         self._phased.clear()
 
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
-        kind = KINDS[entry[Entry.KIND]]
+        kind = kind_of(entry)
         has_acted = kind.once and kind.is_of_task and entry[Entry.COUNT] > 0
         return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
 
@@ -261,7 +258,7 @@ class FaultStage:
 
     def _begin(self, entry: FaultEntry, tick: int) -> None:
         words = entry.words
-        kind = KINDS[entry[Entry.KIND]]
+        kind = kind_of(entry)
         words[Entry.FROM] = tick
         lasts = entry[Entry.TICKS]
         if kind.once and not kind.is_of_task:
@@ -287,6 +284,6 @@ class FaultStage:
 
     def _await_messages(self, entry: FaultEntry) -> None:
         layout = self._segment.layout
-        if KINDS[entry[Entry.KIND]].takes_mailbox:
+        if kind_of(entry).takes_mailbox:
             for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board_of(entry, layout)):
                 self.awaited[layout.mailboxes.index(box)] = entry[Entry.UNTIL]

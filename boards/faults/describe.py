@@ -8,7 +8,7 @@ from typing import Any
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import NEVER, Entry, FaultEntry, Stage
 from rack.backplane.layout import Layout
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import kind_of
 
 ALL_JOINTS = "all joints"
 
@@ -22,7 +22,7 @@ def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
     """Return the mailbox or the joint that a fault affects; empty if it affects its task alone."""
     if entry[Entry.MAILBOX] >= 0:
         return layout.mailboxes[entry[Entry.MAILBOX]].name
-    joint = KINDS[entry[Entry.KIND]].values(entry).get("joint")
+    joint = kind_of(entry).values(entry).get("joint")
     return "" if joint is None else joint_name(int(joint), joints)
 
 
@@ -35,7 +35,7 @@ def joint_name(at: int, joints: Sequence[str]) -> str:
 
 def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
     """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
-    kind = KINDS[entry[Entry.KIND]]
+    kind = kind_of(entry)
     stage = entry.stage
     has_begun = stage in (Stage.ACTIVE, Stage.OVER)
     return {
@@ -58,7 +58,7 @@ def describe(
     entry: FaultEntry, layout: Layout, joints: Sequence[str], with_board: bool = True
 ) -> str:
     """Return a fault as one line: its kind, board and parameters."""
-    kind = KINDS[entry[Entry.KIND]]
+    kind = kind_of(entry)
     target = f" of {board_of(entry, layout)}" if with_board else ""
     about = [subject_of(entry, layout, joints)]
     for parameter, value in zip(kind.parameters, entry.parameters, strict=False):

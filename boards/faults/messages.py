@@ -20,7 +20,7 @@ from rack.backplane.mailbox.protocols import LockWriter
 from rack.backplane.mailbox.slots import Slots, claim
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import kind_of
 
 
 class Outgoing(NamedTuple):
@@ -187,13 +187,10 @@ class FaultyWriter:
         self._late: list[Held] = []
         self._written = True
 
-    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Apply these faults, by kind, from now on; those that continue keep their delayed
+    def apply(self, faults: Sequence[FaultEntry]) -> None:
+        """Apply these faults from now on; those that continue keep their delayed
         messages."""
-        steps = {
-            entry.index: self._steps.get(entry.index) or self._step(kind, entry)
-            for kind, entry in faults
-        }
+        steps = {entry.index: self._steps.get(entry.index) or self._step(entry) for entry in faults}
         for index, step in self._steps.items():
             if index not in steps:
                 self._late += step.held
@@ -204,9 +201,9 @@ class FaultyWriter:
             onward = step.send
         self._first = onward
 
-    def _step(self, kind: str, entry: FaultEntry) -> MessageStep:
-        step = KINDS[kind].step
-        assert isinstance(step, type), f"'{kind}' acts on messages"
+    def _step(self, entry: FaultEntry) -> MessageStep:
+        step = kind_of(entry).step
+        assert isinstance(step, type), "it acts on messages"
         assert issubclass(step, MessageStep)
         return step(entry, self._writer, self._index)
 

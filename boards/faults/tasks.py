@@ -16,7 +16,7 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.process import pin
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import kind_of
 from rack.levels.faults import Fault
 
 if TYPE_CHECKING:
@@ -71,8 +71,8 @@ def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
 class Outputs(Protocol):
     """The ports through which a task writes."""
 
-    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Apply these faults to writes, by kind, from now on."""
+    def apply(self, faults: Sequence[FaultEntry]) -> None:
+        """Apply these faults to writes from now on."""
 
 
 class TaskFaults:
@@ -96,16 +96,14 @@ class TaskFaults:
         next call. The generation is then -1.
         """
         generation = self._table.generation
-        found = [(KINDS[entry[Entry.KIND]], entry) for entry in self._table.active(self._spec.name)]
+        found = [(kind_of(entry), entry) for entry in self._table.active(self._spec.name)]
         active = [(kind, entry) for kind, entry in found if entry[Entry.FROM] <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
-        self._outputs.apply(
-            [(kind.name, entry) for kind, entry in active if kind.where in ("writer", "lock")]
-        )
+        self._outputs.apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
         arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm]
         if self._spec.role == "executor":
@@ -153,7 +151,7 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
 
 def act_on_core(segment: Segment, entry: FaultEntry) -> None:
     """Run the step of a fault that takes the task's core, from this process."""
-    step = KINDS[entry[Entry.KIND]].step
+    step = kind_of(entry).step
     assert callable(step), "a fault of a core has a function"
     step(segment, entry)
 

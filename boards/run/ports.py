@@ -16,7 +16,7 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import kind_of
 from rack.boards.faults.messages import FaultyWriter
 from rack.boards.run.queues import DemandPort, QueuePort, Write
 from rack.boards.wiring import Source
@@ -177,7 +177,7 @@ class OutputPorts:
             port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()
         }
         self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
-        self._indices = {spec.name: index for index, spec in enumerate(segment.layout.mailboxes)}
+        self._layout = segment.layout
         self._queues = {
             port: QueuePort(writer, self._episodes[port], port in sent)
             for port, writer in self.writers.items()
@@ -191,18 +191,16 @@ class OutputPorts:
         self._counted = self._traffic
         self._route()
 
-    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
-        """Apply these faults, by kind, from now on; messages delayed by earlier ones go out with
+    def apply(self, faults: Sequence[FaultEntry]) -> None:
+        """Apply these faults from now on; messages delayed by earlier ones go out with
         the next write."""
         for port, writer in self.writers.items():
-            index = self._indices[writer.spec.name]
-            struck = [
-                (kind, entry) for kind, entry in faults if entry[Entry.MAILBOX] in (-1, index)
-            ]
+            index = self._layout.index(writer.spec.name)
             chosen = [
-                (kind, e)
-                for kind, e in struck
-                if port not in self._queues or not KINDS[kind].not_queued
+                entry
+                for entry in faults
+                if entry[Entry.MAILBOX] in (-1, index)
+                and not (port in self._queues and kind_of(entry).not_queued)
             ]
             if chosen or port in self._faulty:
                 self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)

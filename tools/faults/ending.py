@@ -15,7 +15,7 @@ from rack.backplane.segment import Segment
 from rack.boards.events import statuses
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
-from rack.boards.faults.kind import KINDS, Kind
+from rack.boards.faults.kind import KINDS, Kind, kind_of
 from rack.levels.messages import Error
 
 EXTERNAL = "external kill"
@@ -132,7 +132,7 @@ def is_late(segment: Segment) -> bool:
 
 
 def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
-    kind = KINDS[entry[Entry.KIND]]
+    kind = kind_of(entry)
     values = kind.values(entry)
     board = board_of(entry, layout)
     began = -1 if entry.stage == Stage.WAITING else entry[Entry.FROM]

@@ -313,7 +313,7 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
 
     def write() -> None:
         writer = WritingTask(rack.segment)
-        writer.ports.apply([("lock-held", entry)])
+        writer.ports.apply([entry])
         writer.cycle(4)
 
     with forked(write) as pid:

@@ -15,7 +15,7 @@ from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection,
 from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import KINDS, kind_of
 from rack.boards.faults.tasks import (
     ExtraComputing,
     LoadStep,
@@ -116,9 +116,9 @@ class Writes:
     def __init__(self) -> None:
         self.applied: list[str] = []
 
-    def apply(self, faults: Sequence[tuple[str, FaultEntry]]) -> None:
+    def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Note their kinds."""
-        self.applied = [kind for kind, _ in faults]
+        self.applied = [kind_of(entry).name for entry in faults]
 
 
 def test_a_task_has_the_faults_that_are_active_by_its_tick(

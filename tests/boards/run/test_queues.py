@@ -108,7 +108,7 @@ class QueueLink:
                 parameters=(*parameters, *values[len(parameters) :]),
             )
         )
-        self.ports.apply([(kind, entry)])
+        self.ports.apply([entry])
         return entry
 
     def close(self) -> None:
