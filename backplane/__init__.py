@@ -48,8 +48,6 @@ __all__ = [
     "MailboxSpec",
     "Message",
     "MessageType",
-]
-__all__ += [
     "Reading",
     "Segment",
     "State",
@@ -58,8 +56,10 @@ __all__ += [
     "Verdict",
     "command",
     "open_observer",
+    "open_reader",
+    "open_writer",
+    "status",
 ]
-__all__ += ["open_reader", "open_writer", "status"]
 _PLACES = {
     "rack.backplane.clock.system_clock": ("SystemClock",),
     "rack.backplane.errors": ("BackplaneError",),

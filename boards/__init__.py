@@ -43,8 +43,9 @@ __all__ = [
     "OneProcess",
     "Outcome",
     "Rack",
+    "RackConfig",
+    "load",
 ]
-__all__ += ["RackConfig", "load"]
 _PLACES = {
     "rack.boards.config": ("load",),
     "rack.boards.config.schema": ("RackConfig",),

@@ -64,8 +64,6 @@ __all__ = [
     "Error",
     "Executor",
     "Fault",
-]
-__all__ += [
     "Field",
     "Finding",
     "Finite",
@@ -75,8 +73,6 @@ __all__ += [
     "LevelError",
     "Message",
     "MessageType",
-]
-__all__ += [
     "Operation",
     "Orders",
     "Pace",
@@ -86,8 +82,6 @@ __all__ += [
     "Program",
     "ProgramError",
     "Reading",
-]
-__all__ += [
     "Refused",
     "RobotConfig",
     "RobotError",
@@ -96,8 +90,9 @@ __all__ += [
     "Table",
     "Verdict",
     "command",
+    "read_params",
+    "status",
 ]
-__all__ += ["read_params", "status"]
 _PLACES = {
     "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
     "rack.backplane.watch.alarms": ("Alarm",),

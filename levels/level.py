@@ -99,11 +99,15 @@ __all__ = [
     "Finding",
     "Input",
     "LevelContext",
+    "MadePorts",
     "Output",
     "Pace",
     "Planner",
+    "Ports",
+    "Program",
+    "Reading",
+    "Verdict",
 ]
-__all__ += ["MadePorts", "Ports", "Program", "Reading", "Verdict"]
 
 
 class Input(NamedTuple):
@@ -250,14 +254,45 @@ class LevelContext:
         return self.clock_ns * 1e-9
 
 
-class Executor(ABC):
+class LevelSection:
+    """What executor and planner of a level have in common."""
+
+    inputs: ClassVar[Mapping[str, Input]] = {}
+    params: ClassVar[type[Table] | None] = None
+    """Keys of `[board.<name>.params]`, checked before the launch; executor and planner share one
+    table. None: unchecked, the level reads them by itself."""
+    program: ClassVar[type[Program] | None] = None
+    """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it
+    by itself."""
+
+    def __init__(self, context: LevelContext) -> None:
+        self.context = context
+
+    @classmethod
+    def preload(cls) -> None:
+        """Load what every process of the level needs, such as compiled code. Called once, before
+        the crate forks."""
+
+    def self_test(self) -> None:
+        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the
+        launch fails."""
+
+    def room(self, port: str) -> int:
+        """Return how many messages to take from each queue that `port` reads, asked before each
+        read. Default: all."""
+        return ALL
+
+    def close(self) -> None:
+        """Release what the level holds; called once, after the last cycle, or plan."""
+
+
+class Executor(LevelSection, ABC):
     """The foreground of a level: runs every cycle, at high priority, in bounded time.
 
     Subclasses declare their ports and write `process`. Output messages keep their values from cycle
     to cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
     """
 
-    inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, MessageType | Output]] = {}
     faults: ClassVar[tuple[type, ...]] = ()
     """Classes of steps by which faults can strike what the level drives: see
@@ -265,15 +300,9 @@ class Executor(ABC):
     commands: ClassVar[Commands] = {}
     """An operator's commands to the level, with the forms of their goals; for a level that reads
     "own.operator"."""
-    params: ClassVar[type[Table] | None] = None
-    """Keys of `[board.<name>.params]`, checked before the launch; None: unchecked, the level reads
-    them by itself."""
-    program: ClassVar[type[Program] | None] = None
-    """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it
-    by itself."""
 
     def __init__(self, context: LevelContext) -> None:
-        self.context = context
+        super().__init__(context)
         # In addition to the ports, these pass between board and level. The board sets `demand`
         # before each `process`, and reports and clears `findings` and `acted` after it. It calls
         # `inject` when the active faults change.
@@ -284,11 +313,6 @@ class Executor(ABC):
         # The injected faults that changed anything in this cycle, by index; whether each showed:
         # then it must be found.
         self.acted: dict[int, bool] = {}
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load what every process of the level needs, such as compiled code. Called once, before
-        the crate forks."""
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
@@ -324,53 +348,19 @@ class Executor(ABC):
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, all those active from now on."""
 
-    def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the
-        launch fails."""
-
     @abstractmethod
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
 
-    def room(self, port: str) -> int:
-        """Return how many messages to take from each queue that `port` reads, asked before each
-        read. Default: all."""
-        return ALL
 
-    def close(self) -> None:
-        """Release what the level holds; called once, after the last cycle."""
-
-
-class Planner(ABC):
+class Planner(LevelSection, ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
     It runs in a separate process and shares nothing with the executor but mailboxes. Its one output
     is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
-    inputs: ClassVar[Mapping[str, Input]] = {}
     output: ClassVar[MessageType | Output]
-    params: ClassVar[type[Table] | None] = None
-    """As the executor's: both share one table."""
-    program: ClassVar[type[Program] | None] = None
-    """As the executor's."""
-
-    def __init__(self, context: LevelContext) -> None:
-        self.context = context
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load what every process of the level needs, such as compiled code. Called once, before
-        the crate forks."""
-
-    def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the
-        launch fails."""
-
-    def room(self, port: str) -> int:
-        """Return how many messages to take from each queue that `port` reads, asked before each
-        read. Default: all."""
-        return ALL
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is
@@ -380,6 +370,3 @@ class Planner(ABC):
     @abstractmethod
     def plan(self, read: Ports, write: Message, tick: int) -> None:
         """Make one plan into `write`. It takes effect `within_cycles` cycles after `tick`."""
-
-    def close(self) -> None:
-        """Release what the planner holds; called once, after the last plan."""

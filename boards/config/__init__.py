@@ -35,8 +35,10 @@ __all__ = [
     "loads",
     "names",
     "rack_timing",
+    "resolve",
+    "shared_out",
+    "wire",
 ]
-__all__ += ["resolve", "shared_out", "wire"]
 _PLACES = {
     "rack.boards.config.files": ("CONFIGS", "FAULTS", "names"),
     "rack.boards.config.layout": ("shared_out",),
