@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rack.boards.config.schema import RackConfig
-from rack.levels.tables import RobotConfig, SceneConfig
 
 if TYPE_CHECKING:
     from rack.levels.robot.cell import Cell
@@ -20,18 +19,19 @@ def cell_sizes(config: RackConfig) -> dict[str, int]:
         return {}
     from rack.levels.robot.cell import sizes
 
-    return sizes(built_cell(config.robot, config.scene, config.clock_ns))
+    return sizes(built_cell(config))
 
 
-def geom_name(robot: RobotConfig, scene: SceneConfig, clock_ns: int, geom: int) -> str:
+def geom_name(config: RackConfig, geom: int) -> str:
     """Return the name of a geom of the cell."""
     from rack.levels.robot import lookup
 
-    return lookup.geom_name(built_cell(robot, scene, clock_ns).model, geom)
+    return lookup.geom_name(built_cell(config).model, geom)
 
 
-def built_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Return the cell. Raises `RobotError`."""
+def built_cell(config: RackConfig) -> Cell:
+    """Return the cell of a rack with an arm. Raises `RobotError`."""
     from rack.levels.robot.cell import build_cell
 
-    return build_cell(robot, scene, clock_ns)
+    assert config.robot is not None, "the rack has an arm"
+    return build_cell(config.robot, config.scene, config.clock_ns)

@@ -535,6 +535,11 @@ class RackConfig(Table):
         """One tick, in ns of simulated time."""
         return round(self.clock.period_ms * 1e6)
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the arm's joints; none in a rack without an arm."""
+        return () if self.robot is None else self.robot.joints
+
     def every(self, board: str) -> int:
         """Return the period of a board's executor, ticks. Raises `ClockError` if it is off the
         grid."""

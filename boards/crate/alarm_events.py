@@ -144,14 +144,10 @@ class AlarmWatch:
             name: alarm_ring(segment, name)
             for name in (CLOCK, *(t.name for t in segment.layout.tasks))
         }
-        robot = config.robot
+        # The cell is built at the first collision.
+        geom = str if config.robot is None else partial(geom_name, config)
         name = partial(setting_name, config)
-        if robot is None:
-            self._events = AlarmEvents(segment, name=name)
-        else:
-            # The cell is built at the first collision.
-            geom = partial(geom_name, robot, config.scene, config.clock_ns)
-            self._events = AlarmEvents(segment, robot.joints, geom, name)
+        self._events = AlarmEvents(segment, config.joints, geom, name)
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:

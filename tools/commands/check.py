@@ -125,13 +125,12 @@ def check(
         print_json(stock | {"changed": found.changed, "arm": arm_document, "timing": timing})
     else:
         width = terminal_width()
-        joints = () if found.robot is None else found.robot.joints
         head, *rest = inventory_lines(stock, width)
         lines = [
             head,
             *found.changed,
             *lacking,
-            *summary_lines(forecast, fitting, arm, joints, width),
+            *summary_lines(forecast, fitting, arm, found.joints, width),
         ]
         if verbose:
             lines += [
@@ -173,7 +172,7 @@ def _abilities(config: RackConfig) -> Abilities | None:
     # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
     from rack.levels.robot.abilities import abilities
 
-    return abilities(built_cell(robot, config.scene, config.clock_ns))
+    return abilities(built_cell(config))
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
@@ -246,8 +245,7 @@ def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
     """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile,
     joint by joint."""
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
-        assert config.robot is not None, "it drives one"
-        cell = built_cell(config.robot, config.scene, config.clock_ns)
+        cell = built_cell(config)
         every = config.every(board)
         tick_ms = layout.clock_ns * 1e-6
         ticks = cell.patience.ticks(every, tick_ms * 1e-3)

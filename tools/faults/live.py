@@ -39,7 +39,7 @@ class LiveRack:
         self._segment = Segment.attach(rack)
         self._config = loads(self._segment.config)
         self._table = FaultTable(self._segment)
-        self._joints = self._config.robot.joints if self._config.robot is not None else ()
+        self._joints = self._config.joints
 
     def inject(
         self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None

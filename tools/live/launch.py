@@ -166,7 +166,7 @@ def run_rack(
             },
             recording=recording,
             rows_lost=rows_lost,
-            faults=strikes(segment, config.robot.joints if config.robot is not None else ()),
+            faults=strikes(segment, config.joints),
             clock_offset_ns=time.time_ns() - time.monotonic_ns(),
             refused={queue.mailbox: queue.refused for queue in Queues(segment).look()},
         )

@@ -123,7 +123,7 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterat
         yield Mistake(place, list(joints), why)
         return
     try:
-        ranges = built_cell(robot, config.scene, config.clock_ns).limits.position
+        ranges = built_cell(config).limits.position
     except RobotError:
         return  # reported elsewhere
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):

@@ -249,11 +249,10 @@ def test_a_modification_that_failed_is_named_by_its_board(segment: Segment) -> N
 def test_a_collision_names_both_geoms(segment: Segment) -> None:
     config = load("crossing")
     assert config.robot is not None
-    robot, scene, clock_ns = config.robot, config.scene, config.clock_ns
-    cell = build_cell(robot, scene, clock_ns)
+    cell = build_cell(config.robot, config.scene, config.clock_ns)
     post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
     AlarmWriter(segment, "wave").ring(400, Alarm.COLLISION, post, palm)
     row = alarm_ring(segment, "wave").drain().rows[-1]
-    event = AlarmEvents(segment, JOINTS, partial(geom_name, robot, scene, clock_ns)).of(row, "wave")
+    event = AlarmEvents(segment, JOINTS, partial(geom_name, config)).of(row, "wave")
     assert (event.code, event.subject) == ("collision", "post")
     assert event.text == "unintended contact: 'post' touches 'palm'"

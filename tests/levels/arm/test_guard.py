@@ -91,7 +91,7 @@ def excess(cell: Cell, motion: tuple[Array, Array]) -> tuple[float, float]:
 def puma() -> Cell:
     config = load("nasrem")
     assert config.robot is not None
-    return built_cell(config.robot, config.scene, config.clock_ns)
+    return built_cell(config)
 
 
 def random_torques(cell: Cell, seed: int, cycles: int) -> Iterator[Array]:

@@ -16,7 +16,7 @@ from rack.levels.robot.dynamics import Dynamics, Payload
 def cell() -> Cell:
     config = load("nasrem")
     assert config.robot is not None
-    return built_cell(config.robot, config.scene, config.clock_ns)
+    return built_cell(config)
 
 
 @pytest.fixture(scope="module")

@@ -131,7 +131,7 @@ def test_a_mistake_is_one_line(nasrem: RackConfig, given: dict[str, Any], line: 
 def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
     robot = nasrem.robot
     assert robot is not None
-    ends = built_cell(robot, nasrem.scene, nasrem.clock_ns).limits.position.T.tolist()
+    ends = built_cell(nasrem).limits.position.T.tolist()
     for joints in ends:
         assert mistakes(nasrem, level="servo", what="setpoint", joints=joints) == []
 
