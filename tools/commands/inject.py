@@ -124,9 +124,13 @@ def inject(
             "for": lasts,
             "cycles": cycles,
             "mailbox": mailbox,
+            "tick": tick,
+            "when": when,
+            "phase": phase,
+            "seed": seed,
+            **_values(parameters or []),
         }
-        given |= {"tick": tick, "when": when, "phase": phase, "seed": seed}
-        answer = live.inject({**given, **_values(parameters or [])}, wait, timeout)
+        answer = live.inject(given, wait, timeout)
     print_answer(answer, answer["message"], as_json)
 
 

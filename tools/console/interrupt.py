@@ -37,7 +37,6 @@ class Interrupted(BaseException):
 class _Way(NamedTuple):
     stop: Callable[[], object]
     unfinished: str = ""
-    bound_s: float = BOUND_S
 
 
 class Interrupt:
@@ -63,18 +62,15 @@ class Interrupt:
 
     @contextmanager
     def orderly(
-        self,
-        stop: Callable[[], object] = lambda: None,
-        unfinished: str = "",
-        bound_s: float = BOUND_S,
+        self, stop: Callable[[], object] = lambda: None, unfinished: str = ""
     ) -> Iterator[None]:
         """In this context the first signal calls `stop`, in its handler; the command then ends by
         itself.
 
-        It has `bound_s` for that; otherwise `unfinished` is printed, which says what the user can
+        It has `BOUND_S` for that; otherwise `unfinished` is printed, which says what the user can
         do.
         """
-        self._ways.append(_Way(stop, unfinished, bound_s))
+        self._ways.append(_Way(stop, unfinished))
         try:
             if self.number:
                 stop()
@@ -125,7 +121,7 @@ class Interrupt:
         if self.number:
             self.end()
         self.number = number
-        signal.setitimer(signal.ITIMER_REAL, self._ways[-1].bound_s)
+        signal.setitimer(signal.ITIMER_REAL, BOUND_S)
         self._ways[-1].stop()
 
 

@@ -13,6 +13,8 @@ from rack.backplane.words import Block, Box, TaskState
 
 ADAPTER_STATUS = "adapter_status"
 """Message type of the status of a bus adapter: a group of counts for each entry."""
+ENTRY_COUNTS = ("passed", "refused", "superseded", "full", "waiting")
+"""What is counted of an entry."""
 AWAY = "away"
 """State of a host board that no process runs: an external one, or one that is being restarted."""
 DONE = "done"
@@ -54,18 +56,24 @@ def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
     # The process that runs a host board locks this word, and the kernel unlocks it.
     runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
     state = TaskState(block[Block.STATE])
-    heads = [
-        segment.map.mailboxes[m.name] // 8
-        for m in segment.layout.mailboxes
-        if m.writer == host.name
-    ]
     return HostRow(
         board=host.name,
         pid=block[Block.PID] if runs else 0,
         state=DONE if state == TaskState.ENDED else state.name.lower() if runs else AWAY,
-        sent=sum(segment.words[head + Box.HEAD] for head in heads),
-        restarts=max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)]),
+        sent=sum(head[Box.HEAD] for head in _heads(segment, host.name)),
+        restarts=restarts(segment, host.name),
     )
+
+
+def restarts(segment: Segment, writer: str) -> int:
+    """Return how often a new process took over the mailboxes of a task or host board: each writes
+    in a new epoch."""
+    return max([0, *(head[Box.EPOCH] - 1 for head in _heads(segment, writer))])
+
+
+def _heads(segment: Segment, writer: str) -> list[memoryview]:
+    """Return the words of the mailboxes that a task or host board writes."""
+    return [segment.box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
 def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
@@ -81,10 +89,7 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
                 EntryRow(
                     entry=f"{mailbox.partition('.')[0]}.{entry}",
                     source=source,
-                    **{
-                        name: int(counts[name])
-                        for name in ("passed", "refused", "superseded", "full", "waiting")
-                    },
+                    **{name: int(counts[name]) for name in ENTRY_COUNTS},
                     age_ms=None if age < 0 else age * tick_ms,
                 )
             )

@@ -14,11 +14,11 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
-from rack.backplane.words import Block, Box, Demand, Run, System, TaskState
+from rack.backplane.words import Block, Demand, Run, System, TaskState
 from rack.boards.exchange import EXCHANGE, PortAge, ages_of
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
 from rack.tools.live.holds import Hold, Holds
-from rack.tools.live.host_side import EntryRow, HostRow, entry_rows, host_rows
+from rack.tools.live.host_side import EntryRow, HostRow, entry_rows, host_rows, restarts
 from rack.tools.live.interrupts import Inboxes, InboxFill
 from rack.tools.live.network import ExportRow, ImportRow, Network, PeerRow
 from rack.tools.live.queues import QueueFill, Queues
@@ -231,21 +231,12 @@ class RackMonitor:
             plans=block[Block.PLANS],
             missed=block[Block.MISSED],
             skipped=block[Block.SKIPPED],
-            restarts=self._restarts(task.name),
+            restarts=restarts(self._segment, task.name),
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,
             reason=reason,
             row=row,
         )
-
-    def _restarts(self, task: str) -> int:
-        """Return how often a new process took over the task's mailboxes: each writes in a new
-        epoch."""
-        segment = self._segment
-        heads = [
-            segment.map.mailboxes[m.name] // 8 for m in segment.layout.mailboxes if m.writer == task
-        ]
-        return max([0, *(segment.words[head + Box.EPOCH] - 1 for head in heads)])
 
     def _times_ms(self, task: str) -> tuple[float | None, float | None]:
         """Return the longest execution and lateness of the cycles since the last look that saw

@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple, Self
 
+from pydantic import TypeAdapter
+
 STAT = Path("/proc/stat")
 CPUINFO = Path("/proc/cpuinfo")
 CPUFREQ = Path("/sys/devices/system/cpu")
@@ -54,16 +56,8 @@ class CoreRecord:
 
     @classmethod
     def of(cls, text: str | bytes) -> Self:
-        """Return the record in JSON. Raises `ValueError`, `KeyError` or `TypeError` for anything
-        else."""
-        found = json.loads(text)
-        stolen = (
-            None
-            if found["stolen"] is None
-            else tuple(Stolen(*map(int, span)) for span in found["stolen"])
-        )
-        mhz = tuple((int(core), float(low), float(high)) for core, low, high in found["mhz"])
-        return cls(int(found["lasted_ns"]), stolen, mhz)
+        """Return the record in JSON. Raises `ValueError` for anything else."""
+        return TypeAdapter(cls).validate_json(text)
 
     def stolen_ms(self) -> dict[int, int]:
         """Return the time stolen by core; cores that lost none are left out."""

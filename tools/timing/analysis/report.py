@@ -27,7 +27,7 @@ from rack.levels.timing.trace_times import (
     residual_ns,
 )
 from rack.tools.faults.judge import faults
-from rack.tools.live.host_side import entries_of
+from rack.tools.live.host_side import ENTRY_COUNTS, entries_of
 from rack.tools.live.interrupts import interrupts
 from rack.tools.live.network import BOARD, COUNTS, STATUS, exchanged
 from rack.tools.live.queues import queues
@@ -62,7 +62,6 @@ or bounces."""
 LEAST_M = 0.005
 """Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part
 along."""
-ENTRY_COUNTS = ("passed", "refused", "superseded", "full", "waiting")
 
 
 def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
@@ -137,7 +136,6 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     return {
         **head,
         **dict.fromkeys(unknown),
-        "folder": None,
         "tasks": tasks,
         "recording": ended["recording"],
     }

@@ -467,17 +467,18 @@ def _entries(entries: list[Report]) -> Iterator[str | Grid]:
     if not entries:
         return
     yield from ("", "## Bus adapters, ages in ms of simulated time", "")
-    counts = ("entry", "source", "passed", "refused", "superseded", "full", "waiting")
-    rows = [
-        [
-            *(str(row[name]) for name in counts),
-            *(figure(row["age_ms"], key) for key in ("p50", "p99", "max")),
-        ]
-        for row in entries
+    yield _passed(entries, ("superseded", "waiting", "source"))
+
+
+def _passed(rows: Sequence[Report], dropped: Sequence[str]) -> Grid:
+    """Return what passed from side to side, and its ages."""
+    counts = [name for name in rows[0] if name != "age_ms"]
+    ages = ("p50", "p99", "max")
+    cells = [
+        [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ages)]
+        for row in rows
     ]
-    yield Grid(
-        (*counts, "age p50", "age p99", "age max"), rows, ("superseded", "waiting", "source")
-    )
+    return Grid([*counts, *(f"age {key}" for key in ages)], cells, dropped)
 
 
 def _network(network: Report | None) -> Iterator[str | Grid]:
@@ -487,19 +488,7 @@ def _network(network: Report | None) -> Iterator[str | Grid]:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")
     if imports := network["imports"]:
-        counts = [name for name in imports[0] if name != "age_ms"]
-        rows = [
-            [
-                *(str(row[name]) for name in counts),
-                *(figure(row["age_ms"], key) for key in ("p50", "p99", "max")),
-            ]
-            for row in imports
-        ]
-        yield Grid(
-            (*counts, "age p50", "age p99", "age max"),
-            rows,
-            ("disordered", "repeated", "superseded", "source"),
-        )
+        yield _passed(imports, ("disordered", "repeated", "superseded", "source"))
     for row in network["exports"]:
         yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
     for row in network["peers"]:
