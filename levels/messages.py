@@ -28,6 +28,9 @@ keeps it."""
 SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
 """Most sections of constant jerk of one trajectory."""
 
+JOINTS = ("joints",)
+"""Shape of a field with one value per joint."""
+
 
 class Error(IntEnum):
     """Error codes of the levels' statuses."""
@@ -90,7 +93,7 @@ ELEMENTAL_MOVE = MessageType(
             "f8",
             "rad",
             "where MOVE_JOINTS ends; with `posture`, near the end",
-            ("joints",),
+            JOINTS,
         ),
         Field(
             "posture",
@@ -150,14 +153,14 @@ MOVE_STATUS = status(
     Field("verb", "u1", Verb, "of the move under way"),
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("planned", "u4", "1", "newest elemental move whose path is ready; 0: none yet"),
-    Field("end", "f8", "rad", "joint positions at the end of that path", ("joints",)),
+    Field("end", "f8", "rad", "joint positions at the end of that path", JOINTS),
     Field(
         "replan",
         "u4",
         "1",
         "open request to plan the current move anew from `start`; 0: none is open",
     ),
-    Field("start", "f8", "rad", "joint positions where that motion holds", ("joints",)),
+    Field("start", "f8", "rad", "joint positions where that motion holds", JOINTS),
     Field("replans", "u4", "1", "plans made anew because something was in the way"),
     OPERATED,
     Field(
@@ -238,7 +241,7 @@ PRIMITIVE_STATUS = status(
     OPERATED,
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
     Field("opening", "f8", "m", "gripper joint position, measured"),
-    Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
+    Field("position", "f8", "rad", "joint positions commanded last", JOINTS),
     Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
     Field(
         "ends",
@@ -283,11 +286,11 @@ JOINT_SET_POINT = command(
     2,
     RESTS_ON,
     Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point yet, hold"),
-    Field("position", "f8", "rad", "joint positions", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    Field("position", "f8", "rad", "joint positions", JOINTS),
+    Field("velocity", "f8", "rad/s", "joint velocities", JOINTS),
     # For a servo level that feeds acceleration forward; the default one derives it from positions
     # and velocities.
-    Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
+    Field("acceleration", "f8", "rad/s2", "joint accelerations", JOINTS),
     Field("opening", "f8", "m", "gripper joint position to go to"),
     Field("force", "f8", "N", "largest gripper force"),
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
@@ -316,18 +319,18 @@ DRIVEN_ARM = (
         "f8",
         "rad",
         "joint positions, measured; estimated for suspect sensors",
-        ("joints",),
+        JOINTS,
     ),
-    Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
+    Field("velocity", "f8", "rad/s", "joint velocities, likewise", JOINTS),
     Field(
         "torque",
         "f8",
         "N m",
         "torque given to the arm in this cycle, after the limit gate",
-        ("joints",),
+        JOINTS,
     ),
-    Field("target", "f8", "rad", "where the joints are wanted in this cycle", ("joints",)),
-    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
+    Field("target", "f8", "rad", "where the joints are wanted in this cycle", JOINTS),
+    Field("target_velocity", "f8", "rad/s", "likewise", JOINTS),
     Field("opening", "f8", "m", "gripper joint position, measured"),
     Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
     Field("grip_force", "f8", "N", "force given to the gripper"),
@@ -366,16 +369,16 @@ ARM_STATE = MessageType(
         Field("struck", "i4", "tick", "ticks for which the motion is still that of a blow"),
         Field("waited", "i4", "tick", "ticks since the last command"),
         Field("braked", "u1", "1", "1: the brakes are engaged"),
-        Field("rest", "f8", "rad", "where engaged brakes hold the joints", ("joints",)),
+        Field("rest", "f8", "rad", "where engaged brakes hold the joints", JOINTS),
         Field(
             "position",
             "f8",
             "rad",
             "joint positions as the servo level estimates them",
-            ("joints",),
+            JOINTS,
         ),
-        Field("velocity", "f8", "rad/s", "joint velocities, likewise", ("joints",)),
-        Field("doubt", "f8", "rad", "largest error of those positions", ("joints",)),
+        Field("velocity", "f8", "rad/s", "joint velocities, likewise", JOINTS),
+        Field("doubt", "f8", "rad", "largest error of those positions", JOINTS),
         Field(
             "kept",
             "i8",

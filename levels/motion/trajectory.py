@@ -7,7 +7,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import ruckig
@@ -70,33 +70,27 @@ class Trajectory:
         """Return the state `time_s` after the start."""
         time_s = min(max(time_s, 0.0), self.duration)
         k = max(bisect_right(self._starts, time_s) - 1, 0)
-        s, ds, dds, jerk = self._rows[k]
-        t = time_s - self._starts[k]
-        return PathState(
-            s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
-            ds + t * (dds + t * jerk / 2.0),
-            dds + t * jerk,
-        )
+        return PathState(*_moved(time_s - self._starts[k], *self._rows[k]))
 
     def states(self, times_s: Array) -> tuple[Array, Array, Array]:
         """Return s, ds and dds at `times_s` (n,), within the duration; (n,) each."""
         row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
-        t = times_s - row[:, 0]
-        s = row[:, 1]
-        ds = row[:, 2]
-        dds = row[:, 3]
-        jerk = row[:, 4]
-        return (
-            s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
-            ds + t * (dds + t * jerk / 2.0),
-            dds + t * jerk,
-        )
+        return _moved(times_s - row[:, 0], *row[:, 1:].T)
 
     def stretched(self, factor: float) -> Trajectory:
         """Return the same motion slowed by `factor` >= 1; it keeps every limit that this one
         keeps."""
         powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
         return Trajectory(self.sections * powers, self.duration * factor)
+
+
+def _moved(t: Any, s: Any, ds: Any, dds: Any, jerk: Any) -> tuple[Any, Any, Any]:
+    """Return s, ds and dds, numbers or arrays, after time `t` under a constant jerk."""
+    return (
+        s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
+        ds + t * (dds + t * jerk / 2.0),
+        dds + t * jerk,
+    )
 
 
 def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Trajectory:

@@ -127,14 +127,11 @@ class PathMotion:
 
     def _rest(self, s: float, position: Array) -> float:
         self.s = s
-        self.trajectory = None
-        self.stopping = False
+        self._stand()
         np.subtract(position, self.path.evaluate(s).q, out=self._offset)
         distance = float(np.abs(self._offset).max())
         self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
         self.set_point.position[:] = position
-        self.set_point.velocity.fill(0.0)
-        self.set_point.acceleration.fill(0.0)
         return distance
 
     def _come_to_rest(self) -> None:
@@ -144,6 +141,10 @@ class PathMotion:
         if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
             self.s = self.path.length
             self.set_point.position[:] = self.path.evaluate(self.s).q
+        self._stand()
+
+    def _stand(self) -> None:
+        """Follow no trajectory."""
         self.trajectory = None
         self.stopping = False
         self.set_point.velocity.fill(0.0)
