@@ -225,15 +225,10 @@ class Ending:
     def latched(self) -> list[str]:
         """Return a line for every level whose last status reports an error, except the level that
         ends the run."""
-        errors = [
-            (board, status.reason)
-            for board, status in statuses(self._segment, "error")
-            if status.error
-        ]
         return [
-            f"level '{board}': {reason}"
-            for board, reason in errors
-            if f"{board}.status" != self._ends_run
+            f"level '{board}': {status.reason}"
+            for board, status in statuses(self._segment, "error")
+            if status.error and f"{board}.status" != self._ends_run
         ]
 
     def held(

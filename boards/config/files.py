@@ -40,15 +40,9 @@ def assembled(
 def named_classes(tables: Tables) -> tuple[str, ...]:
     """Return the classes of levels that tables name, as "package.module:Class"; nothing else in
     them is checked."""
-    boards = tables.get("board")
-    found = (
-        [board for board in boards.values() if isinstance(board, dict)]
-        if isinstance(boards, dict)
-        else []
-    )
-    names = [board.get(role) for board in found for role in ("executor", "planner")]
-    adapters = tables.get("adapter")
-    names += [LAN_ADAPTER] if isinstance(adapters, dict) and "lan" in adapters else []
+    boards = [board for board in _table(tables, "board").values() if isinstance(board, dict)]
+    names = [board.get(role) for board in boards for role in ("executor", "planner")]
+    names += [LAN_ADAPTER] if "lan" in _table(tables, "adapter") else []
     return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 
@@ -115,27 +109,28 @@ def anchor(tables: Tables, folder: Path) -> Tables:
     """Return the tables with absolute paths, resolved from `folder`, or for a bundled model from
     configs/."""
     anchored = dict(tables)
-    robot = tables.get("robot")
+    robot = _table(tables, "robot")
     own = tables.get("python_path")
-    if isinstance(robot, dict) and isinstance(robot.get("model"), str):
-        anchored["robot"] = {
-            **robot,
-            "model": str(_find(robot["model"], folder) or folder / robot["model"]),
-        }
+    if isinstance(model := robot.get("model"), str):
+        anchored["robot"] = {**robot, "model": str(_find(model, folder) or folder / model)}
     if isinstance(own, list) and all(isinstance(item, str) for item in own):
         anchored["python_path"] = [str((folder / item).resolve()) for item in own]
-    adapters = tables.get("adapter")
-    if isinstance(adapters, dict):
+    if adapters := _table(tables, "adapter"):
         anchored["adapter"] = {
             name: _with_certificates(adapter, folder) for name, adapter in adapters.items()
         }
-    boards = tables.get("board")
-    if isinstance(boards, dict):
+    if boards := _table(tables, "board"):
         anchored["board"] = {
             name: with_table_files(board, lambda file: str(_find(file, folder) or folder / file))
             for name, board in boards.items()
         }
     return anchored
+
+
+def _table(tables: Tables, key: str) -> Tables:
+    """Return the table of a key; an empty one if there is none, or something else."""
+    found = tables.get(key)
+    return found if isinstance(found, dict) else {}
 
 
 def _with_certificates(adapter: Any, folder: Path) -> Any:
@@ -200,8 +195,7 @@ def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tab
 def _extended(base: Tables, top: Tables) -> Tables:
     """Return a file's tables merged over those it extends; a [robot] with its own model replaces
     the arm."""
-    robot = top.get("robot")
-    if isinstance(robot, dict) and "model" in robot:
+    if "model" in _table(top, "robot"):
         base = {key: value for key, value in base.items() if key != "robot"}
     return merge(base, top)
 

@@ -127,20 +127,27 @@ class Resolved:
         ends."""
         clock = self.config.clock
         tick_ns = self.config.clock_ns
+        ends_run = self.ends_run
+        # The demand on the arm while a board is lost; none if the level below holds.
+        demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
+        silent = self._ticks(SILENT_S)
+        if ends_run is not None:
+            writer = self.layout.mailbox(ends_run).writer
+            silent = max(silent, 8 * self.layout.task(writer).every)
         return ClockWiring(
             lockstep=clock.mode == "lockstep",
             period_ns=round(tick_ns / clock.speed),
             stop_tick=0 if seconds is None else max(1, self._ticks(seconds)),
-            ends_run=self.ends_run,
+            ends_run=ends_run,
             linger=self._ticks(LINGER_S),
-            silent=max(self._ticks(SILENT_S), 8 * self._ending_every),
+            silent=silent,
             history=self._ticks(AHEAD_S),
             core=self._clock_core,
             priority=clock.priority,
             keeps_awake=clock.mode == "realtime" and clock.idle_cores == "awake",
             restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
             on_loss={
-                task.name: self._on_loss(task.board)
+                task.name: demands[self.config.board[task.board].on_loss]
                 for task in self.layout.tasks
                 if task.role == "executor"
             },
@@ -160,25 +167,11 @@ class Resolved:
     def _ticks(self, seconds: float) -> int:
         return round(seconds * 1e9 / self.config.clock_ns)
 
-    def _on_loss(self, board: str) -> Demand:
-        """Return the demand on the arm while a board is lost; none if the level below holds."""
-        return {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}[
-            self.config.board[board].on_loss
-        ]
-
     @property
     def ends_run(self) -> str | None:
         """The status mailbox whose state ends the run; None: no level ends it."""
         return next(
             (f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None
-        )
-
-    @property
-    def _ending_every(self) -> int:
-        return (
-            0
-            if self.ends_run is None
-            else self.layout.task(self.layout.mailbox(self.ends_run).writer).every
         )
 
     @property

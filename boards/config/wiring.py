@@ -30,7 +30,6 @@ from rack.boards.config.schema import (
     TaskPlace,
 )
 from rack.boards.exchange import EXCHANGE, exchange_message
-from rack.boards.host.adapter import Adapter
 from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
@@ -107,12 +106,6 @@ class TaskPorts:
     def rests_on(self, output: str) -> tuple[str, ...]:
         """Return the mailboxes on whose information an output rests."""
         return mailboxes_of(self.reads.get(self.outputs[output].rests_on or output, {}))
-
-    def wired_at(self, port: str) -> str:
-        """Return the key of a config under which an input is wired, as in
-        "board.servo.reads.command"."""
-        key = self.kind.wired_by if issubclass(self.kind, Adapter) else key_of(self.place)
-        return f"{table_of(self.place)}.{key}.{port}"
 
 
 def table_of(place: TaskPlace) -> str:

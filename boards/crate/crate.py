@@ -70,7 +70,7 @@ class Crate:
     def __init__(self, line: Connection, attention: int) -> None:
         self._line = line
         self._attention = attention
-        self._segment: Segment | None = None
+        self._segment: Segment  # from the Rack's request to open it on
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
@@ -165,7 +165,6 @@ class Crate:
         return self._outputs[name]
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
-        assert self._segment is not None, "the Rack opens the segment first"
         crate = os.getpid()
         try:
             pid = os.fork()
@@ -220,7 +219,6 @@ class Crate:
     def _mark_lost(self, name: str) -> int:
         """Mark a board as lost on the backplane, for the clock and the other boards; return the
         tick."""
-        assert self._segment is not None, "boards are forked after the segment is open"
         words = self._segment.words
         tick = words[System.TICK]
         if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
@@ -240,7 +238,6 @@ class Crate:
         return tick
 
     def _is_host(self, name: str) -> bool:
-        assert self._segment is not None, "boards are forked after the segment is open"
         return any(host.name == name for host in self._segment.layout.hosts)
 
     def _kill(self, board: str | None = None) -> None:

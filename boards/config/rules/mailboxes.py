@@ -18,6 +18,7 @@ from rack.boards.config.wiring import (
 )
 from rack.boards.errors import Mistake
 from rack.boards.exchange import EXCHANGE, exchange_message
+from rack.boards.host.adapter import Adapter
 from rack.boards.host.bus_adapter import BusAdapter
 
 PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
@@ -73,7 +74,7 @@ def reads(wiring: Wiring) -> Iterator[Mistake]:
     """Check that each mailbox that is read exists, and carries what the port needs."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
-            place = ports.wired_at(port)
+            place = _wired_at(ports, port)
             wanted = ports.inputs[port].type
             if not wiring.is_known(mailbox):
                 yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
@@ -87,6 +88,14 @@ def reads(wiring: Wiring) -> Iterator[Mistake]:
                     f" {wanted.version}"
                 )
                 yield Mistake(place, mailbox, why)
+
+
+def _wired_at(ports: TaskPorts, port: str) -> str:
+    """Return the key of a config under which an input is wired, as in
+    "board.servo.reads.command"."""
+    place = ports.place
+    key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else key_of(place)
+    return f"{table_of(place)}.{key}.{port}"
 
 
 def statuses(wiring: Wiring) -> Iterator[Mistake]:
@@ -103,7 +112,7 @@ def sides(wiring: Wiring) -> Iterator[Mistake]:
             if mailbox.partition(".")[0] not in wiring.unknown and (
                 why := _reason(wiring, task, mailbox)
             ):
-                yield Mistake(task.wired_at(port), mailbox, why)
+                yield Mistake(_wired_at(task, port), mailbox, why)
 
 
 def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
