@@ -205,11 +205,9 @@ def by_rack_or(count: int) -> Bound:
     cycles old."""
 
     def ticks(case: BoundCase) -> int:
-        return (
-            ceil(RACK_NS / case.layout.clock_ns)
-            if case.reader is None
-            else count * case.cycle + case.read
-        )
+        if case.reader is None:
+            return ceil(RACK_NS / case.layout.clock_ns)
+        return count * case.cycle + case.read
 
     return Bound(f"{RACK_NS * 1e-6:g} ms (Rack), {count} cycles + 1 read (reader)", ticks)
 

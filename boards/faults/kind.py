@@ -150,11 +150,9 @@ class Kind:
     @property
     def size(self) -> Parameter | None:
         """The parameter that decides whether the fault is detectable; None if it always is."""
-        return (
-            None
-            if self.visible_from is None
-            else next(p for p in self.parameters if p.name == "size")
-        )
+        if self.visible_from is None:
+            return None
+        return next(p for p in self.parameters if p.name == "size")
 
     def values(self, entry: FaultEntry) -> dict[str, float]:
         """Return the parameters that an entry of the fault table holds, by name."""
@@ -242,9 +240,9 @@ class Kinds:
         return self._by_name
 
 
+KINDS = Kinds()
+
 
 def kind_of(entry: FaultEntry) -> Kind:
     """Return the kind of a fault in the fault table."""
     return KINDS[entry[Entry.KIND]]
-
-KINDS = Kinds()

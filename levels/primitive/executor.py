@@ -334,11 +334,9 @@ class PrimitiveExecutor(Executor):
         if command.value.hold:
             return HELD_FROM_ABOVE
         unplanned = work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES
-        return (
-            f"segment {work.segment.id} waits for its trajectory from the planner"
-            if work and unplanned
-            else ""
-        )
+        if work and unplanned:
+            return f"segment {work.segment.id} waits for its trajectory from the planner"
+        return ""
 
     def _answer(self, write: Ports, above: int) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""

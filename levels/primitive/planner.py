@@ -95,11 +95,9 @@ class PrimitivePlanner(Planner):
         write.sections[: len(sections)] = sections
         write.earliest = start_s + trajectory.duration + self._rules.latency_s
         fresh = trajectory.begin == 0.0
-        return (
-            segment.too_late(write.earliest)
-            if fresh and 0.0 < segment.by < write.earliest
-            else None
-        )
+        if fresh and 0.0 < segment.by < write.earliest:
+            return segment.too_late(write.earliest)
+        return None
 
 
 class Plans:

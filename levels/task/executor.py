@@ -179,11 +179,9 @@ class TaskExecutor(Executor):
     def _actions_done(self, plan: Message) -> int:
         if not plan.count:
             return 0
-        return (
-            len(self._actions)
-            if self._done == plan.count
-            else int(plan.moves["action"][self._done])
-        )
+        if self._done == plan.count:
+            return len(self._actions)
+        return int(plan.moves["action"][self._done])
 
     def _hand_down(self, plan: Message, command: Message) -> None:
         """Show the program's next moves, or the operator's goto."""
@@ -240,8 +238,6 @@ def _awaited(plan: Message, below: Message) -> str:
     """Return the event for which a task waits while nothing holds it."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"
-    return (
-        f"move {below.current} is under way"
-        if below.current
-        else f"no path yet for move {below.done + 1}"
-    )
+    if below.current:
+        return f"move {below.current} is under way"
+    return f"no path yet for move {below.done + 1}"

@@ -69,11 +69,9 @@ class Goto(Action):
         return self
 
     def __str__(self) -> str:
-        return (
-            f"goto {list(self.position)}"
-            if self.position is not None
-            else f"goto joints {list(self.joints or ())}"
-        )
+        if self.position is not None:
+            return f"goto {list(self.position)}"
+        return f"goto joints {list(self.joints or ())}"
 
 
 class Home(Action):

@@ -389,11 +389,9 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
 
 def _protocol(mailbox: dict[str, Any]) -> str:
     """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
-    return (
-        f"{mailbox['protocol']} of {mailbox['capacity']}"
-        if mailbox["capacity"]
-        else str(mailbox["protocol"])
-    )
+    if mailbox["capacity"]:
+        return f"{mailbox['protocol']} of {mailbox['capacity']}"
+    return str(mailbox["protocol"])
 
 
 def _hex(address: int) -> str:

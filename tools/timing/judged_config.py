@@ -213,11 +213,9 @@ class Change:
         ]
         sharing = f"shared with {', '.join(others)}" if others else "not shared"
         obtained = obtained_core(core)
-        return (
-            sharing
-            if obtained == core
-            else f"{sharing}; this machine has no core {core}, uses core {obtained}"
-        )
+        if obtained == core:
+            return sharing
+        return f"{sharing}; this machine has no core {core}, uses core {obtained}"
 
     def _protocols(self) -> dict[str, str]:
         old, new = (rack.config.protocol.mailbox for rack in (self.before, self.after))

@@ -280,11 +280,9 @@ def _attempt(
         # Between two processors the paper uses time slices or double buffers (section 3.3).
         mailboxes = {f"{board}.plan": "time-slice"}
     after = rack.changed(board, settings, mailboxes)
-    return (
-        Change(board, rack, after)
-        if after is not None and after.cures(cures or board, rack)
-        else None
-    )
+    if after is not None and after.cures(cures or board, rack):
+        return Change(board, rack, after)
+    return None
 
 
 def _any(

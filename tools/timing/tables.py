@@ -93,11 +93,9 @@ def _numbers(frames: Sequence[int], count: int) -> str:
     if len(frames) <= 3:
         return ", ".join(map(str, frames))
     even = all(later - earlier == second - first for earlier, later in pairwise(frames))
-    return (
-        f"{first}, {second} ... {last}"
-        if even
-        else f"{first}, {second}, {frames[2]} ... {last}: {len(frames)}"
-    )
+    if even:
+        return f"{first}, {second} ... {last}"
+    return f"{first}, {second}, {frames[2]} ... {last}: {len(frames)}"
 
 
 def _prediction_lines(system: Prediction) -> Iterator[str]:
