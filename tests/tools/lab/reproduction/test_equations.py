@@ -45,7 +45,7 @@ def test_all_ten_equations_are_there_in_their_order() -> None:
 
 @pytest.mark.parametrize("equation", EQUATIONS, ids=lambda one: one.number)
 def test_each_fails_in_the_rack_that_is_to_show_it(equation: PaperEquation) -> None:
-    _, shown = equation.biting.side(equation.number)
+    _, shown = equation.failure()
     if isinstance(shown, Listing):
         assert re.search("60 Hz does not divide the 400 Hz clock", shown.text)
     else:

@@ -61,7 +61,7 @@ def document(late: int, jobs: int = 100) -> Document:
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
     patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
     run = FigureRun(counts, patterns, {}, {"measured": "pictures/x.svg"})
-    return gantt.FIG2.experiment().document(run)
+    return gantt.FIG2.experiment.document(run)
 
 
 @pytest.mark.parametrize(

@@ -55,8 +55,9 @@ class FigureRack:
         """Return the config."""
         return load(self.config, self.settings)
 
+    @property
     def experiment(self) -> Experiment[FigureRun]:
-        """Return its run by real processes."""
+        """Its run by real processes."""
         lasts_s = SECONDS + LAUNCH_S
         about = f"{self.label} by real processes"
         return Experiment(self.label, about, lasts_s, FigureRun, self._inputs, partial(_run, self))

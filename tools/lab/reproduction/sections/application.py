@@ -292,58 +292,11 @@ def _partition_row(partition: str, level: LevelFigures) -> Row:
 
 
 CHAPTER = Chapter(
-    name="4",
-    title="Application of Concurrent Hierarchical Control",
-    intro="NIST built a controller of executors and state tables first, then NASREM with planners.",
-    statements=(
-        Statement(
-            name="state-tables",
-            title="The earlier controller: executors and state tables",
-            quote=(
-                "The concurrent hierarchical model ... has been previously implemented with a"
-                " purely executor style of task decomposition. ... The flow of control featured"
-                " state-table transitions. Where planning was appropriate, static plan definitions"
-                " were used. ... The system was sensory-interactive and adapted to perturbations in"
-                " the environment in real-time."
-            ),
-            experiments=(TABLES,),
-            predicted=_earlier,
-            tested=_earlier_tested,
-        ),
-        Statement(
-            name="nasrem",
-            title="NASREM: four levels, 400 and 50 Hz",
-            quote=(
-                "The concurrent hierarchy decomposes into these levels: task, elemental move,"
-                " primitive, and servo. ... The executor [of the primitive level] runs at 50Hz and"
-                " supplies new joint positions to the servo level at each clock cycle. At the servo"
-                " level, the robot receives torque commands at updates of 400 Hz. ... A system"
-                " clock synchronizes software execution on all processor boards."
-            ),
-            experiments=(NASREM,),
-            predicted=_levels,
-            tested=_levels_tested,
-        ),
-        Statement(
-            name="context-switch",
-            title="The context switch",
-            quote="For the real-time executive, task-switching is approximately 100 microseconds.",
-            experiments=(SWITCH,),
-            predicted=_switch,
-            tested=_switch_tested,
-        ),
-        Statement(
-            name="figure-5",
-            title="Figure 5: concurrency by cycle time",
-            quote=(
-                "Figure 5 provides a summary of the implementation design for planning and"
-                " execution within the concurrent hierarchical model based on timing constraints at"
-                " NIST. ... Multitasking on a single processor supplies enough processing power for"
-                " both the planner and executor [at higher levels]."
-            ),
-            experiments=(PARTITION,),
-            predicted=_figure5,
-            tested=_figure5_tested,
-        ),
+    "4",
+    (
+        Statement("state-tables", (TABLES,), _earlier, _earlier_tested),
+        Statement("nasrem", (NASREM,), _levels, _levels_tested),
+        Statement("context-switch", (SWITCH,), _switch, _switch_tested),
+        Statement("figure-5", (PARTITION,), _figure5, _figure5_tested),
     ),
 )

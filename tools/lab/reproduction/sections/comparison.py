@@ -241,50 +241,10 @@ def _rccl_tested(findings: Findings) -> Assessment:
 
 
 CHAPTER = Chapter(
-    name="4.1",
-    title="Comparison of Concurrent Hierarchical Control to Other Models",
-    intro=(
-        "The systems of section 4.1 as racks: what each was, what is modelled and what is assumed"
-        " is in the README of its folder in <code>configs</code>."
-    ),
-    statements=(
-        Statement(
-            name="systems",
-            title="The systems next to each other",
-            quote=(
-                "A survey of existing robot control systems provides numerous concurrent models."
-                " ... These architectures share common characteristics with the concurrent,"
-                " hierarchical control model."
-            ),
-            experiments=SYSTEMS,
-            predicted=_promised,
-            tested=_compared,
-        ),
-        Statement(
-            name="two-levels",
-            title="At least two levels",
-            quote=(
-                "Although few of these control systems are directly labeled as a hierarchical, most"
-                " systems have at least a two-level hierarchy, with a low-level, real-time"
-                " subsystem handling real-time motion control, and a slower high-level subsystem"
-                " responsible for planning."
-            ),
-            experiments=(),
-            predicted=_layered,
-            tested=_layered_tested,
-        ),
-        Statement(
-            name="rccl",
-            title="RCCL: a processor a joint",
-            quote=(
-                "The joint control level operates at 1 kHz and assigns 1 processor per joint. The"
-                " fine motion trajectory level runs a 50 Hz and runs as high-priority cyclic task."
-                " Concurrently, a rough motion planner asynchronously produces a queue of motion"
-                " requests for the trajectory level as a background task."
-            ),
-            experiments=(RCCL_RUN,),
-            predicted=_rccl,
-            tested=_rccl_tested,
-        ),
+    "4.1",
+    (
+        Statement("systems", SYSTEMS, _promised, _compared),
+        Statement("two-levels", (), _layered, _layered_tested),
+        Statement("rccl", (RCCL_RUN,), _rccl, _rccl_tested),
     ),
 )

@@ -24,32 +24,10 @@ from rack.tools.lab.reproduction.sections.page import (
     code,
     text,
 )
-from rack.tools.lab.reproduction.sections.statement import Findings, Statement
+from rack.tools.lab.reproduction.sections.statement import Findings, Statement, wording
 
 SIGNS = {"<": "&lt;", "<=": "≤", "=": "="}
 HEAD = ("of", "left side", "", "right side", "margin", "")
-
-
-@dataclass(frozen=True)
-class Biting:
-    """A rack in which an equation fails: a config with settings, and what they mean."""
-
-    config: str
-    settings: tuple[str, ...]
-    about: str
-
-    def side(self, equation: str) -> tuple[str, Columns | Listing]:
-        """Return the rack in words, and what the timing model, or the check of the config, says of
-        it."""
-        given = " ".join(f"--set {setting}" for setting in self.settings)
-        words = (
-            f"Where it fails: {self.about} ({code(f'rack check {self.config} {given}'.strip())})."
-        )
-        try:
-            found = verdicts_of(load(self.config, self.settings), equation)
-        except ConfigError as error:
-            return words, Listing(str(error))
-        return words, Columns(HEAD, [_row(verdict) for verdict in found])
 
 
 def forecast_of(config: RackConfig) -> Forecast:
@@ -64,41 +42,44 @@ def verdicts_of(config: RackConfig, equation: str) -> list[EquationVerdict]:
 
 @dataclass(frozen=True)
 class PaperEquation:
-    """An equation of the paper: its number, its wording, its form, how we read it, and a rack in
-    which it fails."""
+    """An equation of the paper by its number, and a config, with settings, in which it fails."""
 
     number: str
-    title: str
-    quote: str
-    form: str
-    reading: str
-    biting: Biting
+    config: str
+    settings: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The name of its claim."""
+        return f"equation-{self.number}"
 
     def statement(
         self, tested: Callable[[PaperEquation, Findings], Assessment] | None = None
     ) -> Statement:
         """Return the equation as a statement, judged by `tested` or by all of its subjects in the
         run."""
-        return Statement(
-            name=f"equation-{self.number}",
-            title=f"Equation {self.number}: {self.title}",
-            quote=self.quote,
-            equation=f"{self.form} &nbsp; ({self.number})",
-            experiments=(NASREM,),
-            predicted=self.predicted,
-            tested=partial(tested or judged, self),
-        )
+        return Statement(self.name, (NASREM,), self.predicted, partial(tested or judged, self))
 
     def predicted(self, workshop: Workshop) -> Side:
         """Return both sides for the NASREM rack by its budgets, and the rack in which the equation
         fails."""
         found = verdicts_of(load(NAME), self.number)
-        meanings = dict.fromkeys(code(verdict.meaning) for verdict in found)
+        meanings = "; ".join(dict.fromkeys(code(verdict.meaning) for verdict in found))
+        words = f"{wording(self.name).reading} For {code(NAME)}, by the budgets of its config:"
         table = Columns(HEAD, [_row(verdict) for verdict in found])
-        words = (
-            f"{self.reading} For {code(NAME)}, by the budgets of its config: {'; '.join(meanings)}."
-        )
-        return [words, table, *self.biting.side(self.number)]
+        return [f"{words} {meanings}.", table, *self.failure()]
+
+    def failure(self) -> tuple[str, Columns | Listing]:
+        """Return the rack in which it fails in words, and what the timing model, or the check of
+        the config, says of it."""
+        given = " ".join(f"--set {setting}" for setting in self.settings)
+        command = code(f"rack check {self.config} {given}".strip())
+        words = f"Where it fails: {wording(self.name).failure} ({command})."
+        try:
+            found = verdicts_of(load(self.config, self.settings), self.number)
+        except ConfigError as error:
+            return words, Listing(str(error))
+        return words, Columns(HEAD, [_row(verdict) for verdict in found])
 
 
 def _row(verdict: EquationVerdict) -> tuple[str, ...]:

@@ -106,7 +106,7 @@ def fails(found: FigureRun) -> bool:
 
 def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
     """Judge a figure of which the paper says that it works, or that it fails."""
-    found = findings.of(figure.experiment())
+    found = findings.of(figure.experiment)
     cycles = found.tasks[LEVEL]
     plans = found.tasks[PLANNER]
     said = f"{cycles.late} of {cycles.jobs} cycles and {plans.late} of {plans.jobs} plans late"
@@ -235,7 +235,7 @@ def _values(rows: list[Planning]) -> str:
 def _sweep_tested(findings: Findings) -> Assessment:
     rows = sweep(FIG2.config, PAPER_X)
     odd = contradicting(rows)
-    short, long = (findings.of(figure.experiment()) for figure in (SHORT_2, LONG_2))
+    short, long = (findings.of(figure.experiment) for figure in (SHORT_2, LONG_2))
     measured = [*ran(SHORT_2, short), *ran(LONG_2, long)]
     said = ", ".join(
         f"X = {x:g}: {100 * found.late(PLANNER):.0f} % of the plans late"
@@ -271,7 +271,7 @@ def _fig3_side(workshop: Workshop) -> Side:
 
 def _fig3_tested(findings: Findings) -> Assessment:
     own = _judged(FIG3, False, findings)
-    short = findings.of(SHORT_3.experiment())
+    short = findings.of(SHORT_3.experiment)
     works = [one for one in sweep(FIG3.config, PAPER_X) if not _is_slow(one)]
     measured = [*own.measured, *ran(SHORT_3, short)]
     if own.ruling is Ruling.FAILS or not works:
@@ -299,82 +299,22 @@ def _fig4_side(workshop: Workshop) -> Side:
     return [*_predicted(FIG4, workshop), text, _planning_table(rows)]
 
 
-def _statement(name: str, title: str, quote: str, figure: FigureRack, works: bool) -> Statement:
-    return Statement(
-        name=name,
-        title=title,
-        quote=quote,
-        experiments=(figure.experiment(),),
-        predicted=partial(_predicted, figure),
-        tested=partial(_judged, figure, works),
-    )
-
-
 CHAPTER = Chapter(
-    name="3.4",
-    title="Algorithm Timing Analysis",
-    intro=(
-        "One level as a Gantt chart. R reads command and status (1 ms), X is the executor (1 to 3"
-        " ms), W writes command and status (1 ms), P plans (1 to 6 ms), U updates the plan (1 ms),"
-        " C communicates with another processor (1 ms). A new plan is wanted within 16 ms, at worst"
-        " every third cycle. The racks <code>fig2</code>, <code>fig3</code>, <code>fig4</code> and"
-        " <code>fig4-overload</code> really compute that long; they use X = 2 ms, as the figures"
-        " do, and the longest P."
-    ),
-    statements=(
-        _statement(
-            "figure-2",
-            "Figure 2: one processor, 8 ms",
-            "For this case, all the functions can run tightly-coupled on one processor in one"
-            " cycle, with sufficient residual processing time. ... The algorithm repeats ad"
-            ' infinitum the basic "RXWPU" computational pattern.',
-            FIG2,
-            works=True,
+    "3.4",
+    (
+        Statement(
+            "figure-2", (FIG2.experiment,), partial(_predicted, FIG2), partial(_judged, FIG2, True)
         ),
         Statement(
-            name="figure-2-x",
-            title="Figure 2 with X from 1 to 3 ms",
-            quote=(
-                "X ... will range from 1 to 3 ms computation intervals. ... The planner runs at"
-                " least 3 ms. each cycle which implies that after two cycles 6 ms. will have been"
-                " allotted to the planner with 1 ms. for plan updating."
-            ),
-            experiments=(SHORT_2.experiment(), LONG_2.experiment()),
-            predicted=_sweep_side,
-            tested=_sweep_tested,
+            "figure-2-x", (SHORT_2.experiment, LONG_2.experiment), _sweep_side, _sweep_tested
         ),
+        Statement("figure-3", (FIG3.experiment, SHORT_3.experiment), _fig3_side, _fig3_tested),
+        Statement("figure-4", (FIG4.experiment,), _fig4_side, partial(_judged, FIG4, True)),
         Statement(
-            name="figure-3",
-            title="Figure 3: one processor, 6 ms",
-            quote=(
-                "A 6 ms. response time allows insufficient time for planning, so that within 3"
-                " cycles no updated plan exists."
-            ),
-            experiments=(FIG3.experiment(), SHORT_3.experiment()),
-            predicted=_fig3_side,
-            tested=_fig3_tested,
-        ),
-        Statement(
-            name="figure-4",
-            title="Figure 4: two processors, 6 ms",
-            quote=(
-                'The executor repeats ad infinitum a "CRXW-" computational pattern. Processor two'
-                " (P2) will execute planning exclusively. Computational resources easily guarantee"
-                " 6 ms. planning to generate updated plans with 12 ms. ... The control level"
-                " effectively meets all timing constraints with some computational waste."
-            ),
-            experiments=(FIG4.experiment(),),
-            predicted=_fig4_side,
-            tested=partial(_judged, FIG4, True),
-        ),
-        _statement(
             "figure-4-overload",
-            "Figure 4 with X = 4 ms",
-            "If the function X is replaced by a newer version which requires 4 ms. a cycle, then"
-            " the above functional allocation across processors will not work. For in the worst"
-            " case, there is no time for interprocessor communication with the planner (C).",
-            OVERLOAD,
-            works=False,
+            (OVERLOAD.experiment,),
+            partial(_predicted, OVERLOAD),
+            partial(_judged, OVERLOAD, False),
         ),
     ),
 )

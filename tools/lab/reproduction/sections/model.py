@@ -184,7 +184,7 @@ def _both_tested(findings: Findings) -> Assessment:
     late = 0
     due = 0
     for figure, coupling in ((FIG2, "tightly"), (FIG4, "loosely")):
-        tasks = findings.of(figure.experiment()).tasks
+        tasks = findings.of(figure.experiment).tasks
         executor = tasks[LEVEL]
         rows.append(
             (code(figure.label), coupling, tasks[PLANNER].jobs, executor.jobs, executor.late)
@@ -313,73 +313,12 @@ def _pipeline_tested(findings: Findings) -> Assessment:
 
 
 CHAPTER = Chapter(
-    name="2",
-    title="Concurrent Hierarchical Real-Time Control",
-    intro=(
-        "A task is split into levels; each is a virtual control loop of its own, and all run at"
-        " once. Within a level a planner looks ahead, and an executor keeps the cycle."
-    ),
-    statements=(
-        Statement(
-            name="figure-1",
-            title="Figure 1: information flow",
-            quote=(
-                "Concurrent hierarchical control [is defined] as communicating layers of virtual"
-                " control loops. Figure 1 illustrates the information flow in the concurrent"
-                " hierarchical model."
-            ),
-            experiments=(NASREM,),
-            predicted=_flow,
-            tested=_flow_tested,
-        ),
-        Statement(
-            name="virtual-control-loop",
-            title="The virtual control loop",
-            quote=(
-                "Virtual control ... consists of the following periodic actions: 1) inputting"
-                " status and commands from adjoining levels, 2) producing a goal-directed output"
-                " based on the status and command, and 3) outputting an action to the adjoining"
-                " lower level and a status to the adjoining upper level."
-            ),
-            experiments=(NASREM,),
-            predicted=_loop,
-            tested=_loop_tested,
-        ),
-        Statement(
-            name="planner-and-executor",
-            title="Planner and executor run at once",
-            quote=(
-                "The executor must run periodically to guarantee the cyclic behavior of the virtual"
-                " control loop. The planner and executor can run concurrently within a level, thus"
-                " insuring a predictable level response."
-            ),
-            experiments=(FIG2.experiment(), FIG4.experiment()),
-            predicted=_both,
-            tested=_both_tested,
-        ),
-        Statement(
-            name="bounded-waits",
-            title="A dead board or sensor does not stall the system",
-            quote=(
-                "Should one level be unable to complete the virtual control loop within one cycle,"
-                " system performance is no longer predictable. For example, a level awaiting a"
-                " reading from a failed sensor could loop forever."
-            ),
-            experiments=(KILLS, SENSORS),
-            predicted=_bounds,
-            tested=_bounds_tested,
-        ),
-        Statement(
-            name="pipeline",
-            title="Five levels take five cycles",
-            quote=(
-                "It would take 5 control cycles for information from the top level to filter down"
-                " to the bottom level in a five layer hierarchy. However, this cyclic protocol will"
-                " guarantee a deterministic system response time."
-            ),
-            experiments=(PIPELINE,),
-            predicted=_pipeline,
-            tested=_pipeline_tested,
-        ),
+    "2",
+    (
+        Statement("figure-1", (NASREM,), _flow, _flow_tested),
+        Statement("virtual-control-loop", (NASREM,), _loop, _loop_tested),
+        Statement("planner-and-executor", (FIG2.experiment, FIG4.experiment), _both, _both_tested),
+        Statement("bounded-waits", (KILLS, SENSORS), _bounds, _bounds_tested),
+        Statement("pipeline", (PIPELINE,), _pipeline, _pipeline_tested),
     ),
 )

@@ -168,48 +168,10 @@ def _costs_tested(findings: Findings) -> Assessment:
 
 
 ABSTRACT = Chapter(
-    name="abstract",
-    title="Abstract",
-    intro=(
-        "The paper presents concurrent hierarchical control as an efficient, flexible and"
-        " deterministic method, and analyses its timing. What follows reproduces it on processes,"
-        " pinned to the cores of one machine, that share memory as the paper's boards share a VME"
-        " bus."
-    ),
-    statements=(
-        Statement(
-            name="determinism",
-            title="Determinism is the measure",
-            quote=(
-                "Satisfying real-time constraints is important, but determinism, not performance,"
-                " is the key element in assessing a control model."
-            ),
-            experiments=(DETERMINISM,),
-            predicted=_determined,
-            tested=_determined_tested,
-        ),
-    ),
+    "abstract",
+    (Statement("determinism", (DETERMINISM,), _determined, _determined_tested),),
 )
 INTRODUCTION = Chapter(
-    name="1",
-    title="Introduction",
-    intro=(
-        "A robot controller is split into cooperating processes to make it faster; communication is"
-        " the price."
-    ),
-    statements=(
-        Statement(
-            name="communication",
-            title="The cost of communication",
-            quote=(
-                "The cost of communications must not negate the time savings obtained by parallel"
-                " execution on the different processors. Thus, to achieve the benefits of"
-                " parallelism, a robot control model must be inherently concurrent and have an"
-                " efficient means of communication."
-            ),
-            experiments=(NASREM,),
-            predicted=_costs,
-            tested=_costs_tested,
-        ),
-    ),
+    "1",
+    (Statement("communication", (NASREM,), _costs, _costs_tested),),
 )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
@@ -22,6 +24,32 @@ from rack.tools.lab.reproduction.sections.page import (
     text,
 )
 
+PAPER: dict[str, dict[str, dict[str, str]]] = tomllib.loads(
+    Path(__file__).with_name("paper.toml").read_text(encoding="utf-8")
+)
+"""The paper's words, by section and by claim."""
+
+
+class Wording(NamedTuple):
+    """A claim in the paper's words. An equation also has a `form`, our `reading` of it, and words
+    for the rack of its `failure`."""
+
+    title: str
+    quote: str
+    form: str = ""
+    reading: str = ""
+    failure: str = ""
+
+
+def wording(claim: str) -> Wording:
+    """Return the words of a claim."""
+    return Wording(**_texts("claim", claim))
+
+
+def _texts(table: str, name: str) -> dict[str, str]:
+    """Return texts of the paper; how they are broken into lines means nothing."""
+    return {key: " ".join(words.split()) for key, words in PAPER[table][name].items()}
+
 
 @dataclass(frozen=True)
 class Findings:
@@ -37,29 +65,27 @@ class Findings:
 
 @dataclass(frozen=True)
 class Statement:
-    """A claim in the paper's words, with the experiments that it rests on.
+    """A claim of the paper by its name, with the experiments that it rests on.
 
     `predicted` computes our side from configs alone, and may draw; `tested` judges what the
     experiments have found.
     """
 
     name: str
-    title: str
-    quote: str
     experiments: tuple[Experiment[Any], ...]
     predicted: Callable[[Workshop], Side]
     tested: Callable[[Findings], Assessment]
-    equation: str = ""
 
     def claim(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageClaim:
         """Return the claim with its ruling; a text among the `results` says why there is none."""
+        words = wording(self.name)
         return PageClaim(
             name=self.name,
-            title=self.title,
-            quote=self.quote,
+            title=words.title,
+            quote=words.quote,
             predicted=self.predicted(workshop),
             tested=self._tested(workshop, results),
-            equation=self.equation,
+            equation=words.form,
         )
 
     def _tested(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> Assessment:
@@ -84,11 +110,9 @@ class Chapter:
     """A section of the paper with its claims; `name` is its number, as in "3.1", or "abstract"."""
 
     name: str
-    title: str
-    intro: str
     statements: tuple[Statement, ...]
 
     def section(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageSection:
         """Return the section with every claim judged."""
         claims = tuple(statement.claim(workshop, results) for statement in self.statements)
-        return PageSection(self.name, self.title, self.intro, claims)
+        return PageSection(self.name, claims=claims, **_texts("section", self.name))
