@@ -7,13 +7,13 @@ time; in lockstep, where a tick takes as long as its boards do, it is the time o
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,14 @@ from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.chain import LONGEST, PRIORITY, Chain
 from rack.tools.lab.benches.chain_figures import RATE_HZ, Boards, ChainFigures
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
-from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
-from rack.tools.lab.benches.harness import turns
+from rack.tools.lab.benches.cyclictest import (
+    CYCLICTEST,
+    WakeGrid,
+    absent_cyclictest,
+    cyclictest,
+    overdue,
+)
+from rack.tools.lab.benches.harness import interleaved
 from rack.tools.lab.benches.observed import Observed, Runs, missed_share, observe
 
 COUNTS = (1, 2, 5, 10, 15, LONGEST)
@@ -41,101 +47,75 @@ def measure(counts: Sequence[int], runs: Runs, against: Path | None, progress: P
     `against` is another checkout, which runs the same in lockstep. Raises `Failure` if it cannot.
     """
     absent = absent_cyclictest()
-    cores = tuple(sorted(os.sched_getaffinity(0)))
-    peers = () if absent else cores
     racks = rack_commands(against)
+    contestants = 1 + len(racks) + (not absent)
+    each_s = runs.rounds * contestants * (runs.seconds + LAUNCH_S)
+    progress.total(each_s * len(counts))
+    chains = []
     with TemporaryDirectory(prefix="rack-bench-") as folder:
-        chains = [
-            _ChainRuns(Chain(count, RATE_HZ), runs, peers, racks, Path(folder)) for count in counts
-        ]
-        progress.total(sum(chain.lasts_s for chain in chains))
-        for chain in chains:
-            progress.begin(f"boards: {chain.chain.boards}")
-            chain.measure()
-            progress.end(chain.lasts_s)
-        return Boards(
-            tuple(chain.figures() for chain in chains),
-            tuple(rack.name for rack in racks),
-            len(cores),
-            absent,
-        )
+        bench = ChainRuns(runs, racks, Path(folder), is_compared=not absent)
+        for count in counts:
+            progress.begin(f"boards: {count}")
+            chains.append(bench.figures(Chain(count, RATE_HZ)))
+            progress.end(each_s)
+    trees = tuple(rack.name for rack in racks)
+    return Boards(tuple(chains), trees, len(os.sched_getaffinity(0)), absent)
 
 
-class _ChainRuns:
-    """All runs of one chain; `peers` are the cores of `cyclictest`, `racks` run in lockstep."""
+class ChainRuns(NamedTuple):
+    """How chains run: `racks` in lockstep, with their configs in `folder`, and next to `cyclictest`
+    if so."""
 
-    def __init__(
-        self,
-        chain: Chain,
-        runs: Runs,
-        peers: tuple[int, ...],
-        racks: Sequence[RackCommand],
-        folder: Path,
-    ) -> None:
-        self.chain = chain
-        self._settings = runs
-        self._grid = WakeGrid.at(peers, RATE_HZ, runs.seconds, PRIORITY)
-        path = chain._replace(mode="lockstep").write(folder)
-        self._runs: list[Observed] = []
-        self._late: list[np.ndarray] = []
-        self._lockstep_us: dict[str, list[float]] = {rack.name: [] for rack in racks}
-        self._contestants: list[Callable[[], None]] = [self._run, *([self._peer] if peers else [])]
-        self._contestants += [partial(self._lockstep, rack, path) for rack in racks]
+    runs: Runs
+    racks: Sequence[RackCommand]
+    folder: Path
+    is_compared: bool
 
-    @property
-    def lasts_s(self) -> float:
-        """About how long measuring takes."""
-        return self._settings.rounds * len(self._contestants) * (self._settings.seconds + LAUNCH_S)
+    def figures(self, chain: Chain) -> ChainFigures:
+        """Run every contestant once a round; return the figures of all.
 
-    def measure(self) -> None:
-        """Run every contestant once a round."""
-        for _, contestant in turns(self._contestants, self._settings.rounds):
-            contestant()
-
-    def _run(self) -> None:
-        self._runs.append(self._observe(self.chain))
-
-    def _observe(self, chain: Chain) -> Observed:
-        return observe(
-            loads(chain.text()), self._settings.seconds, self._settings.share, [self._last]
-        )
-
-    def _peer(self) -> None:
-        self._late.append(cyclictest(self._grid))
-
-    def _lockstep(self, rack: RackCommand, path: Path) -> None:
-        seconds = self._settings.seconds * min(STRETCH, LONGEST / self.chain.boards)
-        options = ["--lockstep", "--no-record", "--json", "--seconds", seconds]
-        options += ["--share"] if self._settings.share else []
-        found = json.loads(rack.run("run", path, *options, bound_s=BOUND_S))
-        self._lockstep_us[rack.name].append(found["wall_s"] * 1e6 / found["outcome"]["ticks"])
-
-    @property
-    def _last(self) -> str:
-        return f"{self.chain.names[-1]}.status"
-
-    def figures(self) -> ChainFigures:
-        """Return the figures of all runs; the response in lockstep is that of one more."""
-        lockstep = self._observe(self.chain._replace(mode="lockstep"))
-        names = self.chain.names
-        late = np.concatenate(self._late) if self._late else None
-        counts = [run.cycles(name) for run in self._runs for name in names]
-        rows = [np.concatenate([run.traces[name] for run in self._runs]) for name in names]
+        The response in lockstep is that of one more run.
+        """
+        in_lockstep = chain._replace(mode="lockstep")
+        path = in_lockstep.write(self.folder)
+        grid = WakeGrid.at(os.sched_getaffinity(0), RATE_HZ, self.runs.seconds, PRIORITY)
+        contestants: dict[str, Callable[[], Any]] = {"chain": partial(self._observe, chain)}
+        if self.is_compared:
+            contestants[CYCLICTEST] = partial(cyclictest, grid)
+        for rack in self.racks:
+            contestants[f"lockstep, {rack.name}"] = partial(self._tick_us, rack, chain, path)
+        found = interleaved(contestants, self.runs.rounds)
+        runs: list[Observed] = found["chain"]
+        last = _last(chain)
+        counts = [run.cycles(name) for run in runs for name in chain.names]
+        rows = [np.concatenate([run.traces[name] for run in runs]) for name in chain.names]
+        costs_ns = [float(np.median(trace["processor_ns"])) for trace in rows if len(trace)]
         return ChainFigures(
-            boards=self.chain.boards,
+            boards=chain.boards,
             cycles=sum(count.due for count in counts),
-            processor_us=sum(
-                float(np.median(trace["processor_ns"])) for trace in rows if len(trace)
-            )
-            * 1e-3,
+            processor_us=sum(costs_ns) * 1e-3,
             missed=missed_share(counts),
-            late=None if late is None else overdue(late, self._grid.period_ns),
-            responses=responses_of([run.messages[self._last] for run in self._runs]),
-            lockstep_responses=responses_of([lockstep.messages[self._last]]),
+            late=overdue(found.get(CYCLICTEST, ()), grid.period_ns),
+            responses=responses_of([run.messages[last] for run in runs]),
+            lockstep_responses=responses_of([self._observe(in_lockstep).messages[last]]),
             lockstep_us={
-                name: float(np.median(costs)) for name, costs in self._lockstep_us.items()
+                rack.name: float(np.median(found[f"lockstep, {rack.name}"])) for rack in self.racks
             },
         )
+
+    def _observe(self, chain: Chain) -> Observed:
+        return observe(loads(chain.text()), self.runs.seconds, self.runs.share, [_last(chain)])
+
+    def _tick_us(self, rack: RackCommand, chain: Chain, path: Path) -> float:
+        """Return the time of a tick in lockstep, us."""
+        seconds = self.runs.seconds * min(STRETCH, LONGEST / chain.boards)
+        share = ["--share"] * self.runs.share
+        return rack.tick_us(path, "--seconds", seconds, *share, bound_s=BOUND_S)
+
+
+def _last(chain: Chain) -> str:
+    """Return the mailbox at the end of a chain."""
+    return f"{chain.names[-1]}.status"
 
 
 def responses_of(runs: Sequence[np.ndarray]) -> dict[int, int]:

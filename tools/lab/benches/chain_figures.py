@@ -159,8 +159,8 @@ class Boards(BenchResult):
             found = [one.lockstep_us[tree] for one in self.chains]
             costs += _fitted(f"lockstep, {tree}", counts, found)
         panels = (
-            Diagram("", "boards", costs, "us a tick", is_linear=True),
-            Diagram("", "boards", missed_by(counts, self.chains), "% of the cycles"),
+            Diagram("boards", costs, "us a tick", is_linear=True),
+            Diagram("boards", missed_by(counts, self.chains), "% of the cycles"),
         )
         return draw(folder / "boards", self.title, panels)
 

@@ -52,10 +52,10 @@ class Series(NamedTuple):
 class Diagram(NamedTuple):
     """Series on one pair of axes, whose labels carry the units."""
 
-    title: str
     x_label: str
     series: Sequence[Series]
     y_label: str = ""
+    title: str = ""
     is_linear: bool = False
 
 

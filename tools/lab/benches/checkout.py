@@ -7,14 +7,15 @@ and its libraries.
 
 from __future__ import annotations
 
+import json
 import os
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.harness import finished
 
 THIS = "this tree"
 RUN = "import sys; from rack.tools.cli import main; sys.argv[0] = 'rack'; sys.exit(main())"
@@ -26,8 +27,6 @@ WHERE_S = 30.0
 ENV = ".venv/installed"
 SOURCES = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 """Variables by which a process would get modules of this environment."""
-END_S = 1.2
-"""Longest wait for a command that was asked to end."""
 
 
 @dataclass(frozen=True)
@@ -44,31 +43,23 @@ class RackCommand:
     def run(self, *arguments: object, bound_s: float) -> str:
         """Run a command to its end; return its stdout.
 
-        Raises `Failure` with the last line of its stderr if it fails, or if it takes longer than
-        `bound_s`. Ends the command, in order if it can, if this process is interrupted.
+        Raises `Failure` with the last line of its stderr if it fails, and as `finished`.
         """
         called = f"{self.name}: rack {' '.join(map(str, arguments[:2]))}"
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(
-            [*self.argv, *map(str, arguments)],
-            env=self.environment,
-            stdin=subprocess.DEVNULL,
-            stdout=pipe,
-            stderr=pipe,
-            text=True,
-            errors="replace",
-        )
-        try:
-            out, err = process.communicate(timeout=bound_s)
-        except subprocess.TimeoutExpired:
-            raise Failure(f"{called}: still running after {bound_s:g} s") from None
-        finally:
-            if process.poll() is None:
-                _end(process)
-        if status := process.returncode:
-            reasons = [line for line in err.splitlines() if line.strip()]
-            raise Failure(f"{called}: {reasons[-1] if reasons else f'exit status {status}'}")
-        return out
+        argv = [*self.argv, *map(str, arguments)]
+        done = finished(called, argv, bound_s, self.environment)
+        if done.returncode:
+            reasons = [line for line in done.stderr.splitlines() if line.strip()]
+            raise Failure(
+                f"{called}: {reasons[-1] if reasons else f'exit status {done.returncode}'}"
+            )
+        return done.stdout
+
+    def tick_us(self, config: object, *options: object, bound_s: float) -> float:
+        """Return the time of a tick of a rack in lockstep, us. Raises `Failure` as `run`."""
+        words = ("run", config, "--lockstep", "--no-record", "--json", *options)
+        found = json.loads(self.run(*words, bound_s=bound_s))
+        return float(found["wall_s"] * 1e6 / found["outcome"]["ticks"])
 
 
 def rack_commands(against: Path | None) -> list[RackCommand]:
@@ -98,12 +89,3 @@ def checkout(tree: Path) -> RackCommand:
             f"{tree}: its .venv is that of {found}; to make its own: make -C {tree} clean {ENV}", 2
         )
     return replace(place, argv=(str(python), "-c", RUN))
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.terminate()
-    try:
-        process.communicate(timeout=END_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()

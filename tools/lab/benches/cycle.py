@@ -116,8 +116,7 @@ class CycleCosts(BenchResult):
         rows = list(dict.fromkeys(one.who for one in self.parts))
         cases = dict.fromkeys(one.case for one in self.parts)
         panels = [
-            Diagram("", f"{case}, us", list(self._bars(case, rows)), is_linear=True)
-            for case in cases
+            Diagram(f"{case}, us", list(self._bars(case, rows)), is_linear=True) for case in cases
         ]
         return draw(folder / self.comparison.name, self.comparison.title, panels, rows)
 

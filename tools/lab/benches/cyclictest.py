@@ -9,12 +9,11 @@ time.
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import decimal
 from rack.tools.lab.benches.chart import BASELINE, Series
-from rack.tools.lab.benches.harness import Absent, absent_program
+from rack.tools.lab.benches.harness import Absent, absent_program, finished
 
 CYCLICTEST = "cyclictest"
 LONGEST_US = 100_000
@@ -90,41 +89,18 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
             "--distance=0",
         ]
         command += [f"--loops={grid.wakes}", f"--histogram={LONGEST_US}", f"--json={path}"]
-        errors = _run(command, grid.patience_s)
-        if errors or not path.is_file():
-            raise Failure(f"{CYCLICTEST}: {errors or 'it wrote no figures'}")
+        done = finished(CYCLICTEST, command, grid.patience_s)
+        if done.returncode or not path.is_file():
+            status = f"exit status {done.returncode}, and no figures"
+            raise Failure(f"{CYCLICTEST}: {' '.join(done.stderr.split()) or status}")
         threads = json.loads(path.read_text())["thread"].values()
-    return np.concatenate([np.fromiter(_lateness_us(thread), float) for thread in threads])
+    return np.concatenate([_lateness_us(thread) for thread in threads])
 
 
-def _run(command: Sequence[str], patience_s: float) -> str:
-    """Run it to its end; return why it failed, empty if it did not."""
-    process = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        _, errors = process.communicate(timeout=patience_s)
-    except subprocess.TimeoutExpired:
-        return f"still running after {patience_s:g} s"
-    finally:
-        if process.poll() is None:
-            # In order: killed, it would leave its shared memory.
-            process.terminate()
-            process.communicate()
-    return (
-        (" ".join(errors.split()) or f"exit status {process.returncode}")
-        if process.returncode
-        else ""
-    )
-
-
-def _lateness_us(thread: dict[str, object]) -> Iterator[float]:
-    histogram = thread["histogram"]
-    assert isinstance(histogram, dict)
-    for late_us, count in histogram.items():
-        yield from [float(late_us)] * count
-    beyond = int(str(thread["cycles"])) - sum(histogram.values())
-    yield from [float(str(thread["max"]))] * beyond
+def _lateness_us(thread: dict[str, Any]) -> np.ndarray:
+    counts = thread["histogram"]
+    beyond = thread["cycles"] - sum(counts.values())
+    return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond])
 
 
 BEYOND = 0.001
@@ -166,12 +142,11 @@ def missed_by(places: Sequence[float], figures: Sequence[MissesBeyond]) -> list[
     return series
 
 
-def overdue(late_us: np.ndarray, period_ns: int) -> float:
-    """Return the share of grid points at which the sleeper was late by a cycle or more, those it
-    skipped included."""
-    passed = np.floor(late_us * 1e3 / period_ns)
-    return (
-        float(passed.sum() / (len(late_us) + np.clip(passed - 1, 0, None).sum()))
-        if len(late_us)
-        else 0.0
-    )
+def overdue(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
+    """Return the share of grid points at which a sleeper was late by a cycle or more, those it
+    skipped included; `runs` have the lateness of its wakes, us. None without any run."""
+    if not runs:
+        return None
+    passed = np.floor(np.concatenate(runs) * 1e3 / period_ns)
+    points = len(passed) + np.clip(passed - 1, 0, None).sum()
+    return float(passed.sum() / points) if points else 0.0

@@ -153,11 +153,9 @@ class HandBench(BenchResult):
         """Write ages, jitter and losses, a row a type of messages, into `folder`; return the
         paths."""
         panels = [
-            Diagram("", "age when read, longest, ms", self._series(lambda link: link.age_max_ms)),
-            Diagram(
-                "", "jitter of arrival, most, ms", self._series(lambda link: link.jitter_max_ms)
-            ),
-            Diagram("", "lost, % of messages", self._series(LinkFigures.lost_percent)),
+            Diagram("age when read, longest, ms", self._series(lambda link: link.age_max_ms)),
+            Diagram("jitter of arrival, most, ms", self._series(lambda link: link.jitter_max_ms)),
+            Diagram("lost, % of messages", self._series(LinkFigures.lost_percent)),
         ]
         return draw(folder / "hand", "", panels, self.messages)
 

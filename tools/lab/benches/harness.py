@@ -13,9 +13,12 @@ and the others are measured all the same.
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from importlib import import_module
@@ -25,6 +28,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from rack.backplane.process import pin, set_priority
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
@@ -35,6 +39,8 @@ if TYPE_CHECKING:
 
 EXTRA = "pip install 'nasrem-rack[lab]'"
 """Brings the peers that are Python packages."""
+END_S = 1.2
+"""Longest wait for a program that was asked to end."""
 KEY = "dot: median (ratio to the black one of the case); line: best to p99"
 _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
@@ -168,6 +174,59 @@ def absent_program(who: str, program: str, debian: str) -> tuple[Absent, ...]:
     return (Absent(who, f"no program '{program}'", f"apt-get install {debian}"),)
 
 
+def finished(
+    called: str,
+    argv: Sequence[str],
+    bound_s: float,
+    environment: Mapping[str, str] | None = None,
+    text: str = "",
+) -> subprocess.CompletedProcess[str]:
+    """Run a program, `called` so in messages, to its end, with `text` as its input. Raises
+    `Failure` if it takes longer than `bound_s`. Ends it, in order if it can, if this process is
+    interrupted."""
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(
+        argv,
+        env=environment,
+        stdin=pipe,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        errors="replace",
+    )
+    try:
+        out, err = process.communicate(text, timeout=bound_s)
+    except subprocess.TimeoutExpired:
+        raise Failure(f"{called}: still running after {bound_s:g} s") from None
+    finally:
+        if process.poll() is None:
+            _end(process)
+    return subprocess.CompletedProcess(argv, process.returncode, out, err)
+
+
+@contextmanager
+def pinned(core: int, priority: int = 0) -> Iterator[None]:
+    """Keep the calling process on a core, at a real-time priority if that is permitted, while the
+    context lasts."""
+    cores = os.sched_getaffinity(0)
+    try:
+        pin(core)
+        set_priority(priority)
+        yield
+    finally:
+        set_priority(0)
+        os.sched_setaffinity(0, cores)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.terminate()
+    try:
+        process.communicate(timeout=END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+
+
 @dataclass(frozen=True)
 class Comparison(BenchResult):
     """All samples of a bench. `baselines` names the contestant of each case that the others are
@@ -271,7 +330,7 @@ class Comparison(BenchResult):
             ratio = self.ratio(sample)
             note = shown(sample.median) + ("" if ratio is None else f"  ({ratio:.2f})")
             series.append(Series("", [sample.median], [row], "o", colour, notes=[note]))
-        return Diagram(case, own[0].unit, series)
+        return Diagram(own[0].unit, series, title=case)
 
 
 def shown(value: float) -> str:

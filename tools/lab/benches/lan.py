@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -93,7 +94,7 @@ class LanBench:
     def __init__(self, runs: LanRuns) -> None:
         self._runs = runs
         self._priority = PRIORITY if permits_fifo() else 0
-        self._values: dict[Point, list[float]] = {}
+        self._values: defaultdict[Point, list[float]] = defaultdict(list)
         self._steady: dict[str, Steadiness] = {}
 
     def cost_s(self, count: int) -> float:
@@ -109,9 +110,7 @@ class LanBench:
         with Group(lab, who, echoes=True, priority=self._priority) as group:
             for rate_hz in self._runs.rates_hz:
                 found = group.run(rate_hz, self._cycles(rate_hz))
-                self._note(
-                    Point("round trip", group.racks, rate_hz, who, "us"), found[COORDINATOR].us
-                )
+                self._note(group, "round trip", "us", found[COORDINATOR].us, rate_hz)
         with Group(lab, who, echoes=False, priority=self._priority) as group:
             self._exchange(group)
             if who not in WITHOUT_LIVELINESS:
@@ -124,7 +123,7 @@ class LanBench:
         idle_from = _wire_bytes(group.lab)
         group.idle(IDLE_S)
         idle = (_wire_bytes(group.lab) - idle_from) / (time.monotonic() - start_s)
-        self._note(Point("on the wire", group.racks, 0.0, group.who, "kB/s"), [idle * 1e-3])
+        self._note(group, "on the wire", "kB/s", [idle * 1e-3])
         for rate_hz in self._runs.rates_hz:
             before = _wire_bytes(group.lab)
             before_s = time.monotonic()
@@ -133,13 +132,11 @@ class LanBench:
             # A window is idle before its first cycle and after its last one.
             sent = _wire_bytes(group.lab) - before - idle * (time.monotonic() - before_s)
             kilobytes = (idle + sent * rate_hz / cycles) * 1e-3
-            self._note(
-                Point("age", group.racks, rate_hz, group.who, "ms"),
-                [us * 1e-3 for m in found for us in m.us],
-            )
-            self._note(Point("on the wire", group.racks, rate_hz, group.who, "kB/s"), [kilobytes])
+            ages_ms = [us * 1e-3 for one in found for us in one.us]
             each_us = found[COORDINATOR].processor_us / (cycles * group.racks)
-            self._note(Point("processor", group.racks, rate_hz, group.who, "us"), [each_us])
+            self._note(group, "age", "ms", ages_ms, rate_hz)
+            self._note(group, "on the wire", "kB/s", [kilobytes], rate_hz)
+            self._note(group, "processor", "us", [each_us], rate_hz)
             steady.missing += sum(one.missing for one in found)
             steady.taken += sum(len(one.us) for one in found)
         steady.false_deaths += group.false_deaths
@@ -148,25 +145,24 @@ class LanBench:
     def _disturb(self, group: Group) -> None:
         """Pull cables, then kill processes, while they exchange."""
         group.begin(DISTURBED_HZ, ENDLESS)
-
-        def point(what: str) -> Point:
-            return Point(what, group.racks, 0.0, group.who, "ms")
-
         for turn in range(DEATHS):
             lost_ms, back_ms = group.pull_cable(1 + turn % group.racks)
-            self._note(point("cable pulled"), [lost_ms])
-            self._note(point("plugged in"), [back_ms])
+            self._note(group, "cable pulled", "ms", [lost_ms])
+            self._note(group, "plugged in", "ms", [back_ms])
         for machine in range(1, min(DEATHS, group.racks) + 1):
-            self._note(point("killed"), [group.kill(machine)])
+            self._note(group, "killed", "ms", [group.kill(machine)])
 
     def wake(self, count: int) -> None:
         """Measure how late this machine wakes `cyclictest` at the highest rate, on all cores."""
         rate_hz = max(self._runs.rates_hz)
         grid = WakeGrid.at(os.sched_getaffinity(0), rate_hz, self._runs.seconds, PRIORITY)
-        self._note(Point("wake", count, rate_hz, CYCLICTEST, "us"), cyclictest(grid).tolist())
+        point = Point("wake", count, rate_hz, CYCLICTEST, "us")
+        self._values[point].extend(cyclictest(grid).tolist())
 
-    def _note(self, point: Point, values: Sequence[float]) -> None:
-        self._values.setdefault(point, []).extend(values)
+    def _note(
+        self, group: Group, what: str, unit: str, values: Sequence[float], rate_hz: float = 0.0
+    ) -> None:
+        self._values[Point(what, group.racks, rate_hz, group.who, unit)].extend(values)
 
     def figures(self, absent: Sequence[Absent]) -> LanFigures:
         """Return all that was found."""

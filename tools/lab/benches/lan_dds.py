@@ -16,12 +16,11 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from rack.tools.lab.benches.lan_ends import (
-    COORDINATOR,
     LEASE_MS,
     ORDER_BYTES,
     STATUS_BYTES,
     UNREAD,
-    LanPlace,
+    LanTask,
     Notice,
     Take,
 )
@@ -101,20 +100,18 @@ class _Events(Listener):
 class DdsEnd:
     """A participant, with a reader and a writer for each machine it exchanges messages with."""
 
-    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None:
-        peers = "".join(f'<Peer address="{place.addresses[other]}"/>' for other in place.others)
-        self._domain = Domain(0, SETTINGS.format(own=place.addresses[place.machine], peers=peers))
+    def __init__(self, task: LanTask, notice: Notice, take: Take | None) -> None:
+        peers = "".join(f'<Peer address="{task.addresses[other]}"/>' for other in task.others)
+        self._domain = Domain(0, SETTINGS.format(own=task.addresses[task.machine], peers=peers))
         participant = DomainParticipant(0)
-        own, theirs = (
-            (DdsOrder, DdsStatus) if place.machine == COORDINATOR else (DdsStatus, DdsOrder)
-        )
+        own, theirs = (DdsOrder, DdsStatus) if task.is_coordinator else (DdsStatus, DdsOrder)
         self._kind = own
         self._writers: dict[int, DataWriter[Any]] = {}
         self._readers: dict[int, DataReader[Any]] = {}
-        for other in place.others:
+        for other in task.others:
             events = _Events(other, notice, take)
-            there = Topic(participant, f"from_{other}_to_{place.machine}", theirs)
-            here = Topic(participant, f"from_{place.machine}_to_{other}", own)
+            there = Topic(participant, f"from_{other}_to_{task.machine}", theirs)
+            here = Topic(participant, f"from_{task.machine}_to_{other}", own)
             self._readers[other] = DataReader(participant, there, qos=QOS, listener=events)
             self._writers[other] = DataWriter(participant, here, qos=QOS, listener=events)
         self._participant = participant

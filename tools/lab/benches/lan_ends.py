@@ -29,20 +29,27 @@ Notice = Callable[[int, bool], None]
 
 
 @dataclass(frozen=True)
-class LanPlace:
-    """Where an end is: on which machine, and the addresses of all. `certificates`: a folder; empty:
-    without TLS."""
+class LanTask:
+    """What the process of `machine` is to do, and the addresses of all. `certificates`: a folder;
+    empty: without TLS. `echoes`: answer, or count answers, at once; else take messages in
+    cycles."""
 
+    who: str
     machine: int
     addresses: tuple[str, ...]
     certificates: str
+    echoes: bool
+    priority: int
+
+    @property
+    def is_coordinator(self) -> bool:
+        """Whether this is the machine that exchanges messages with all others."""
+        return self.machine == COORDINATOR
 
     @property
     def others(self) -> tuple[int, ...]:
         """The machines that this one exchanges messages with."""
-        return (
-            tuple(range(1, len(self.addresses))) if self.machine == COORDINATOR else (COORDINATOR,)
-        )
+        return tuple(range(1, len(self.addresses))) if self.is_coordinator else (COORDINATOR,)
 
 
 def rack_name(machine: int) -> str:
@@ -57,7 +64,7 @@ class End(Protocol):
     `notice` is called in a thread, too.
     """
 
-    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None: ...
+    def __init__(self, task: LanTask, notice: Notice, take: Take | None) -> None: ...
 
     def send(self, to: int, content: bytes) -> None:
         """Send a message to a machine, without waiting."""
@@ -69,17 +76,17 @@ class End(Protocol):
 class UdpEnd:
     """A bare UDP socket: no connection, no seal, and nobody notices who is there."""
 
-    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None:
-        self._places = {other: (place.addresses[other], PORT) for other in place.others}
+    def __init__(self, task: LanTask, notice: Notice, take: Take | None) -> None:
+        self._places = {other: (task.addresses[other], PORT) for other in task.others}
         self._from = {address: other for other, (address, _) in self._places.items()}
         self._socket = socket.socket(type=socket.SOCK_DGRAM)
-        self._socket.bind((place.addresses[place.machine], PORT))
+        self._socket.bind((task.addresses[task.machine], PORT))
         self._take = take
         if take is None:
             self._socket.setblocking(False)
         else:
             threading.Thread(target=self._listen, daemon=True).start()
-        for other in place.others:
+        for other in task.others:
             notice(other, True)
 
     def _listen(self) -> None:

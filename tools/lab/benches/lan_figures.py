@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from rack.tools.lab.benches.chart import PALETTE, Diagram, Series, draw
 from rack.tools.lab.benches.harness import Absent, BenchResult, Comparison, Sample, plain
 from rack.tools.lab.benches.lan_ends import LEASE_MS, ORDER_BYTES, STATUS_BYTES
@@ -121,9 +119,9 @@ class LanFigures(BenchResult):
                 if (point.what, point.rate_hz, point.who) == (what, rate_hz, who)
             )
             racks = [point.racks for point in own]
-            medians = [float(np.median(self.values[point])) for point in own]
-            p99s = [float(np.percentile(self.values[point], 99.0)) for point in own]
+            samples = [Sample(point.case, who, self.values[point], unit) for point in own]
+            medians = [sample.median for sample in samples]
             series.append(Series(who, racks, medians, "o-", colour))
-            series.append(Series("", racks, p99s, "--", colour))
+            series.append(Series("", racks, [sample.p99 for sample in samples], "--", colour))
         rate = f", {rate_hz:g} Hz" if rate_hz else ""
-        return Diagram(f"{what}{rate}", "racks", series, unit)
+        return Diagram("racks", series, unit, f"{what}{rate}")

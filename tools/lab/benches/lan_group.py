@@ -13,14 +13,13 @@ from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Self
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.lan_ends import COORDINATOR, LanPlace, rack_name
+from rack.tools.lab.benches.lan_ends import COORDINATOR, LanTask, rack_name
 from rack.tools.lab.benches.lan_machine import (
     ANSWER_S,
     FIND_S,
     TLS,
     LanFound,
     LanNotice,
-    LanTask,
     LanWindow,
 )
 from rack.tools.lab.benches.network import Lab
@@ -47,8 +46,10 @@ class Group:
         addresses = tuple(lab.address(machine) for machine in range(len(lab)))
         self._folder = TemporaryDirectory(prefix="rack-bench-")
         certificates = self._certificates(addresses) if who == TLS else ""
-        places = [LanPlace(machine, addresses, certificates) for machine in range(len(lab))]
-        self._tasks = [LanTask(who, place, echoes, priority) for place in places]
+        self._tasks = [
+            LanTask(who, machine, addresses, certificates, echoes, priority)
+            for machine in range(len(lab))
+        ]
         self._members: list[_Member] = []
         self.false_deaths = 0
 
@@ -135,14 +136,14 @@ class _Member:
     """One process of a group."""
 
     def __init__(self, lab: Lab, task: LanTask) -> None:
-        self._name = f"{task.who}, machine {task.place.machine}"
+        self._name = f"{task.who}, machine {task.machine}"
         self._errors = TemporaryFile()  # noqa: SIM115  # closed when the process ends
         self.pipe, theirs = Pipe()
         self.notices: list[LanNotice] = []
         with theirs:
             argv = [sys.executable, "-c", RUN, str(theirs.fileno())]
             self.process = lab.popen(
-                task.place.machine, argv, pass_fds=[theirs.fileno()], stderr=self._errors
+                task.machine, argv, pass_fds=[theirs.fileno()], stderr=self._errors
             )
         self.pipe.send(task)
 

@@ -16,7 +16,7 @@ from rack.tools.lab.benches.lan_ends import (
     LEASE_MS,
     PORT,
     UNREAD,
-    LanPlace,
+    LanTask,
     Notice,
     Take,
     rack_name,
@@ -26,17 +26,17 @@ from rack.tools.lab.benches.lan_ends import (
 class RackEnd:
     """The link of a rack's network adapter, with its envelopes and seals."""
 
-    def __init__(self, place: LanPlace, notice: Notice, take: Take | None) -> None:
-        self._link = link = LanLink(rack_name(place.machine), _table(place))
+    def __init__(self, task: LanTask, notice: Notice, take: Take | None) -> None:
+        self._link = link = LanLink(rack_name(task.machine), _table(task))
         self._number = 0
-        keys = {other: _key(place.machine, other) for other in place.others}
+        keys = {other: _key(task.machine, other) for other in task.others}
         self._puts = {other: (key, link.publish(key)) for other, key in keys.items()}
-        self._from = {_key(other, place.machine): other for other in place.others}
+        self._from = {_key(other, task.machine): other for other in task.others}
         self._arrived = [link.subscribe(key, UNREAD) for key in self._from if take is None]
         if take is not None:
             for key in self._from:
                 link.on(key, lambda arrived: take(*self._opened(arrived)))
-        racks = {rack_name(other): other for other in place.others}
+        racks = {rack_name(other): other for other in task.others}
 
         def see(sample: zenoh.Sample) -> None:
             rack = str(sample.key_expr).split("/")[1]
@@ -44,7 +44,7 @@ class RackEnd:
                 notice(racks[rack], sample.kind == zenoh.SampleKind.PUT)
 
         self._alive = link.session.liveliness().declare_subscriber(ALL_ALIVE, see, history=True)
-        link.declare_alive(place.machine)
+        link.declare_alive(task.machine)
 
     def _opened(self, arrived: Arrived) -> tuple[int, bytes]:
         head = self._link.sealer.opened(arrived.key, arrived.envelope, arrived.payload)
@@ -77,19 +77,19 @@ def _key(writer: int, reader: int) -> str:
     return out_key(rack_name(writer), _mailbox(reader))
 
 
-def _table(place: LanPlace) -> LanTable:
+def _table(task: LanTask) -> LanTable:
     """Return what would stand in the config of this rack."""
-    others = {rack_name(other): other for other in place.others}
+    others = {rack_name(other): other for other in task.others}
     imported = {
-        name: {"from": f"{name}/{_mailbox(place.machine)}", "type": "none:NONE", "max_age_ms": 1000}
+        name: {"from": f"{name}/{_mailbox(task.machine)}", "type": "none:NONE", "max_age_ms": 1000}
         for name in others
     }
-    endpoint = f"{'tls' if place.certificates else 'tcp'}/{place.addresses[COORDINATOR]}:{PORT}"
+    endpoint = f"{'tls' if task.certificates else 'tcp'}/{task.addresses[COORDINATOR]}:{PORT}"
     table = {
-        "listen" if place.machine == COORDINATOR else "connect": [endpoint],
+        "listen" if task.is_coordinator else "connect": [endpoint],
         "lease_ms": LEASE_MS,
-        "insecure": not place.certificates,
-        "certificates": place.certificates or None,
+        "insecure": not task.certificates,
+        "certificates": task.certificates or None,
         "export": {name: {"from": _mailbox(other)} for name, other in others.items()},
         "import": imported,
     }

@@ -21,7 +21,7 @@ from struct import Struct
 from typing import NamedTuple
 
 from rack.backplane.process import die_with_parent, pin, set_priority
-from rack.tools.lab.benches.lan_ends import COORDINATOR, ORDER_BYTES, STATUS_BYTES, End, LanPlace
+from rack.tools.lab.benches.lan_ends import ORDER_BYTES, STATUS_BYTES, End, LanTask
 
 TLS = "rack, TLS"
 TCP = "rack, TCP"
@@ -37,17 +37,6 @@ ANSWER_S = 1.0
 """Longest wait for the last answers of a window."""
 _HEAD = Struct("<qq")
 """Head of a message: its number, and when it was sent, CLOCK_MONOTONIC, ns."""
-
-
-@dataclass(frozen=True)
-class LanTask:
-    """What one process is to do. `echoes`: answer, or count answers, at once; else take messages in
-    cycles."""
-
-    who: str
-    place: LanPlace
-    echoes: bool
-    priority: int
 
 
 @dataclass(frozen=True)
@@ -83,8 +72,7 @@ class Machine:
     def __init__(self, task: LanTask, pipe: Connection) -> None:
         self._pipe = pipe
         self._sending = threading.Lock()  # the end's threads send, too
-        self._place = task.place
-        self._echoes = task.echoes
+        self._task = task
         self._seen: set[int] = set()
         self._all_there = threading.Event()
         self._answered = threading.Event()
@@ -94,29 +82,25 @@ class Machine:
         self._sent = 0
         module, _, name = ENDS[task.who].partition(":")
         kind: type[End] = getattr(import_module(module), name)
-        take = (
-            (self._count if task.place.machine == COORDINATOR else self._answer)
-            if task.echoes
-            else None
-        )
-        self._size = ORDER_BYTES if task.place.machine == COORDINATOR else STATUS_BYTES
-        self._end = kind(task.place, self._notice, take)
+        take = (self._count if task.is_coordinator else self._answer) if task.echoes else None
+        self._size = ORDER_BYTES if task.is_coordinator else STATUS_BYTES
+        self._end = kind(task, self._notice, take)
 
     def find(self) -> None:
         """Wait until all others are there. Raises `TimeoutError`."""
         if not self._all_there.wait(FIND_S):
-            missing = sorted(set(self._place.others) - self._seen)
+            missing = sorted(set(self._task.others) - self._seen)
             raise TimeoutError(
-                f"machine {self._place.machine}: {missing} not found within {FIND_S:g} s"
+                f"machine {self._task.machine}: {missing} not found within {FIND_S:g} s"
             )
 
     def _notice(self, machine: int, is_there: bool) -> None:
         """Note that another machine has come or gone; the coordinator says so."""
         if is_there:
             self._seen.add(machine)
-        if self._place.machine == COORDINATOR:
+        if self._task.is_coordinator:
             self.answer(LanNotice(machine, is_there, time.monotonic_ns()))
-        if len(self._seen) == len(self._place.others):
+        if len(self._seen) == len(self._task.others):
             self._all_there.set()
 
     def answer(self, found: LanFound | LanNotice) -> None:
@@ -127,10 +111,10 @@ class Machine:
     def measure(self, window: LanWindow) -> LanFound:
         """Run a window."""
         before_ns = time.process_time_ns()
-        if not self._echoes:
+        if not self._task.echoes:
             found = self._cycle(window)
         else:
-            found = self._ask(window) if self._place.machine == COORDINATOR else LanFound()
+            found = self._ask(window) if self._task.is_coordinator else LanFound()
         # Of all threads.
         found.processor_us = (time.process_time_ns() - before_ns) * 1e-3
         return found
@@ -140,7 +124,7 @@ class Machine:
         them."""
         found = LanFound()
         # The coordinator at 0, the others spread over its period.
-        shift = self._place.machine * window.period_ns // len(self._place.addresses)
+        shift = self._task.machine * window.period_ns // len(self._task.addresses)
         for _ in _grid(window, shift):
             now = time.monotonic_ns()
             for machine, content in self._end.taken():
@@ -151,17 +135,17 @@ class Machine:
                 if sent_ns >= window.start_ns:
                     found.us.append((now - sent_ns) * 1e-3)
             self._sent += 1
-            for machine in self._place.others:
+            for machine in self._task.others:
                 self._end.send(machine, _HEAD.pack(self._sent, now).ljust(self._size, b"\0"))
         return found
 
     def _ask(self, window: LanWindow) -> LanFound:
         """Send an order to all in each cycle; each is answered at once."""
         self._round_trips.clear()
-        self._awaited = window.cycles * len(self._place.others)
+        self._awaited = window.cycles * len(self._task.others)
         self._answered.clear()
         for cycle in _grid(window, 0):
-            for machine in self._place.others:
+            for machine in self._task.others:
                 self._end.send(
                     machine, _HEAD.pack(cycle, time.monotonic_ns()).ljust(self._size, b"\0")
                 )
@@ -197,7 +181,7 @@ def main() -> None:
         # Before the end starts its threads, which have core and priority of this one: as on a
         # rack's adapter board.
         cores = sorted(os.sched_getaffinity(0))
-        pin(cores[task.place.machine % len(cores)])
+        pin(cores[task.machine % len(cores)])
         set_priority(task.priority)
         machine = Machine(task, pipe)
         machine.find()

@@ -8,7 +8,6 @@ prolongs.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -54,14 +53,11 @@ class BareRun:
 
 @dataclass(frozen=True)
 class LockstepSpeeds(BenchResult):
-    """The time that a simulated second takes, by rack and contestant."""
+    """The time that a simulated second takes, by rack and contestant; `speeds` are simulated
+    seconds a second, of the median."""
 
     comparison: Comparison
-
-    @property
-    def speeds(self) -> Mapping[tuple[str, str], float]:
-        """Simulated seconds a second, by rack and contestant: of the median."""
-        return {(_rack(one.case), one.who): 1e3 / one.median for one in self.comparison.samples}
+    speeds: Mapping[tuple[str, str], float]
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -73,17 +69,8 @@ class LockstepSpeeds(BenchResult):
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield both tables for people, fitted to `width`."""
         who = list(dict.fromkeys(who for _, who in self.speeds))
-        racks = list(dict.fromkeys(rack for rack, _ in self.speeds))
-        rows = [
-            [
-                rack,
-                *(
-                    shown(self.speeds[rack, one]) if (rack, one) in self.speeds else "-"
-                    for one in who
-                ),
-            ]
-            for rack in racks
-        ]
+        racks = dict.fromkeys(rack for rack, _ in self.speeds)
+        rows = [[rack, *(shown(self.speeds[rack, one]) for one in who)] for rack in racks]
         yield "Simulated seconds a second in lockstep"
         yield from table(["rack", *who], rows, width)
         yield ""
@@ -129,7 +116,11 @@ def speeds(found: Mapping[tuple[str, str], list[float]], names: list[str]) -> Lo
         samples += [replace(sample, case=_limit(rack)) for sample in own]
         baselines[_limit(rack)] = BARE
     title = "Time of a simulated second in lockstep"
-    return LockstepSpeeds(Comparison("lockstep", title, tuple(samples), baselines))
+    medians = {key: float(np.median(times_ms)) for key, times_ms in found.items()}
+    return LockstepSpeeds(
+        Comparison("lockstep", title, tuple(samples), baselines),
+        {key: 1e3 / median for key, median in medians.items()},
+    )
 
 
 def _limit(rack: str) -> str:
@@ -137,28 +128,22 @@ def _limit(rack: str) -> str:
     return f"{rack} and its limit"
 
 
-def _rack(case: str) -> str:
-    return case.removesuffix(_limit(""))
-
-
 def _run(command: RackCommand, rack: str, seconds: float | None) -> float:
-    document = json.loads(
-        command.run(*_arguments(rack, seconds), "--no-record", "--json", bound_s=BOUND_S)
-    )
-    return _ms_a_second(rack, document["outcome"]["ticks"], document["wall_s"])
+    tick_us = command.tick_us(rack, *_options(seconds), bound_s=BOUND_S)
+    return _ms_a_second(rack, tick_us)
 
 
-def _arguments(rack: str, seconds: float | None) -> list[str]:
-    until = [] if seconds is None else ["--seconds", str(seconds)]
-    return ["run", rack, "--lockstep", "--set", f"name=bench-{os.getpid()}", *until]
+def _options(seconds: float | None) -> list[object]:
+    until = [] if seconds is None else ["--seconds", seconds]
+    return ["--set", f"name=bench-{os.getpid()}", *until]
 
 
 def _run_bare(rack: str, ticks: int) -> float:
-    return _ms_a_second(rack, ticks, _bare(rack, ticks).processor_s)
+    return _ms_a_second(rack, _bare(rack, ticks).processor_s * 1e6 / ticks)
 
 
-def _ms_a_second(rack: str, ticks: int, took_s: float) -> float:
-    return took_s * 1e12 / (ticks * load(rack).clock_ns)
+def _ms_a_second(rack: str, tick_us: float) -> float:
+    return tick_us * 1e6 / load(rack).clock_ns
 
 
 def _bare(rack: str, ticks: int) -> BareRun:
@@ -178,7 +163,8 @@ def run_bare(config: RackConfig, ticks: int) -> BareRun:
 def _check(rack: str, seconds: float | None, folder: Path) -> int:
     """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
     for."""
-    rack_commands(None)[0].run(*_arguments(rack, seconds), "--out", str(folder), bound_s=BOUND_S)
+    words = ("run", rack, "--lockstep", *_options(seconds), "--out", folder)
+    rack_commands(None)[0].run(*words, bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])
     differing = list(differences(recording, _bare(rack, ticks)))

@@ -91,13 +91,11 @@ def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Compariso
 def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison:
     """Return the comparison of these samples with the best peer of each case."""
     peers = {peer.name for peer in PEERS}
-    best: dict[str, Sample] = {}
-    for sample in samples:
-        if sample.who in peers and (
-            sample.case not in best or sample.median < best[sample.case].median
-        ):
-            best[sample.case] = sample
-    baselines = {case: sample.who for case, sample in best.items()}
+    baselines = {}
+    for case in dict.fromkeys(sample.case for sample in samples):
+        own = [sample for sample in samples if sample.case == case and sample.who in peers]
+        if own:
+            baselines[case] = min(own, key=lambda sample: sample.median).who
     title = "A message written and read; ratio to the best peer of the case"
     return Comparison("mailbox", title, tuple(samples), baselines, absent)
 

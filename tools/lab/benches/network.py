@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, Self
 
 from rack.backplane.process import is_alive, readable, start_time
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.harness import finished
 
 PREFIX = "rack-lab"
 NAMESPACES = Path("/run/netns")
@@ -183,16 +184,12 @@ def _ip(commands: Iterable[str], namespace: str | None = None) -> None:
 
 def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
     """Run a command with these lines as its input, and return what it prints. Raises `Failure`."""
+    called = f"network lab: {' '.join(argv)}"
     text = "".join(f"{line}\n" for line in lines)
-    try:
-        done = subprocess.run(argv, input=text, capture_output=True, text=True, timeout=PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        raise Failure(
-            f"network lab: still running after {PATIENCE_S:g} s: {' '.join(argv)}"
-        ) from None
+    done = finished(called, argv, PATIENCE_S, text=text)
     if done.returncode:
         why = " ".join(done.stderr.split()) or f"exit status {done.returncode}"
-        raise Failure(f"network lab: {' '.join(argv)}: {why}")
+        raise Failure(f"{called}: {why}")
     return done.stdout
 
 

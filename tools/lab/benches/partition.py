@@ -136,8 +136,18 @@ class Partitions(BenchResult):
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield two tables for people, fitted to `width`: executors, and planners with their plan
         ages; times in ms."""
-        levels = [(one.partition, level) for one in self.partitions for level in one.levels]
-        planned = [_planner_row(*one) for one in levels if one[1].planner is not None]
+        executors = []
+        planners = []
+        for one in self.partitions:
+            for level in one.levels:
+                place = [one.partition, level.level]
+                task = level.executor
+                residuals = _cells(task.residual_ms, "p50", "min")
+                executors.append([*place, *_counts(task), str(task.skipped), *residuals])
+                if (planner := level.planner) is not None:
+                    residuals = _cells(planner.residual_ms, "p50", "min")
+                    ages = _cells(level.plan_age_ms, "p50", "max")
+                    planners.append([*place, *_counts(planner), *residuals, *ages])
         yield "executors: predicted worst-case response, and residual, ms"
         head = [
             "partition",
@@ -150,9 +160,7 @@ class Partitions(BenchResult):
             "residual p50",
             "residual min",
         ]
-        yield from table(
-            head, [_executor_row(*one) for one in levels], width, ("cycles", "residual p50")
-        )
+        yield from table(head, executors, width, ("cycles", "residual p50"))
         yield ""
         yield "planners: the same for a plan's time slice, and the age of plans when read, ms"
         head = [
@@ -165,7 +173,7 @@ class Partitions(BenchResult):
             "residual p50",
             "residual min",
         ]
-        yield from table([*head, "age p50", "age max"], planned, width, PLANNERS_DROPPED)
+        yield from table([*head, "age p50", "age max"], planners, width, PLANNERS_DROPPED)
 
 
 def measure(name: str, seconds: float, rounds: int, progress: Progress) -> Partitions:
@@ -245,35 +253,14 @@ def _task(
     )
 
 
-def _executor_row(partition: str, level: LevelFigures) -> list[str]:
-    executor = level.executor
-    counts = [str(count) for count in (executor.cycles, executor.missed, executor.skipped)]
-    return [
-        partition,
-        level.level,
-        *_prediction(executor),
-        *counts,
-        *_cells(executor.residual_ms, "p50", "min"),
-    ]
-
-
-def _planner_row(partition: str, level: LevelFigures) -> list[str]:
-    planner = level.planner
-    assert planner is not None, "levels without a planner have no such row"
-    row = [partition, level.level, *_prediction(planner), str(planner.cycles), str(planner.missed)]
-    return [
-        *row,
-        *_cells(planner.residual_ms, "p50", "min"),
-        *_cells(level.plan_age_ms, "p50", "max"),
-    ]
-
-
-def _prediction(task: TaskFigures) -> list[str]:
-    """Return the time slice, and the predicted response."""
-    if task.fits is None:
-        return [f"{task.slice_ms:g}", "-"]
-    response = "no bound" if task.predicted_ms is None else f"{task.predicted_ms:.2f}"
-    return [f"{task.slice_ms:g}", response if task.fits else f"{response} FAILS"]
+def _counts(task: TaskFigures) -> list[str]:
+    """Return the time slice, the predicted response, and the cycles with those missed."""
+    response = "-"
+    if task.fits is not None:
+        response = "no bound" if task.predicted_ms is None else f"{task.predicted_ms:.2f}"
+    if task.fits is False:
+        response += " FAILS"
+    return [f"{task.slice_ms:g}", response, str(task.cycles), str(task.missed)]
 
 
 def _cells(found: Distribution | None, *names: str) -> list[str]:

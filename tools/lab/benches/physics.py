@@ -7,10 +7,8 @@ them. The replay must end in the recorded state, bit for bit: otherwise it was o
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -18,9 +16,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from rack.backplane.process import pin, set_priority
 from rack.levels.robot.cell import STATE, Cell, build_cell
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.harness import pinned
 from rack.tools.recording.recording import Recording
 
 SERVO = "servo"
@@ -86,7 +84,7 @@ class Replay:
         data = mujoco.MjData(self.cell.model)
         mujoco.mj_setState(model, data, self.start, STATE)
         found: list[float] = []
-        with _scheduled(pace):
+        with pinned(pace.core, pace.priority) if pace.priority else nullcontext():
             due_ns = time.monotonic_ns()
             for number, control in enumerate(self.controls[:ticks], self.first_tick + 1):
                 due_ns += pace.period_ns
@@ -127,38 +125,14 @@ def _stretch(recording: Recording) -> tuple[int, int]:
     """Return first and last tick of the longest stretch without brakes; states are recorded at
     both."""
     status = f"{SERVO}.status"
-    ticks = recording.signal(status, "tick")
-    braked = recording.signal(status, "braked")
-    known = set(recording.signal(f"{SERVO}.state", "tick").tolist())
-    best = (0, 0)
-    begun = -1
-    ended = -1
-    for tick, is_braked in zip(ticks.tolist(), braked.tolist(), strict=True):
-        if is_braked or (begun >= 0 and tick != ended + 1 and tick != begun):
-            begun = -1
-        if is_braked:
-            continue
-        if begun < 0 and tick in known:
-            begun = ended = tick
-        ended = tick
-        if begun >= 0 and tick in known and tick - begun > best[1] - best[0]:
-            best = begun, tick
+    ticks = recording.signal(status, "tick")[recording.signal(status, "braked") == 0]
+    stretches = np.split(ticks, np.flatnonzero(np.diff(ticks) != 1) + 1)
+    recorded = recording.signal(f"{SERVO}.state", "tick")
+    known = [np.intersect1d(stretch, recorded) for stretch in stretches]
+    ends = [(int(stretch[0]), int(stretch[-1])) for stretch in known if len(stretch)]
+    best = max(ends, key=lambda pair: pair[1] - pair[0], default=(0, 0))
     if best[0] == best[1]:
         raise Failure(
             "the arm did not move in the recorded run: no physics to replay; run it for longer"
         )
     return best
-
-
-@contextmanager
-def _scheduled(pace: ReplayPace) -> Iterator[None]:
-    """Run as a board does: pinned, at its priority if that is permitted."""
-    cores = os.sched_getaffinity(0)
-    try:
-        if pace.priority:
-            pin(pace.core)
-            set_priority(pace.priority)
-        yield
-    finally:
-        set_priority(0)
-        os.sched_setaffinity(0, cores)

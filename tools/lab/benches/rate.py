@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +37,13 @@ from rack.tools.lab.benches.cyclictest import (
     misses_count,
     overdue,
 )
-from rack.tools.lab.benches.harness import Absent, BenchResult, turns
+from rack.tools.lab.benches.harness import Absent, BenchResult, interleaved
 from rack.tools.lab.benches.observed import Observed, Runs, endless, missed_share, observe
 
 RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
 STEP_MS = 0.5
 """Longest time step of the simulated arm, that of the bundled racks."""
 LAUNCH_S = 3.0
-Late = np.ndarray | None
 
 
 def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
@@ -168,8 +168,8 @@ class Rates(BenchResult):
         loads = [one.processor_us * one.rate_hz * 1e-4 for one in self.rates]
         load = [Series("", rates, loads, "o-")]
         panels = (
-            Diagram("", "servo rate, Hz", missed_by(rates, self.rates), "% of the cycles"),
-            Diagram("", "servo rate, Hz", load, "processor time of a cycle, % of its period"),
+            Diagram("servo rate, Hz", missed_by(rates, self.rates), "% of the cycles"),
+            Diagram("servo rate, Hz", load, "processor time of a cycle, % of its period"),
         )
         return draw(folder / "rate", self.title, panels)
 
@@ -186,24 +186,21 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     figures = []
     for rate_hz, rack in racks.items():
         progress.begin(f"{rate_hz:g} Hz")
-        priority = config.board[board].priority or 1
-        grid = WakeGrid.at((core,), rate_hz, runs.seconds, priority)
-        ran: list[Observed] = []
-        late: list[np.ndarray] = []
-        for _, who in turns(("rack",) if absent else ("rack", CYCLICTEST), runs.rounds):
-            if who == CYCLICTEST:
-                late.append(cyclictest(grid))
-            else:
-                ran.append(observe(rack, runs.seconds, runs.share))
-        figures.append(
-            _figures(rate_hz, board, ran, np.concatenate(late) if late else None, grid.period_ns)
-        )
+        grid = WakeGrid.at((core,), rate_hz, runs.seconds, config.board[board].priority or 1)
+        contestants: dict[str, Callable[[], Any]] = {
+            "rack": partial(observe, rack, runs.seconds, runs.share)
+        }
+        if not absent:
+            contestants[CYCLICTEST] = partial(cyclictest, grid)
+        found = interleaved(contestants, runs.rounds)
+        late = overdue(found.get(CYCLICTEST, ()), grid.period_ns)
+        figures.append(_figures(rate_hz, board, found["rack"], late))
         progress.end(each_s, figures[-1].verdict)
     return Rates(name, board, core, tuple(figures), absent)
 
 
 def _figures(
-    rate_hz: float, board: str, runs: Sequence[Observed], late_us: Late, period_ns: int
+    rate_hz: float, board: str, runs: Sequence[Observed], late: float | None
 ) -> RateFigures:
     settled = np.concatenate([run.settled(board) for run in runs])
     ended = [run.outcome for run in runs if not run.outcome.worked]
@@ -211,7 +208,7 @@ def _figures(
         rate_hz=rate_hz,
         cycles=sum(run.cycles(board).due for run in runs),
         missed=missed_share(run.cycles(board) for run in runs),
-        late=None if late_us is None else overdue(late_us, period_ns),
+        late=late,
         lateness_us=distribution(lateness_ns(settled) * 1e-3),
         processor_us=float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0,
         failure=(

@@ -88,18 +88,9 @@ class ResponseBench(BenchResult):
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        head = {
-            "config": self.config,
-            "mode": self.mode,
-            "seed": self.seed,
-            "runs": self.runs,
-            "held": self.held,
-        }
-        return {
-            **head,
-            **self.response.document(),
-            "twins": plain(self.twins),
-        }
+        names = ("config", "mode", "seed", "runs", "held")
+        head = {name: getattr(self, name) for name in names}
+        return {**head, **self.response.document(), "twins": plain(self.twins)}
 
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as text for people, the table fitted to `width`."""

@@ -26,7 +26,7 @@ import posix_ipc
 from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.levels.timing.trace_times import Distribution, distribution
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import BenchResult
+from rack.tools.lab.benches.harness import BenchResult, pinned
 
 PAPER_US = 100.0
 """Task switch on NIST's boards (NISTIR 90-4251, section 4)."""
@@ -106,7 +106,8 @@ def _run(core: int, other: int) -> tuple[np.ndarray, np.ndarray]:
     with _semaphore() as wake, _semaphore() as work:
         executor = spawn.Process(target=_execute, args=(wake.name, shared), daemon=True)
         planner = spawn.Process(target=_plan, args=(work.name, shared), daemon=True)
-        with _alive(executor, planner), _pinned(other):
+        # This process is kept off the measured core.
+        with _alive(executor, planner), pinned(other):
             _await(shared)
             for _ in range(WAKES):
                 work.release()
@@ -181,17 +182,6 @@ def _alive(*processes: BaseProcess) -> Iterator[None]:
         for process in processes:
             process.kill()
             process.join()
-
-
-@contextmanager
-def _pinned(core: int) -> Iterator[None]:
-    """Keep the calling process off the measured core."""
-    cores = os.sched_getaffinity(0)
-    pin(core)
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
 
 
 def _await(shared: _Shared) -> None:

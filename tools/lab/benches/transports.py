@@ -17,6 +17,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 from multiprocessing.queues import Queue
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -64,7 +65,7 @@ def raw_copy(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         def fetch(raw: memoryview) -> None:
             raw[:] = view
 
-        yield Transport(message, send, [_into(Message(dtype), fetch) for _ in range(readers)])
+        yield Transport(message, send, [_into(dtype, fetch) for _ in range(readers)])
 
 
 @contextmanager
@@ -126,7 +127,7 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
         return fetch
 
-    takers = [_into(Message(dtype), fetcher(one)) for one in entries]
+    takers = [_into(dtype, fetcher(one)) for one in entries]
     yield Transport(message, lambda tick: entry.update_with_copy(own), takers)
 
 
@@ -142,7 +143,7 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
     try:
         yield Transport(
-            message, send, [_into(Message(dtype), way_out.recv_bytes_into) for way_out, _ in pipes]
+            message, send, [_into(dtype, way_out.recv_bytes_into) for way_out, _ in pipes]
         )
     finally:
         for end in (end for pipe in pipes for end in pipe):
@@ -159,14 +160,8 @@ def multiprocessing_queue(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         for queue in queues:
             queue.put(bytes(message.raw))
 
-    def fetcher(queue: Queue[bytes]) -> Callable[[memoryview], None]:
-        def fetch(raw: memoryview) -> None:
-            raw[:] = queue.get()
-
-        return fetch
-
     try:
-        yield Transport(message, send, [_into(Message(dtype), fetcher(queue)) for queue in queues])
+        yield Transport(message, send, [_into(dtype, _copied(queue.get)) for queue in queues])
     finally:
         for queue in queues:
             queue.close()
@@ -180,15 +175,21 @@ def zenoh_sessions(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
     They are connected through a socket in the file system: nothing listens on a network.
     """
+    import zenoh
+
+    message = Message(dtype)
     with ExitStack() as stack:
         with TemporaryDirectory(prefix="rack-bench-") as folder:
             place = f"unixsock-stream/{folder}/zenoh"
             session = stack.enter_context(_zenoh(listen=place, connect=""))
             others = [stack.enter_context(_zenoh(listen="", connect=place)) for _ in range(readers)]
-        publisher = _publisher(session)
-        subscribers = _subscribers(others)
+        # Full buffers delay a message; they do not drop it.
+        blocks = zenoh.CongestionControl.BLOCK
+        publisher = session.declare_publisher(KEY, congestion_control=blocks)
+        subscribers = [other.declare_subscriber(KEY) for other in others]
         _await(session, others)
-        yield _zenoh_transport(publisher, dtype, subscribers)
+        takers = [_into(dtype, _copied(partial(_received, one))) for one in subscribers]
+        yield Transport(message, lambda tick: publisher.put(bytes(message.raw)), takers)
 
 
 def _zenoh(listen: str, connect: str) -> Any:
@@ -206,17 +207,6 @@ def _zenoh(listen: str, connect: str) -> Any:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise Failure(f"zenoh: {' '.join(str(error).split())}") from None
-
-
-def _publisher(session: Any) -> Any:
-    import zenoh
-
-    # Full buffers delay a message; they do not drop it.
-    return session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-
-
-def _subscribers(sessions: Sequence[Any]) -> list[Any]:
-    return [session.declare_subscriber(KEY) for session in sessions]
 
 
 def _await(session: Any, others: Sequence[Any]) -> None:
@@ -239,19 +229,6 @@ def _received(subscriber: Any) -> bytes:
     return bytes(sample.payload.to_bytes())
 
 
-def _zenoh_transport(publisher: Any, dtype: np.dtype, subscribers: Sequence[Any]) -> Transport:
-    message = Message(dtype)
-
-    def fetcher(subscriber: Any) -> Callable[[memoryview], None]:
-        def fetch(raw: memoryview) -> None:
-            raw[:] = _received(subscriber)
-
-        return fetch
-
-    takers = [_into(Message(dtype), fetcher(subscriber)) for subscriber in subscribers]
-    return Transport(message, lambda tick: publisher.put(bytes(message.raw)), takers)
-
-
 REFERENCES = (Peer("raw copy", "mmap", raw_copy),)
 """No peer: the least that can be done."""
 PEERS = (
@@ -263,8 +240,9 @@ PEERS = (
 )
 
 
-def _into(message: Message, fetch: Callable[[memoryview], object]) -> Callable[[int], Message]:
-    """Return a reader that lets `fetch` fill the bytes of its own message."""
+def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[int], Message]:
+    """Return a reader that lets `fetch` fill the bytes of a message of its own."""
+    message = Message(dtype)
     raw = message.raw
 
     def take(tick: int) -> Message:
@@ -272,6 +250,15 @@ def _into(message: Message, fetch: Callable[[memoryview], object]) -> Callable[[
         return message
 
     return take
+
+
+def _copied(get: Callable[[], bytes]) -> Callable[[memoryview], None]:
+    """Return a function that copies what `get` returns into the bytes of a message."""
+
+    def fetch(raw: memoryview) -> None:
+        raw[:] = get()
+
+    return fetch
 
 
 @contextmanager

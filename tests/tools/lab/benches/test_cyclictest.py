@@ -71,8 +71,9 @@ def test_it_is_absent_without_the_program_or_the_permission(
 
 def test_a_wake_late_by_cycles_is_overdue_at_each_point_it_passed() -> None:
     period_ns = 1_000_000
-    assert overdue(np.array([0.0, 999.0]), period_ns) == 0.0
+    assert overdue([np.array([0.0, 999.0])], period_ns) == 0.0
     # The second wake came 3.2 cycles late: three points are lost, two of which had no wake of their
     # own.
-    assert overdue(np.array([0.0, 3200.0]), period_ns) == 3 / 4
-    assert overdue(np.array([]), period_ns) == 0.0
+    assert overdue([np.array([0.0, 3200.0])], period_ns) == 3 / 4
+    assert overdue([np.array([])], period_ns) == 0.0
+    assert overdue([], period_ns) is None

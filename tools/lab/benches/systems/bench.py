@@ -18,11 +18,10 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
 from rack.tools.lab.benches.observed import Runs, missed_share, record
-from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures
+from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, prediction
 from rack.tools.lab.benches.systems.hold import held, hold_for
 from rack.tools.lab.benches.systems.kills import kill_each, kills_s
 from rack.tools.lab.benches.systems.motion import LONGEST_S, PosesBench, poses_config
-from rack.tools.lab.benches.systems.prediction import prediction
 from rack.tools.lab.benches.systems.realtime import (
     ages_ms,
     board_loads,
@@ -62,10 +61,10 @@ def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
     absent = absent_cyclictest()
     racks = [_System(name, runs, is_compared=not absent) for name in names]
     progress.total(sum(rack.lasts_s for rack in racks))
-    figures = []
     with TemporaryDirectory(prefix="rack-bench-") as scratch:
-        for number, rack in enumerate(racks):
-            figures.append(rack.measure(Path(scratch) / str(number), progress))
+        figures = [
+            rack.measure(Path(scratch) / str(number), progress) for number, rack in enumerate(racks)
+        ]
     return Systems(tuple(figures), runs.seconds, absent)
 
 
@@ -81,7 +80,7 @@ class _System:
         self._config = load(name, [f"name={own}", "clock.mode=realtime", "clock.speed=1.0"])
         self._layout = wire(self._config)
         self._timing = rack_timing(self._config, self._layout)
-        self._hold = hold_for(self._config, self._timing, self._layout, runs.seconds)
+        self._hold = hold_for(self._config, runs.seconds)
         poses = poses_config(name)
         self._poses = None if poses is None else PosesBench(poses, own, runs.share)
 
@@ -119,7 +118,7 @@ class _System:
         failures = [text for text in (failure, killed, unmoved) if text]
         return SystemFigures(
             rack=Path(self._name).stem,
-            predicted=prediction(self._config, self._timing, self._layout),
+            predicted=prediction(self._config),
             realtime=realtime,
             kills=kills,
             poses=poses,
@@ -130,8 +129,8 @@ class _System:
         commands = () if self._hold is None else (self._hold,)
         config = self._config.model_copy(update={"command": (*self._config.command, *commands)})
         run, recording = record(config, self._runs.seconds, folder, self._runs.share)
-        late_us = cyclictest(self._grid()) if self._is_compared else None
-        late = None if late_us is None else overdue(late_us, self._grid().period_ns)
+        grid = self._grid()
+        late = overdue([cyclictest(grid)] if self._is_compared else [], grid.period_ns)
         return self._figures(run, recording, late), "" if run.worked else run.failure()
 
     @property
@@ -143,24 +142,22 @@ class _System:
     def _grid(self) -> WakeGrid:
         boards = [self._config.board[name] for name in self._fastest]
         period_ns = self._timing.boards[self._fastest[0]].every * self._timing.tick_ns
-        return WakeGrid(
-            cores=tuple(sorted({obtained_core(board.core) for board in boards})),
-            period_ns=period_ns,
-            wakes=max(1, round(self._runs.seconds * 1e9 / period_ns)),
-            priority=max(*(board.priority for board in boards), 1),
-        )
+        cores = {obtained_core(board.core) for board in boards}
+        priority = max(*(board.priority for board in boards), 1)
+        return WakeGrid.at(cores, 1e9 / period_ns, self._runs.seconds, priority)
 
     def _figures(self, run: RunResult, recording: Recording, late: float | None) -> RealTimeFigures:
         counts = [cycles_in(run, self._layout, name) for name in self._fastest]
         cycles = cycles_of(recording)
-        response = system_response(recording)
+        response = system_response(recording) or {"command": {}, "status": {}}
+        command = response["command"]
         return RealTimeFigures(
             missed=missed_share(counts),
             late=late,
-            commanded="" if response is None else next(iter(response["command"]["levels"]), ""),
-            command_bound_ms=None if response is None else response["command"]["bound_ms"],
-            command_ms=None if response is None else response["command"]["measured_ms"],
-            status_ms=None if response is None else response["status"]["measured_ms"],
+            commanded=next(iter(command.get("levels", ())), ""),
+            command_bound_ms=command.get("bound_ms"),
+            command_ms=command.get("measured_ms"),
+            status_ms=response["status"].get("measured_ms"),
             command_age_ms=ages_ms(recording, self._timing, down=True),
             status_age_ms=ages_ms(recording, self._timing, down=False),
             hold=None if self._hold is None else held(recording, self._hold),

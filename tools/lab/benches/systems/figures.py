@@ -1,4 +1,5 @@
-"""The figures by which racks are compared, as plain data."""
+"""The figures by which racks are compared, as plain data: those that a config promises before any
+run, and those of runs."""
 
 from __future__ import annotations
 
@@ -6,13 +7,62 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from rack.boards.config import RackConfig, rack_timing, wire
+from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.lab.benches.cyclictest import MissesBeyond
 from rack.tools.lab.benches.systems.hold import HoldResponse
 from rack.tools.lab.benches.systems.kills import KilledBoards
 from rack.tools.lab.benches.systems.motion import PosesRun
-from rack.tools.lab.benches.systems.prediction import SystemPrediction
 from rack.tools.lab.benches.systems.realtime import BusTraffic, PlanLatency
+
+
+@dataclass(frozen=True)
+class SystemPrediction:
+    """What a config promises, times in ms. `levels` are those of its longest response, the highest
+    first.
+
+    `boards` are the slots that it takes besides the clock's, `hosts` its boards without real time;
+    `processes` are those that it starts. `fits` is None without a budget; `loads` are by core.
+    """
+
+    levels: tuple[str, ...]
+    boards: int
+    hosts: int
+    processes: int
+    rates_hz: tuple[float, ...]
+    longest_cycle_ms: float
+    bound_ms: float
+    sum_ms: float
+    command_ms: float
+    status_ms: float
+    loads: Mapping[int, float]
+    fits: bool | None
+
+
+def prediction(config: RackConfig) -> SystemPrediction:
+    """Return what a config promises."""
+    layout = wire(config)
+    timing = rack_timing(config, layout)
+    forecast = Forecast.of(timing)
+    hierarchy = timing.hierarchy
+    slots = {task.slot for task in layout.tasks}
+    started = [host for host in config.host.values() if not host.external]
+    rates = (1e9 / (every * timing.clock_ns) for every in hierarchy.cycles)
+    return SystemPrediction(
+        levels=hierarchy.levels,
+        boards=len(slots),
+        hosts=len(config.host),
+        processes=len(layout.tasks) + len(started) + 1,  # the clock's
+        rates_hz=tuple(rates),
+        longest_cycle_ms=max(hierarchy.cycles, default=0) * timing.clock_ns * 1e-6,
+        bound_ms=forecast.system.bound_eq_3_2_ms,
+        sum_ms=forecast.system.sum_eq_3_3_ms,
+        command_ms=forecast.system.command_ms,
+        status_ms=forecast.system.status_ms,
+        loads=dict(sorted(forecast.loads.items())),
+        fits=forecast.holds if forecast.levels else None,
+    )
 
 
 @dataclass(frozen=True)

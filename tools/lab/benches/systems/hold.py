@@ -6,12 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout
-from rack.boards.config import RackConfig
+from rack.boards.config import RackConfig, rack_timing, wire
 from rack.boards.config.schema import CommandConfig
 from rack.boards.config.wiring import commandable
 from rack.levels.operator import Operation
 from rack.levels.timing.command_path import CommandPath, command_paths
-from rack.levels.timing.rack import RackTiming
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
 
@@ -44,25 +43,24 @@ class HoldResponse:
         return self.measured_ms is not None and self.measured_ms > self.longest_ms + ROUNDING_MS
 
 
-def hold_paths(config: RackConfig, timing: RackTiming, layout: Layout) -> list[CommandPath]:
+def hold_paths(config: RackConfig) -> list[CommandPath]:
     """Return the paths of a hold from every level that takes one and shows the response, the
     longest first."""
+    layout = wire(config)
     taken = commandable(config)
     paths = [
         path
-        for level, path in command_paths(timing, layout).items()
+        for level, path in command_paths(rack_timing(config, layout), layout).items()
         if Operation.HOLD in taken[level] and _shows(layout, path)
     ]
     return sorted(paths, key=lambda path: (len(path.levels), path.longest), reverse=True)
 
 
-def hold_for(
-    config: RackConfig, timing: RackTiming, layout: Layout, seconds: float
-) -> CommandConfig | None:
+def hold_for(config: RackConfig, seconds: float) -> CommandConfig | None:
     """Return a hold of the highest level that takes one and responds within the run; None: there is
     none."""
     ticks, after = (round(time_s * 1e9 / config.clock_ns) for time_s in (seconds, AFTER_HOLD_S))
-    for path in hold_paths(config, timing, layout):
+    for path in hold_paths(config):
         if (last := ticks - path.longest - after) > 0:
             return CommandConfig(
                 level=path.levels[0], what="hold", tick=min(last, round(BEFORE_HOLD * ticks))

@@ -19,7 +19,7 @@ import numpy as np
 from rack.backplane.layout import Layout
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
-from rack.boards.config import RackConfig, load, rack_timing, wire
+from rack.boards.config import RackConfig, load, wire
 from rack.boards.config.files import CONFIGS, file_at, read
 from rack.boards.config.schema import CommandConfig
 from rack.levels.algebra import Array, norm
@@ -96,12 +96,13 @@ class _Moved:
         """Speed of the fastest joint, rad/s, shape (n,)."""
         return np.asarray(np.abs(self.velocity).max(axis=1))
 
-    def rests_at(self) -> int | None:
-        """Return the tick from which the arm rests for good; None if it moves to the end."""
-        moving = np.flatnonzero(self.speed > REST_RAD_S)
-        if not len(moving):
-            return int(self.tick[0])
-        return None if moving[-1] + 1 == len(self.tick) else int(self.tick[moving[-1] + 1])
+
+def rests_at(tick: np.ndarray, velocity: np.ndarray) -> int | None:
+    """Return the tick from which an arm rests for good; None if it moves to the end."""
+    moving = np.flatnonzero(np.abs(velocity).max(axis=1) > REST_RAD_S)
+    if not len(moving):
+        return int(tick[0])
+    return None if moving[-1] + 1 == len(tick) else int(tick[moving[-1] + 1])
 
 
 def three_poses() -> Array:
@@ -156,7 +157,7 @@ class PosesBench:
         moving = np.abs(moved.target_velocity).max(axis=1) > 0.0
         error = moved.position[moving] - moved.target[moving]
         begins = int(moved.tick[moving][0])
-        rests = moved.rests_at()
+        rests = rests_at(moved.tick, moved.velocity)
         second = self._layout.clock_ns * 1e-9
         still = moved.position[moved.speed <= REST_RAD_S]
         near = [np.abs(still - pose).max(axis=1).min() < NEAR_RAD for pose in three_poses()]
@@ -190,7 +191,7 @@ class PosesBench:
         return max(float(norm(is_at - wanted)) for is_at, wanted in pairs)
 
     def _hold(self, tick: int) -> Stop | None:
-        paths = hold_paths(self._config, rack_timing(self._config, self._layout), self._layout)
+        paths = hold_paths(self._config)
         if not paths:
             return None
         hold = CommandConfig(level=paths[0].levels[0], what="hold", tick=tick)
@@ -203,13 +204,7 @@ class PosesBench:
         rows = observe(config, seconds, self._share, (self._arm,), run.deeds).messages[self._arm]
         after = rows[rows["tick"] >= run.tick]
         velocity = after["message"]["velocity"]
-        moving = np.flatnonzero(np.abs(velocity).max(axis=1) > REST_RAD_S)
-        # It must be seen to rest.
-        rests = (
-            int(after["tick"][moving[-1] + 1])
-            if len(moving) and moving[-1] + 1 < len(after)
-            else None
-        )
+        rests = rests_at(after["tick"], velocity)
         speed = float(np.abs(velocity[0]).max())
         return Stop(by, speed, None if rests is None else (rests - run.tick) * tick_s * 1e3)
 

@@ -52,7 +52,7 @@ def plot(figures: Figures, folder: Path) -> list[Path]:
             by_row("cyclictest: late by a cycle", late, "D")._replace(colour=BASELINE),
         ],
     }
-    drawn = [Diagram("", label, list(series)) for label, series in panels.items()]
+    drawn = [Diagram(label, list(series)) for label, series in panels.items()]
     return draw(folder / "systems", "", drawn, [one.rack for one in figures])
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
-from rack.boards.config import load, rack_timing, wire
+from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.lab.benches.systems.bench import systems
-from rack.tools.lab.benches.systems.figures import SystemFigures
-from rack.tools.lab.benches.systems.prediction import SystemPrediction, prediction
+from rack.tools.lab.benches.systems.figures import SystemFigures, SystemPrediction, prediction
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
 from rack.tools.lab.reproduction.experiments.measured import (
     SYSTEMS,
@@ -19,16 +17,18 @@ from rack.tools.lab.reproduction.experiments.measured import (
 from rack.tools.lab.reproduction.sections.gantt import DISTURBED
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
+    Chapter,
     Columns,
+    Findings,
     Listing,
     Plate,
     Row,
     Ruling,
     Side,
+    Statement,
     code,
     text,
 )
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
 RCCL = "rccl"
 RCCL_RUN = system_experiment(RCCL)
@@ -36,9 +36,7 @@ RCCL_RUN = system_experiment(RCCL)
 
 @cache
 def _promise(name: str) -> SystemPrediction:
-    config = load(name)
-    layout = wire(config)
-    return prediction(config, rack_timing(config, layout), layout)
+    return prediction(load(name))
 
 
 def _promised(workshop: Workshop) -> Side:
@@ -75,7 +73,7 @@ def _promise_row(name: str, said: SystemPrediction) -> Row:
         said.boards,
         said.hosts,
         *times,
-        {True: "yes", False: "NO", None: "-"}[said.fits],
+        said.fits,
     )
 
 
@@ -99,7 +97,7 @@ def _compared(findings: Findings) -> Assessment:
     side: Side = [
         Columns(head, rows, caption),
         Plate(
-            Path(drawn),
+            drawn,
             "Responses with their bounds, ages of messages, and more, system by system.",
         ),
         Listing(

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, rack_timing, wire
+from rack.boards.config import load, wire
 from rack.tools.lab.benches.systems.bench import systems
+from rack.tools.lab.benches.systems.figures import prediction
 from rack.tools.lab.benches.systems.hold import hold_for
-from rack.tools.lab.benches.systems.prediction import prediction
 from tests.boards.conftest import PLAIN
 from tests.boards.vector_racks import JOINTED, NAMES
 from tests.tools.command_line import rack
@@ -33,8 +33,7 @@ def test_the_default_is_nasrem_and_every_bundled_rack_with_a_folder() -> None:
 
 def test_what_a_config_promises_is_read_from_it_alone() -> None:
     config = load("nasrem")
-    layout = wire(config)
-    found = prediction(config, rack_timing(config, layout), layout)
+    found = prediction(config)
     assert found.levels == ("task", "elemental_move", "primitive", "servo")
     assert found.rates_hz == pytest.approx((1, 4, 50, 400))
     # Slots 2 to 7, one of them a planner's; five executors, four planners and the clock.
@@ -48,8 +47,7 @@ def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: P
     path = tmp_path / "lone.toml"
     path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
     config = load(path)
-    layout = wire(config)
-    found = prediction(config, rack_timing(config, layout), layout)
+    found = prediction(config)
     assert (found.levels, found.rates_hz, found.longest_cycle_ms, found.command_ms, found.fits) == (
         (),
         (),
@@ -57,19 +55,17 @@ def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: P
         0,
         None,
     )
-    assert hold_for(config, rack_timing(config, layout), layout, 10.0) is None
+    assert hold_for(config, 10.0) is None
 
 
 def test_the_highest_level_that_responds_within_the_run_is_held() -> None:
     config = load("nasrem")
-    layout = wire(config)
-    timing = rack_timing(config, layout)
-    long, short = (hold_for(config, timing, layout, seconds) for seconds in (10.0, 2.0))
+    long, short = (hold_for(config, seconds) for seconds in (10.0, 2.0))
     assert long is not None
     assert (long.level, long.what, long.tick) == ("task", "hold", 2000)
     assert short is not None
     assert short.level == "elemental_move"
-    assert hold_for(config, timing, layout, 0.1) is None
+    assert hold_for(config, 0.1) is None
 
 
 @pytest.mark.thorough

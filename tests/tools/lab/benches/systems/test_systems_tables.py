@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rack.tools.lab.benches.harness import Absent
-from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures
+from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, SystemPrediction
 from rack.tools.lab.benches.systems.hold import HoldResponse
 from rack.tools.lab.benches.systems.kills import KillDetection, KilledBoards
 from rack.tools.lab.benches.systems.motion import PosesRun, Stop
-from rack.tools.lab.benches.systems.prediction import SystemPrediction
 from rack.tools.lab.benches.systems.realtime import BusTraffic, PlanLatency
 from rack.tools.lab.benches.systems.tables import Systems
 
