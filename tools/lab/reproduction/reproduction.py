@@ -32,17 +32,15 @@ from rack.tools.lab.reproduction.sections import (
     gantt,
     model,
     opening,
-    time,
     timing,
 )
-from rack.tools.lab.reproduction.sections.page import Page, Ruling, plain, text
-from rack.tools.lab.reproduction.sections.statement import Chapter
+from rack.tools.lab.reproduction.sections.page import Chapter, Page, Ruling, plain, text
 
 CHAPTERS: tuple[Chapter, ...] = (
     opening.ABSTRACT,
     opening.INTRODUCTION,
     model.CHAPTER,
-    time.CHAPTER,
+    timing.SOFT,
     timing.RESPONSE,
     timing.LOW,
     timing.HIGH,

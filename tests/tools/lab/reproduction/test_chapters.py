@@ -32,9 +32,8 @@ from rack.tools.lab.reproduction.experiments.measured import (
 )
 from rack.tools.lab.reproduction.experiments.tables import TABLES, FiredRow, TableRun, TableRuns
 from rack.tools.lab.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
-from rack.tools.lab.reproduction.sections import application, model, opening, time
-from rack.tools.lab.reproduction.sections.page import Assessment, Ruling
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings
+from rack.tools.lab.reproduction.sections import application, model, opening, timing
+from rack.tools.lab.reproduction.sections.page import Assessment, Chapter, Findings, Ruling
 from rack.tools.recording.history import Difference
 
 SECTIONS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
@@ -135,7 +134,7 @@ def test_a_time_is_refused_or_met(refused: bool, done_s: float, ruling: Ruling) 
     early = replace(soft, by_s=4.0, done_s=None if refused else 5.0, moved=not refused)
     met = replace(soft, by_s=10.0, done_s=done_s)
     found = GotoRuns((0.0, 0.0, 0.0), soft, early, met)
-    assert judged(time.CHAPTER, "soft-and-real-time", DEADLINE, found).ruling is ruling
+    assert judged(timing.SOFT, "soft-and-real-time", DEADLINE, found).ruling is ruling
 
 
 def test_state_tables_must_answer_the_disturbance() -> None:
@@ -189,7 +188,7 @@ def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None
 
     workshop = Workshop(tmp_path, share=True)
     workshop.prepare()
-    (statement,) = time.CHAPTER.statements
+    (statement,) = timing.SOFT.statements
     unmade = statement.claim(workshop, {})
     failed = statement.claim(workshop, {"goto": "the rack did not run"})
     lacking = statement.claim(

@@ -20,8 +20,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
 )
 from rack.tools.lab.reproduction.sections import timing
 from rack.tools.lab.reproduction.sections.equations import PaperEquation, judged
-from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
-from rack.tools.lab.reproduction.sections.statement import Findings
+from rack.tools.lab.reproduction.sections.page import Columns, Findings, Listing, Ruling
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
 WAY = WayResponse(4.0, Percentiles(1.0, 2.0, 3.0), ())

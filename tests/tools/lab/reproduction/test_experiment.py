@@ -26,7 +26,7 @@ class Times:
     """How often an experiment was made, and its pictures."""
 
     times: int
-    pictures: dict[str, str] = field(default_factory=dict)
+    pictures: dict[str, Path] = field(default_factory=dict)
 
 
 class Counted:

@@ -16,8 +16,7 @@ from rack.tools.lab.reproduction.experiments.figures import (
     sweep,
 )
 from rack.tools.lab.reproduction.sections import gantt
-from rack.tools.lab.reproduction.sections.page import Listing, Plate, Ruling
-from rack.tools.lab.reproduction.sections.statement import Findings
+from rack.tools.lab.reproduction.sections.page import Findings, Listing, Plate, Ruling
 from rack.tools.timing.charts.panel import Count
 
 NOWHERE = Workshop(Path("nowhere"), share=True)
@@ -60,7 +59,7 @@ def document(late: int, jobs: int = 100) -> Document:
     """Return what a run of a figure leaves, with so many late plans."""
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
     patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
-    run = FigureRun(counts, patterns, {}, {"measured": "pictures/x.svg"})
+    run = FigureRun(counts, patterns, {}, {"measured": Path("pictures/x.svg")})
     return gantt.FIG2.experiment.document(run)
 
 

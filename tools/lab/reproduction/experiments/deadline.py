@@ -78,7 +78,7 @@ def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | N
     by = "" if by_s is None else f", by = {by_s!r}"
     program = f'task.action=[{{ do = "goto", position = {place}{by} }}, {{ do = "home" }}]'
     config = workshop.config(NAME, ["clock.mode=lockstep", program])
-    result, recording = workshop.run(label, config, None)
+    result, recording = workshop.run(label, config)
     outcome = result.outcome
     return GotoRun(
         by_s=by_s,

@@ -82,7 +82,7 @@ class Workshop:
         """Return a config under a name of its own. Raises `ConfigError`."""
         return load(name, [*settings, f"name={self.rack}"], faults)
 
-    def run(self, label: str, config: RackConfig, seconds: float | None) -> Recorded:
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
         """Run a rack and return how it went and its recording, which stays in the folder; one of an
         unfinished run is replaced."""
         folder = self.folder / RUNS / label
@@ -93,13 +93,13 @@ class Workshop:
         """Return the path of a picture without its suffix."""
         return self.folder / PICTURES / name
 
-    def shown(self, paths: Sequence[Path]) -> str:
+    def shown(self, paths: Sequence[Path]) -> Path:
         """Return a picture that was drawn, by its path within the folder; the page shows SVG, and
         needs no other."""
         for path in paths:
             if path.suffix != ".svg":
                 path.unlink()
-        return str(next(path for path in paths if path.suffix == ".svg").relative_to(self.folder))
+        return next(path for path in paths if path.suffix == ".svg").relative_to(self.folder)
 
 
 @dataclass(frozen=True)

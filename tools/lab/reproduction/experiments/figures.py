@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rack.boards.config import RackConfig, load, rack_timing, wire
@@ -121,7 +122,7 @@ class FigureRun:
     tasks: dict[str, Count]
     patterns: tuple[PatternCount, ...]
     steal: dict[str, float]
-    pictures: dict[str, str]
+    pictures: dict[str, Path]
 
     def late(self, task: str) -> float:
         """Return the part of a task's jobs that were late."""

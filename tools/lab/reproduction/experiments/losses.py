@@ -43,7 +43,7 @@ def losses_of(script: str, about: str) -> Experiment[LossesRun]:
 
 def _run(script: str, workshop: Workshop) -> LossesRun:
     config = workshop.config(NAME, ["clock.mode=lockstep"], script)
-    result, recording = workshop.run(script, config, None)
+    result, recording = workshop.run(script, config)
     report = faults(recording.events, recording.layout)
     return LossesRun(
         faults=TypeAdapter(tuple[Judgement, ...]).validate_python(report["faults"]),

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from pydantic import TypeAdapter
-
 from rack.boards.config import load, loads
 from rack.boards.config.schema import Mode
 from rack.levels.timing.equations import response_ticks
@@ -17,11 +15,10 @@ from rack.tools.lab.benches import partition, switch
 from rack.tools.lab.benches.boards import responses_of
 from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.observed import Runs, observe
-from rack.tools.lab.benches.response import ResponseRuns, Twin
+from rack.tools.lab.benches.response import ResponseBench, ResponseRuns
 from rack.tools.lab.benches.systems.bench import measure, systems
 from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import (
-    PICTURES,
     Experiment,
     Workshop,
     need_real_time,
@@ -89,47 +86,15 @@ PIPELINE = Experiment(
 )
 
 
-@dataclass(frozen=True)
-class LevelResponse:
-    """Responses to the commands that one level was given, ms."""
-
-    level: str
-    commands: int
-    min_ms: float
-    median_ms: float
-    max_ms: float
-    longest_ms: float
-    sum_eq_3_3_ms: float
-    bound_eq_3_2_ms: float
-    max_from_reading_ms: float
-    off_prediction: int
-
-
-@dataclass(frozen=True)
-class OperatorRun:
-    """Responses to an operator, and runs without one of the commands: `twins`."""
-
-    held: bool
-    measured: int
-    beyond: int
-    off_prediction: int
-    levels: tuple[LevelResponse, ...]
-    twins: tuple[Twin, ...]
-    pictures: dict[str, str]
-
-
-def _response(workshop: Workshop) -> OperatorRun:
-    bench = ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
-    paths = bench.plot(workshop.folder / PICTURES)
-    document = bench.document() | {"pictures": {"response": workshop.shown(paths)}}
-    return TypeAdapter(OperatorRun).validate_python(document)
+def _response(workshop: Workshop) -> ResponseBench:
+    return ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
 
 
 RESPONSE = Experiment(
     "response",
     "holds and resumes by an operator",
     30.0,
-    OperatorRun,
+    ResponseBench,
     lambda: {"config": load(NAME).text(), "commands": COMMANDS, "twins": TWINS, "seed": SEED},
     _response,
 )

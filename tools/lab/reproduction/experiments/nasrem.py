@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -13,6 +14,7 @@ from rack.boards.config import load
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import distribution
 from rack.levels.timing.verdicts import EquationVerdict
+from rack.tools.console.pictures import paths_of
 from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
     Experiment,
@@ -132,7 +134,7 @@ class NasremRun:
     response: SystemResponse
     mailboxes: tuple[MailboxTraffic, ...]
     bus: dict[str, BusAccesses]
-    pictures: dict[str, str]
+    pictures: dict[str, Path]
 
 
 def _run(workshop: Workshop) -> NasremRun:
@@ -140,7 +142,7 @@ def _run(workshop: Workshop) -> NasremRun:
     from rack.tools.timing.analysis.residuals import plot
 
     need_real_time()
-    result, recording = workshop.run(NAME, workshop.config(NAME), None)
+    result, recording = workshop.run(NAME, workshop.config(NAME))
     analysis = Analysis.of(recording)
     analysis = replace(analysis, config=analysis.config.model_copy(update={"name": NAME}))
     stem = workshop.picture("residuals")
@@ -151,7 +153,6 @@ def _run(workshop: Workshop) -> NasremRun:
         for breach in analysis.judged_breaches
         for equation in {one.equation for one in breach.broken}
     )
-    drawn = workshop.shown([stem.with_suffix(".png"), stem.with_suffix(".svg")])
     ticks = result.outcome.ticks
     return NasremRun(
         ticks=ticks,
@@ -169,7 +170,7 @@ def _run(workshop: Workshop) -> NasremRun:
         response=TypeAdapter(SystemResponse).validate_python(analysis.response),
         mailboxes=tuple(_mailbox(recording, name, ticks) for name in recording.mailboxes),
         bus=TypeAdapter(dict[str, BusAccesses]).validate_python(result.tasks),
-        pictures={"residuals": drawn},
+        pictures={"residuals": workshop.shown(paths_of(stem))},
     )
 
 

@@ -58,6 +58,6 @@ TABLES = Experiment(
 
 def _task(workshop: Workshop, label: str, settings: Sequence[str]) -> TableRun:
     config = workshop.config(NAME, ["clock.mode=lockstep", *settings])
-    result, recording = workshop.run(label, config, None)
+    result, recording = workshop.run(label, config)
     rows = TypeAdapter(dict[str, tuple[FiredRow, ...]]).validate_python(fired_rows(recording))
     return TableRun(rows, result.worked)

@@ -16,15 +16,17 @@ from rack.tools.lab.reproduction.experiments.tables import TABLES
 from rack.tools.lab.reproduction.sections.equations import forecast_of
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
+    Chapter,
     Columns,
+    Findings,
     Plate,
     Row,
     Ruling,
     Side,
+    Statement,
     code,
     text,
 )
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 from rack.tools.timing.charts import figure5
 
 NOMINAL = 0.01
@@ -210,7 +212,7 @@ def _figure5(workshop: Workshop) -> Side:
     ]
     caption = f"The levels of {code(NAME)} among the paper's regions."
     return [
-        Plate(Path(path), caption),
+        Plate(path, caption),
         Columns(("level", "cycle", "the figure suggests", "planner here"), rows),
     ]
 
@@ -278,11 +280,10 @@ def _partition_row(partition: str, level: LevelFigures) -> Row:
     age = level.plan_age_ms
     oldest = None if age is None else f"{age['max']:g}"
     fits = [task.fits for task in filter(None, (executor, planner)) if task.fits is not None]
-    verdict = "yes" if all(fits) else "NO"
     return (
         partition,
         level.level,
-        verdict if fits else None,
+        all(fits) if fits else None,
         executor.cycles,
         executor.missed + executor.skipped,
         plans,

@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from rack.boards.config import load
-from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
 from rack.tools.lab.reproduction.experiments.measured import NAME, RESPONSE
 from rack.tools.lab.reproduction.sections.equations import forecast_of
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Plate, Ruling, Side, code
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Chapter,
+    Columns,
+    Findings,
+    Plate,
+    Ruling,
+    Side,
+    Statement,
+    code,
+)
+
+TIMES = (
+    "min_ms",
+    "median_ms",
+    "max_ms",
+    "longest_ms",
+    "sum_eq_3_3_ms",
+    "bound_eq_3_2_ms",
+    "max_from_reading_ms",
+)
+"""Times of a level's responses, in the order of the table."""
 
 
 def _predictable(workshop: Workshop) -> Side:
@@ -25,20 +43,15 @@ def _predictable(workshop: Workshop) -> Side:
 
 def _predictable_tested(findings: Findings) -> Assessment:
     found = findings.of(RESPONSE)
+    response = found.response
     rows = [
         (
-            row.level,
-            row.commands,
-            f"{row.min_ms:g}",
-            f"{row.median_ms:g}",
-            f"{row.max_ms:g}",
-            f"{row.longest_ms:g}",
-            f"{row.sum_eq_3_3_ms:g}",
-            f"{row.bound_eq_3_2_ms:g}",
-            f"{row.max_from_reading_ms:g}",
-            row.off_prediction,
+            row["level"],
+            row["commands"],
+            *(f"{row[name]:g}" for name in TIMES),
+            row["off_prediction"],
         )
-        for row in found.levels
+        for row in response.rows()
     ]
     head = (
         "given to",
@@ -56,22 +69,20 @@ def _predictable_tested(findings: Findings) -> Assessment:
         "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of the"
         " cycle that acts."
     )
+    drawn = findings.workshop.shown(found.plot(findings.workshop.folder / PICTURES))
     side: Side = [
         Columns(head, rows, caption),
-        Plate(
-            Path(found.pictures["response"]),
-            "Responses to commands at each level, with their bounds.",
-        ),
+        Plate(drawn, "Responses to commands at each level, with their bounds."),
     ]
-    if found.held and all(twin.agrees for twin in found.twins):
+    if found.held:
         why = (
-            f"All {found.measured} commands took effect at the predicted tick and within the"
-            " bounds of equations 3.2 and 3.3. In a run without one of them, the torque is the"
+            f"All {len(response.measured)} commands took effect at the predicted tick and within"
+            " the bounds of equations 3.2 and 3.3. In a run without one of them, the torque is the"
             " same until that tick, bit for bit."
         )
         return Assessment(side, Ruling.HOLDS, why)
     why = (
-        f"{found.beyond} responses beyond a bound, {found.off_prediction} not at the"
+        f"{len(response.beyond)} responses beyond a bound, {len(response.off)} not at the"
         " predicted tick."
     )
     return Assessment(side, Ruling.FAILS, why)

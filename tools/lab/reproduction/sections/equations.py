@@ -18,13 +18,16 @@ from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, Measure
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
     Columns,
+    Findings,
     Listing,
+    Row,
     Ruling,
     Side,
+    Statement,
     code,
     text,
+    wording,
 )
-from rack.tools.lab.reproduction.sections.statement import Findings, Statement, wording
 
 SIGNS = {"<": "&lt;", "<=": "≤", "=": "="}
 HEAD = ("of", "left side", "", "right side", "margin", "")
@@ -82,7 +85,7 @@ class PaperEquation:
         return words, Columns(HEAD, [_row(verdict) for verdict in found])
 
 
-def _row(verdict: EquationVerdict) -> tuple[str, ...]:
+def _row(verdict: EquationVerdict) -> Row:
     """Return a row of a table: subject, both sides, margin, and whether it holds."""
     holds = "ok" if verdict.holds else "FAILS"
     return (
@@ -109,8 +112,7 @@ def measured_of(equation: str, found: NasremRun) -> list[MeasuredVerdict]:
 def table_of(verdicts: list[MeasuredVerdict]) -> Columns:
     """Return the measured verdicts as a table: the worst cycle of the run, and whether most cycles
     are better."""
-    mostly = {True: "yes", False: "NO"}
-    rows = [(*_row(verdict.measured), mostly[verdict.mostly]) for verdict in verdicts]
+    rows = [(*_row(verdict.measured), verdict.mostly) for verdict in verdicts]
     return Columns((*HEAD[:-1], "worst cycle", "in 99 of 100"), rows)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
@@ -20,14 +19,16 @@ from rack.tools.lab.reproduction.experiments.figures import (
 )
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
+    Chapter,
     Columns,
+    Findings,
     Listing,
     Plate,
     Ruling,
     Side,
+    Statement,
     code,
 )
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 from rack.tools.timing.charts.letters import column_for, lines
 
 LEAST_X = 1.0
@@ -69,7 +70,7 @@ def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:
     )
     column_ns = column_for(figure.window_ns, figure.schedule().shortest_ns)
     letters = "\n".join(lines(panel, column_ns))
-    return Plate(Path(workshop.shown(paths)), caption), Listing(letters)
+    return Plate(workshop.shown(paths), caption), Listing(letters)
 
 
 def ran(figure: FigureRack, found: FigureRun) -> Side:
@@ -87,7 +88,7 @@ def ran(figure: FigureRack, found: FigureRun) -> Side:
     )
     return [
         Plate(
-            Path(found.pictures["measured"]),
+            found.pictures["measured"],
             f"A run of {code(figure.label)} by real processes, from its middle.",
         ),
         Columns(("", "all", "late", "skipped"), rows, caption),
@@ -151,7 +152,6 @@ def _planning_table(rows: list[Planning]) -> Columns:
         "schedule",
         "in time",
     )
-    in_time = {True: "yes", False: "NO"}
     cells = [
         (
             f"{one.process_ms:g}",
@@ -162,7 +162,7 @@ def _planning_table(rows: list[Planning]) -> Columns:
             _in_cycles(one.permitted),
             ", ".join(one.failing) or "none",
             code(one.pattern),
-            in_time[one.in_time],
+            one.in_time,
         )
         for one in rows
     ]

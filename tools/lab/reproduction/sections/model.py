@@ -21,16 +21,18 @@ from rack.tools.lab.reproduction.sections.flow import between, flow_svg
 from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, MOSTLY
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
+    Chapter,
     Columns,
+    Findings,
     Listing,
     Plate,
     Row,
     Ruling,
     Side,
+    Statement,
     code,
     text,
 )
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
 PAPERS_LOOP = """\
 procedure level()

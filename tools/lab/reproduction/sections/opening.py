@@ -14,14 +14,16 @@ from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM
 from rack.tools.lab.reproduction.sections.page import (
     Assessment,
+    Chapter,
     Columns,
+    Findings,
     Row,
     Ruling,
     Side,
+    Statement,
     code,
     text,
 )
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings, Statement
 
 REAL = "realtime"
 LOCKSTEP = "lockstep"

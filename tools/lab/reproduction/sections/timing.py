@@ -1,10 +1,11 @@
-"""Sections 3.1 to 3.3 of the paper: equations 3.1 to 3.10."""
+"""Section 3 of the paper: soft time and real time, and equations 3.1 to 3.10."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
+from rack.tools.lab.reproduction.experiments.deadline import DEADLINE, TOO_EARLY, GotoRun
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM
 from rack.tools.lab.reproduction.sections.equations import (
@@ -14,8 +15,19 @@ from rack.tools.lab.reproduction.sections.equations import (
     stolen,
     table_of,
 )
-from rack.tools.lab.reproduction.sections.page import Assessment, Columns, Plate, Ruling, Side
-from rack.tools.lab.reproduction.sections.statement import Chapter, Findings
+from rack.tools.lab.reproduction.sections.page import (
+    Assessment,
+    Chapter,
+    Columns,
+    Findings,
+    Plate,
+    Row,
+    Ruling,
+    Side,
+    Statement,
+    code,
+    text,
+)
 
 HURRIED = ("timing.response_ms=1000",)
 """A response within 1 s is demanded of the same four levels."""
@@ -30,6 +42,45 @@ GRID = PaperEquation("3.7", "nasrem", ("board.primitive.rate_hz=60",))
 TIGHT = PaperEquation("3.8", "fig3")
 WITH_PLANNER = PaperEquation("3.9", "fig3", settings_of("fig3", 3.0))
 SMALL = PaperEquation("3.10", "fig2", ("timing.small_share=0.1",))
+
+
+def _goto(workshop: Workshop) -> Side:
+    return [
+        f"A is a pose above the first object's goal, B the start. In a task, {code('by')} is the"
+        " simulated time by which an action must be done. The task's planner rehearses the whole"
+        " program before anything moves and adds up the longest times of planning, waiting for the"
+        " grid, motion and settling. It refuses a time that it cannot promise, and names the"
+        f" earliest that it can. We first run without times, then with {100 * TOO_EARLY:g} % of the"
+        " time that took, then with the time that the refusal names, rounded up to a tenth of a"
+        " second."
+    ]
+
+
+def _goto_tested(findings: Findings) -> Assessment:
+    found = findings.of(DEADLINE)
+    early = found.early
+    met = found.met
+    rows = [_row(run) for run in (found.soft, early, met)]
+    head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
+    side: Side = [Columns(head, rows, f"At A: {list(found.place)} m. Runs in lockstep.")]
+    is_refused = early.done_s is None and not early.moved
+    is_met = met.done_s is not None and met.by_s is not None and met.done_s <= met.by_s
+    if is_refused and is_met:
+        why = (
+            f"By {early.by_s:g} s is refused before anything moves; by {met.by_s:g} s is"
+            f" promised, and done at {met.done_s:g} s. Without a time nothing is promised."
+        )
+        return Assessment(side, Ruling.HOLDS, why)
+    return Assessment(
+        side, Ruling.FAILS, f"Refused when it must be: {is_refused}; met when promised: {is_met}."
+    )
+
+
+def _row(run: GotoRun) -> Row:
+    by = "" if run.by_s is None else f" BY {run.by_s} s"
+    done = "never" if run.done_s is None else f"{run.done_s:g}"
+    moved = "yes" if run.moved else "no"
+    return f"GOTO A{by}, GOTO B", done, moved, text(run.cause), text(run.reason) or "-"
 
 
 def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
@@ -108,12 +159,16 @@ def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         "standard deviation of the residual",
     )
     plate = Plate(
-        Path(found.pictures["residuals"]),
+        found.pictures["residuals"],
         "What the cycles of each level used of R<sub>i</sub>, and &alpha;.",
     )
     return replace(own, measured=[*own.measured, Columns(head, rows), plate])
 
 
+SOFT = Chapter(
+    "3",
+    (Statement("soft-and-real-time", (DEADLINE,), _goto, _goto_tested),),
+)
 RESPONSE = Chapter(
     "3.1",
     (FITS.statement(), BOUND.statement(), SUM.statement(_sum_tested)),
