@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rack.tools.console.tables import decimal, table
+from rack.tools.console.tables import table
 from rack.tools.lab.benches.chart import Diagram, Series, draw
 from rack.tools.lab.benches.cyclictest import BEYOND, MissesBeyond, missed_by, misses_count
 from rack.tools.lab.benches.harness import Absent, BenchResult
@@ -141,14 +141,14 @@ class Boards(BenchResult):
         cycles = ", ".join(map(str, sorted({*one.responses, *one.lockstep_responses})))
         costs = [one.lockstep_us[tree] for tree in self.trees]
         return [
-            str(one.boards),
-            decimal(one.processor_us, 1),
-            decimal(one.processor_us / one.boards, 1),
+            f"{one.boards}",
+            f"{one.processor_us:.1f}",
+            f"{one.processor_us / one.boards:.1f}",
             *one.cells(),
             "held" if one.held else "not held",
             f"{cycles}{'' if one.exact else ' INEXACT'}",
-            *(decimal(cost, 1) for cost in costs),
-            *([decimal(costs[0] / costs[1], 2)] if len(costs) > 1 else []),
+            *(f"{cost:.1f}" for cost in costs),
+            *([f"{costs[0] / costs[1]:.2f}"] if len(costs) > 1 else []),
         ]
 
     def plot(self, folder: Path) -> list[Path]:

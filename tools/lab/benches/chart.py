@@ -59,6 +59,11 @@ class Diagram(NamedTuple):
     is_linear: bool = False
 
 
+def marks(label: str, points: Sequence[tuple[float, float]], look: str = "o") -> Series:
+    """Return a series of points, each a value and a row."""
+    return Series(label, [value for value, _ in points], [row for _, row in points], look)
+
+
 def by_row(
     label: str, values: Sequence[float | None], look: str = "o", lower: float = 0.0
 ) -> Series:
@@ -67,7 +72,7 @@ def by_row(
     Its marks are `lower` by a part of a row.
     """
     known = [(value, row + lower) for row, value in enumerate(values) if value is not None]
-    return Series(label, [value for value, _ in known], [row for _, row in known], look)
+    return marks(label, known, look)
 
 
 def draw(stem: Path, title: str, panels: Sequence[Diagram], rows: Sequence[str] = ()) -> list[Path]:

@@ -57,16 +57,12 @@ class _Arrivals(NamedTuple):
     reads: np.ndarray
 
 
-def exchange_times(recording: Recording) -> list[ExchangeTimes]:
-    """Return the times of every sampled mailbox at each of its readers, in the order of the layout.
+def exchange_times(recording: Recording) -> Iterator[ExchangeTimes]:
+    """Yield the times of every sampled mailbox at each of its readers, in the order of the layout.
 
     Queues, and mailboxes that operators or host boards write, are left out, as are readers that
     left no trace.
     """
-    return list(_all_times(recording))
-
-
-def _all_times(recording: Recording) -> Iterator[ExchangeTimes]:
     layout = recording.layout
     boards = dict[int, BoardInterrupts]()
     tasks = {task.name: task for task in layout.tasks}

@@ -58,7 +58,8 @@ def _run(rack: str, mode: str, scratch: str, share: bool) -> Recorded:
 def _figures(rack: str, mode: str, runs: Sequence[Recorded]) -> HandFigures:
     shifts = [shift for ran in runs if (shift := shift_mm(ran.recording)) is not None]
     misses = [counts(rows) for ran in runs for rows in ran.recording.cycles.values()]
-    costs = np.array([_costs_ms(ran.recording) for ran in runs]).max(axis=0)
+    costs_ms = np.array([_costs_ms(ran.recording) for ran in runs]).max(axis=0).tolist()
+    exchange_ms, process_ms, handler_ms = costs_ms
     return HandFigures(
         rack=rack,
         mode=mode,
@@ -66,9 +67,9 @@ def _figures(rack: str, mode: str, runs: Sequence[Recorded]) -> HandFigures:
         links=tuple(_links([ran.recording for ran in runs])),
         shift_mm=max((most for most, _ in shifts), default=None),
         left_mm=max((left for _, left in shifts), default=None),
-        exchange_ms=float(costs[0]),
-        process_ms=float(costs[1]),
-        handler_ms=float(costs[2]),
+        exchange_ms=exchange_ms,
+        process_ms=process_ms,
+        handler_ms=handler_ms,
         missed=sum(map(sum, misses)),
         cycles=sum(len(rows) for ran in runs for rows in ran.recording.cycles.values()),
         digests=tuple(ran.result.outcome.digest for ran in runs),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rack.tools.console.tables import decimal, table
-from rack.tools.lab.benches.chart import Diagram, Series, draw
+from rack.tools.lab.benches.chart import Diagram, Series, draw, marks
 from rack.tools.lab.benches.harness import BenchResult
 
 NARROW = ("overtaken", "sent", "age p50", "jitter p50", "protocol")
@@ -141,7 +141,9 @@ class HandBench(BenchResult):
                         decimal(link.jitter_max_ms),
                         decimal(link.age_p50_ms),
                         decimal(link.age_max_ms),
-                        *map(str, (link.sent, link.lost, link.overtaken)),
+                        f"{link.sent}",
+                        f"{link.lost}",
+                        f"{link.overtaken}",
                     ]
 
     @property
@@ -169,8 +171,7 @@ class HandBench(BenchResult):
                 for link in one.links
                 if (figure := value(link)) is not None
             ]
-            values = [figure for figure, _ in known]
-            found.append(Series(one.name, values, [row for _, row in known]))
+            found.append(marks(one.name, known))
         return found
 
 
@@ -181,7 +182,7 @@ def _rack_row(one: HandFigures) -> Sequence[str]:
         decimal(one.shift_mm, 2),
         decimal(one.left_mm, 2),
         *(f"{time:.1f}" for time in times),
-        str(one.missed),
-        str(one.cycles),
+        f"{one.missed}",
+        f"{one.cycles}",
         "failed" if one.failure else "done",
     ]

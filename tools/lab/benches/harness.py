@@ -311,7 +311,7 @@ class Comparison(BenchResult):
     def _row(self, sample: Sample) -> list[str]:
         figures = [shown(getattr(sample, name)) for name in ("median", "p99", "best", "worst")]
         ratios = [decimal(self.ratio(sample, name), 2) for name in ("median", "p99")]
-        return [sample.case, sample.who, str(sample.count), *figures, sample.unit, *ratios]
+        return [sample.case, sample.who, f"{sample.count}", *figures, sample.unit, *ratios]
 
     def plot(self, folder: Path) -> list[Path]:
         """Write the comparison into `folder`, a panel a case; return the paths."""

@@ -82,8 +82,8 @@ class LanFigures(BenchResult):
         refused = (
             "" if self.is_fifo else "; SCHED_FIFO is refused, so all run under ordinary scheduling"
         )
-        order = {case: number for number, case in enumerate(baselines)}
-        samples.sort(key=lambda sample: order[sample.case])
+        cases = list(baselines)
+        samples.sort(key=lambda sample: cases.index(sample.case))
         return Comparison("lan", TITLE + lost + refused, tuple(samples), baselines, self.absent)
 
     def document(self) -> dict[str, Any]:

@@ -143,7 +143,7 @@ class Partitions(BenchResult):
                 place = [one.partition, level.level]
                 task = level.executor
                 residuals = _cells(task.residual_ms, "p50", "min")
-                executors.append([*place, *_counts(task), str(task.skipped), *residuals])
+                executors.append([*place, *_counts(task), f"{task.skipped}", *residuals])
                 if (planner := level.planner) is not None:
                     residuals = _cells(planner.residual_ms, "p50", "min")
                     ages = _cells(level.plan_age_ms, "p50", "max")
@@ -260,7 +260,7 @@ def _counts(task: TaskFigures) -> list[str]:
         response = "no bound" if task.predicted_ms is None else f"{task.predicted_ms:.2f}"
     if task.fits is False:
         response += " FAILS"
-    return [f"{task.slice_ms:g}", response, str(task.cycles), str(task.missed)]
+    return [f"{task.slice_ms:g}", response, f"{task.cycles}", f"{task.missed}"]
 
 
 def _cells(found: Distribution | None, *names: str) -> list[str]:

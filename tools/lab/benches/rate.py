@@ -24,7 +24,7 @@ from rack.boards.config.layout import obtained_core
 from rack.levels.timing.trace_times import Distribution, distribution, lateness_ns
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import decimal, figure, table
+from rack.tools.console.tables import figure, table
 from rack.tools.lab.benches.chart import Diagram, Series, draw
 from rack.tools.lab.benches.cyclictest import (
     BEYOND,
@@ -155,10 +155,10 @@ class Rates(BenchResult):
         late_us = [figure(one.lateness_us, name, 0) for name in ("p50", "p99")]
         return [
             f"{one.rate_hz:g}",
-            str(one.cycles),
+            f"{one.cycles}",
             *one.cells(),
             *late_us,
-            decimal(one.processor_us, 0),
+            f"{one.processor_us:.0f}",
             one.verdict,
         ]
 

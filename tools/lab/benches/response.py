@@ -95,10 +95,11 @@ class ResponseBench(BenchResult):
     def lines(self, width: int | None = None) -> Iterator[str]:
         """Yield the figures as text for people, the table fitted to `width`."""
         yield self.response.text(width)
-        beyond, off, measured = (
-            len(getattr(self.response, name)) for name in ("beyond", "off", "measured")
+        found = self.response
+        yield (
+            f"{len(found.beyond)} of {len(found.measured)} beyond a bound, {len(found.off)} not at"
+            " the predicted tick"
         )
-        yield f"{beyond} of {measured} beyond a bound, {off} not at the predicted tick"
         for twin in self.twins:
             where = "nowhere" if twin.differs is None else f"first at tick {twin.differs}"
             command = f"command {twin.serial} to {twin.level}, given at tick {twin.given}"
@@ -247,8 +248,9 @@ def _is_moving(recording: Recording, status: str, tick: int) -> bool:
     shows it."""
     if not {"target_velocity", "torque"} <= recording.fields(status):
         return False
-    ticks, velocities = (recording.signal(status, name) for name in ("tick", "target_velocity"))
-    speed = dict(zip(ticks.tolist(), np.abs(velocities).max(axis=1).tolist(), strict=True))
+    ticks = recording.signal(status, "tick")
+    speeds = np.abs(recording.signal(status, "target_velocity")).max(axis=1)
+    speed = dict(zip(ticks.tolist(), speeds.tolist(), strict=True))
     return all(speed.get(tick + k, 0.0) > MOVING_RAD_S for k in range(-8, 24, 8))
 
 
@@ -271,9 +273,8 @@ def first_difference(first: Recording, second: Recording, status: str) -> int | 
     both runs have."""
     torques = []
     for recording in (first, second):
-        ticks, values = (recording.signal(status, name) for name in ("tick", "torque"))
-        torques.append(
-            {int(tick): value.tobytes() for tick, value in zip(ticks, values, strict=True)}
-        )
+        ticks = recording.signal(status, "tick").tolist()
+        values = [value.tobytes() for value in recording.signal(status, "torque")]
+        torques.append(dict(zip(ticks, values, strict=True)))
     common = sorted(torques[0].keys() & torques[1].keys())
     return next((tick for tick in common if torques[0][tick] != torques[1][tick]), None)

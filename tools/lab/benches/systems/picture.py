@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rack.tools.lab.benches.chart import BASELINE, PALE, Diagram, Series, by_row, draw
+from rack.tools.lab.benches.chart import BASELINE, PALE, Diagram, Series, by_row, draw, marks
 
 if TYPE_CHECKING:
     from rack.tools.lab.benches.systems.figures import SystemFigures
@@ -71,22 +71,20 @@ def _responses(figures: Figures) -> Iterator[Series]:
 def _plans(figures: Figures) -> Iterator[Series]:
     """Yield a mark for each planner: how long until its plan is visible, and computing it took."""
     plans = [(row, plan) for row, one in enumerate(figures) for plan in one.realtime.plans]
-    latency = [plan.latency_ms["max"] for _, plan in plans]
-    yield Series("until visible, longest", latency, [row for row, _ in plans])
-    computed = [(row, plan.computed_ms["max"]) for row, plan in plans if plan.computed_ms]
-    times = [time_ms for _, time_ms in computed]
-    yield Series("computing, longest", times, [row for row, _ in computed], "x")
+    yield marks("until visible, longest", [(plan.latency_ms["max"], row) for row, plan in plans])
+    computed = [(plan.computed_ms["max"], row) for row, plan in plans if plan.computed_ms]
+    yield marks("computing, longest", computed, "x")
 
 
 def _kills(figures: Figures) -> Iterator[Series]:
     """Yield the ticks to detection by a neighbour, a mark a board."""
     kills = [
-        (row, kill.neighbour)
+        (kill.neighbour, row)
         for row, one in enumerate(figures)
         for kill in one.kills.detections
         if kill.neighbour is not None
     ]
-    yield Series("a board killed", [ticks for _, ticks in kills], [row for row, _ in kills])
+    yield marks("a board killed", kills)
 
 
 def _of_poses(figures: Figures, figure: Callable[[PosesRun], float | None]) -> list[float | None]:

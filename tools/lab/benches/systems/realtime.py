@@ -118,7 +118,8 @@ def _of_hosts(recording: Recording) -> Iterator[PlanLatency]:
         bridge = status.partition(".")[0]
         if source.partition(".")[0] not in hosts or status not in recording.mailboxes:
             continue
-        passed, age = (recording.signal(status, f"{entry}.{name}") for name in ("passed", "age"))
+        passed = recording.signal(status, f"{entry}.passed")
+        age = recording.signal(status, f"{entry}.age")
         entered = np.flatnonzero(np.diff(passed, prepend=0) > 0)
         latency_ms = distribution((age[entered] + layout.task(bridge).every) * tick_ms)
         if latency_ms is not None:
@@ -142,7 +143,8 @@ def _ages(recording: Recording, writer: str, reader: str) -> Iterator[np.ndarray
     """Yield the ages in ticks of what one board has of another, cycle by cycle."""
     cycles: np.ndarray = recording.cycles[reader]["tick"]
     for box in mailboxes_along(recording.layout, (writer, reader)):
-        made, visible_at = (recording.signal(box.name, name) for name in ("tick", "visible_at"))
+        made = recording.signal(box.name, "tick")
+        visible_at = recording.signal(box.name, "visible_at")
         grid = recording.layout.read_grid(box, reader)
         # Between two reads the message of the last one grows older.
         since = (cycles - grid.phase) % grid.every

@@ -10,7 +10,7 @@ from textwrap import wrap
 from typing import NamedTuple
 
 from rack.levels.timing.trace_times import Distribution
-from rack.tools.console.tables import decimal, figure, table
+from rack.tools.console.tables import figure, table
 from rack.tools.lab.benches.cyclictest import BEYOND, misses_count
 from rack.tools.lab.benches.harness import Absent, BenchResult, shown
 from rack.tools.lab.benches.systems.figures import SystemFigures
@@ -100,12 +100,12 @@ def _answered(one: SystemFigures) -> Iterator[Sequence[str]]:
 def _stopped(one: SystemFigures) -> Iterator[Sequence[str]]:
     held = ["-"] * 3
     if (hold := one.realtime.hold) is not None:
-        took = hold.fate if hold.measured_ms is None else decimal(hold.measured_ms, 1)
-        held = [hold.level, took, decimal(hold.longest_ms, 1)]
+        took = hold.fate if hold.measured_ms is None else f"{hold.measured_ms:.1f}"
+        held = [hold.level, took, f"{hold.longest_ms:.1f}"]
     moved = [NO_ARM, *["-"] * 3]
     if (run := one.poses) is not None:
         level = "-" if run.hold is None else run.hold.by
-        speed = decimal(run.emergency.speed, 2)
+        speed = f"{run.emergency.speed:.2f}"
         moved = [level, speed, _rests(run.hold), _rests(run.emergency)]
     yield [one.rack, *held, *moved]
 
@@ -117,7 +117,7 @@ def _planned(one: SystemFigures) -> Iterator[Sequence[str]]:
             for found in (plan.latency_ms, plan.computed_ms)
             for key in ("p50", "max")
         ]
-        yield [one.rack, plan.maker, str(plan.made), *times]
+        yield [one.rack, plan.maker, f"{plan.made}", *times]
 
 
 def _unplanned(figures: Sequence[SystemFigures]) -> Iterator[str]:
@@ -132,7 +132,7 @@ def _used(one: SystemFigures) -> Iterator[Sequence[str]]:
     traffic = ran.bus.values()
     accesses = sum(each.accesses for each in traffic), sum(each.bytes for each in traffic)
     bus = (*_accesses(*accesses), name, *_accesses(most.accesses, most.bytes))
-    used = (decimal(sum(ran.loads.values()), 2), _loads(ran.loads), heavy, decimal(share, 2))
+    used = (f"{sum(ran.loads.values()):.2f}", _loads(ran.loads), heavy, f"{share:.2f}")
     yield [one.rack, *bus, *used]
 
 
@@ -154,7 +154,7 @@ def _killed(one: SystemFigures) -> Iterator[Sequence[str]]:
     ticks = [_between([kill.rack for kill in kills.detections])]
     ticks.append(_between([kill.neighbour for kill in seen]))
     speed = f"{shown(kills.speed)}x"
-    yield [one.rack, speed, str(count), *ticks, _ends(ms), *first, *last, str(count - len(seen))]
+    yield [one.rack, speed, f"{count}", *ticks, _ends(ms), *first, *last, f"{count - len(seen)}"]
 
 
 def _noticed(figures: Sequence[SystemFigures]) -> Iterator[str]:
@@ -173,9 +173,9 @@ def _moved(one: SystemFigures) -> Iterator[Sequence[str]]:
         yield [one.rack, NO_ARM, *["-"] * 5]
         return
     # A host board takes as long as it takes, and lockstep does not wait for it.
-    begins = "-" if one.predicted.hosts else decimal(run.begins_s, 2)
-    errors = (decimal(run.rms_mrad), decimal(run.peak_mrad), decimal(run.tool_mm))
-    yield [one.rack, begins, decimal(run.lasts_s, 2), *errors, str(run.reached)]
+    begins = "-" if one.predicted.hosts else f"{run.begins_s:.2f}"
+    errors = (f"{run.rms_mrad:.3f}", f"{run.peak_mrad:.3f}", f"{run.tool_mm:.3f}")
+    yield [one.rack, begins, f"{run.lasts_s:.2f}", *errors, f"{run.reached}"]
 
 
 THEMES = (
@@ -267,7 +267,7 @@ def _ticks(kill: KillDetection) -> int:
 
 
 def _rests(stop: Stop | None) -> str:
-    return "-" if stop is None or stop.rest_ms is None else decimal(stop.rest_ms, 0)
+    return "-" if stop is None or stop.rest_ms is None else f"{stop.rest_ms:.0f}"
 
 
 def _span(times: Distribution | None) -> str:
@@ -276,7 +276,7 @@ def _span(times: Distribution | None) -> str:
 
 def _between(ticks: Sequence[int | None]) -> str:
     """Return the least and the greatest of ticks; "-" where one is unknown."""
-    known = [str(each) for each in sorted(each for each in ticks if each is not None)]
+    known = [f"{each}" for each in sorted(each for each in ticks if each is not None)]
     return (
         _ends(known)
         if len(known) == len(ticks)

@@ -8,7 +8,7 @@ from math import ceil
 
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop, inputs
 from rack.tools.recording.recording import Recording
 
 NAME = "nasrem"
@@ -62,7 +62,7 @@ DEADLINE = Experiment(
     "goto in soft time, and by a time",
     LASTS_S,
     GotoRuns,
-    lambda: {"config": load(NAME).text(), "above": ABOVE_M, "too_early": TOO_EARLY},
+    inputs(NAME, above=ABOVE_M, too_early=TOO_EARLY),
     _run,
 )
 

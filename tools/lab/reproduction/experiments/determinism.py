@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rack.boards.config import load
 from rack.tools.lab.benches.observed import Recorded
-from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop, inputs
 from rack.tools.recording.history import Difference, first_difference, misses
 from rack.tools.recording.recording import Recording
 
@@ -56,7 +55,7 @@ DETERMINISM = Experiment(
     "nasrem twice in lockstep, then in real time",
     LASTS_S,
     ComparedRuns,
-    lambda: {"config": load(NAME).text(), "seconds": SECONDS, "attempts": ATTEMPTS},
+    inputs(NAME, seconds=SECONDS, attempts=ATTEMPTS),
     _run,
 )
 

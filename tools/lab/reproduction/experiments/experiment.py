@@ -130,6 +130,11 @@ class Experiment(Generic[Found]):
         return {"inputs": self.inputs(), "program": program(), "machine": machine()}
 
 
+def inputs(name: str, **settings: object) -> Callable[[], Document]:
+    """Return the `inputs` of an experiment that rests on a config, and on settings of its own."""
+    return lambda: {"config": load(name).text(), **settings}
+
+
 @dataclass(frozen=True)
 class Kept:
     """A result that is kept: what was found, when, in which time; or why nothing can be found on

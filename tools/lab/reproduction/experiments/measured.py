@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from rack.boards.config import load, loads
+from rack.boards.config import loads
 from rack.boards.config.schema import Mode
 from rack.levels.timing.equations import response_ticks
 from rack.tools.console.progress import Progress
@@ -21,6 +21,7 @@ from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
+    inputs,
     need_real_time,
 )
 
@@ -95,7 +96,7 @@ RESPONSE = Experiment(
     "holds and resumes by an operator",
     30.0,
     ResponseBench,
-    lambda: {"config": load(NAME).text(), "commands": COMMANDS, "twins": TWINS, "seed": SEED},
+    inputs(NAME, commands=COMMANDS, twins=TWINS, seed=SEED),
     _response,
 )
 
@@ -110,7 +111,7 @@ PARTITION = Experiment(
     "nasrem with its planners on one core and on two",
     len(partition.PARTITIONS) * (PARTITION_S + LAUNCH_S),
     partition.Partitions,
-    lambda: {"config": load(NAME).text(), "seconds": PARTITION_S},
+    inputs(NAME, seconds=PARTITION_S),
     _partition,
 )
 
@@ -122,7 +123,7 @@ def system_experiment(name: str) -> Experiment[Systems]:
         f"{name} next to the other systems",
         SYSTEM_LASTS_S,
         Systems,
-        lambda: {"config": load(name).text(), "seconds": SYSTEM_S},
+        inputs(name, seconds=SYSTEM_S),
         partial(_system, name),
     )
 

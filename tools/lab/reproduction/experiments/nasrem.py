@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from rack.boards.config import load
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import distribution
 from rack.levels.timing.verdicts import EquationVerdict
@@ -19,6 +18,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
     Experiment,
     Workshop,
+    inputs,
     need_real_time,
 )
 from rack.tools.recording.cycles import Cycles
@@ -179,7 +179,7 @@ NASREM = Experiment(
     "nasrem in real time, its whole task",
     LASTS_S,
     NasremRun,
-    lambda: {"config": load(NAME).text()},
+    inputs(NAME),
     _run,
 )
 

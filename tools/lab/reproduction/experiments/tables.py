@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import TypeAdapter
 
-from rack.boards.config import load
-from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop, inputs
 from rack.tools.recording.history import fired_rows
 
 NAME = "nist-state-table"
@@ -51,7 +50,7 @@ TABLES = Experiment(
     "state tables, with a disturbance and without",
     LASTS_S,
     TableRuns,
-    lambda: {"config": load(NAME).text(), "without": UNDISTURBED},
+    inputs(NAME, without=UNDISTURBED),
     _run,
 )
 
