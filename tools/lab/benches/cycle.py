@@ -273,18 +273,11 @@ def costs(found: Found, baseline: str | None) -> CycleCosts:
 def _ordered(found: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """Return cases and contestants: real time first, in it the empty boards; in each case this tree
     first."""
-    cases = list(dict.fromkeys(case for case, _ in found))
-
-    def place(one: tuple[str, str]) -> tuple[bool, bool, int, bool]:
-        case, who = one
-        return (
-            case.endswith("lockstep"),
-            not case.startswith(EMPTY),
-            cases.index(case),
-            _is_other(who),
-        )
-
-    return sorted(found, key=place)
+    cases = sorted(
+        dict.fromkeys(case for case, _ in found),
+        key=lambda case: (case.endswith("lockstep"), not case.startswith(EMPTY)),
+    )
+    return sorted(found, key=lambda one: (cases.index(one[0]), _is_other(one[1])))
 
 
 def _is_other(who: str) -> bool:

@@ -126,14 +126,15 @@ def _links(runs: Sequence[Recording]) -> Iterator[LinkFigures]:
     """Yield the links of a rack; mailboxes of one message type from or to several boards that do
     the same are one."""
     groups: dict[tuple[str, str, str], list[ExchangeTimes]] = {}
-    periods = {box.name: box.every for run in runs for box in run.layout.mailboxes}
+    # All runs are of one rack.
+    layout = runs[0].layout
+    tick_ms = layout.clock_ns * 1e-6
+    doing = {name: board.executor for name, board in runs[0].rack_config.board.items()}
     for run in runs:
-        doing = {name: board.executor for name, board in run.rack_config.board.items()}
-        types = {box.name: box.message for box in run.layout.mailboxes}
-        tick_ms = run.layout.clock_ns * 1e-6
         for times in exchange_times(run):
             if times.writer in doing and times.reader in doing and times.writer != times.reader:
-                key = types[times.mailbox], doing[times.writer], doing[times.reader]
+                message = layout.mailbox(times.mailbox).message
+                key = message, doing[times.writer], doing[times.reader]
                 groups.setdefault(key, []).append(times)
     for (message, _, _), alike in groups.items():
         yield LinkFigures(
@@ -141,7 +142,7 @@ def _links(runs: Sequence[Recording]) -> Iterator[LinkFigures]:
             writers=spanned(list(dict.fromkeys(times.writer for times in alike))),
             readers=spanned(list(dict.fromkeys(times.reader for times in alike))),
             protocol=alike[0].protocol,
-            period_ms=periods[alike[0].mailbox] * tick_ms,
+            period_ms=layout.mailbox(alike[0].mailbox).every * tick_ms,
             jitter_p50_ms=_most(alike, "jitter_ms", "p50"),
             jitter_max_ms=_most(alike, "jitter_ms", "max"),
             age_p50_ms=_most(alike, "age_ms", "p50"),

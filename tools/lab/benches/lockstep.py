@@ -116,11 +116,9 @@ def speeds(found: Mapping[tuple[str, str], list[float]], names: list[str]) -> Lo
         samples += [replace(sample, case=_limit(rack)) for sample in own]
         baselines[_limit(rack)] = BARE
     title = "Time of a simulated second in lockstep"
-    medians = {key: float(np.median(times_ms)) for key, times_ms in found.items()}
-    return LockstepSpeeds(
-        Comparison("lockstep", title, tuple(samples), baselines),
-        {key: 1e3 / median for key, median in medians.items()},
-    )
+    comparison = Comparison("lockstep", title, tuple(samples), baselines)
+    a_second = {key: float(1e3 / np.median(times_ms)) for key, times_ms in found.items()}
+    return LockstepSpeeds(comparison, a_second)
 
 
 def _limit(rack: str) -> str:
