@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import STATE, Cell
 from rack.tools.viewer.forces import contacts_of
@@ -25,7 +26,7 @@ WORLD = "world"
 SHOWN_GROUPS = 3
 """MuJoCo's own viewer shows groups 0, 1, 2; by convention those above hold collision shapes."""
 TOOL = (CELL, "tool")
-TOOL_COLOUR = (230, 60, 200)
+TOOL_COLOUR = 0xE63CC8FF
 PATH = (CELL, "planned_path")
 WAYPOINTS = (CELL, "way_points")
 GOALS = (CELL, "goals")
@@ -64,8 +65,11 @@ def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -
     for geom in range(model.ngeom):
         shape = shape_of(model, geom)
         if shape is not None:
-            frame = stream.within(frame_of(model, int(model.geom_bodyid[geom])))
-            stream.static(_entity(model, geom, is_shown[geom]), shape, frame)
+            body = int(model.geom_bodyid[geom])
+            name = model.geom(geom).name or f"geom {geom}"
+            group = (CELL,) if is_shown[geom] else (CELL, COLLISION)
+            entity = (*group, model.body(body).name or f"body {body}", name)
+            stream.static(entity, shape, stream.within(frame_of(model, body)))
     for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
         name = frame_of(model, body)
         pose = rr.Transform3D(
@@ -75,12 +79,6 @@ def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -
             child_frame=stream.frame(name),
         )
         stream.static((FRAMES, name), pose)
-
-
-def _entity(model: mujoco.MjModel, geom: int, shown: bool) -> tuple[str, ...]:
-    body = model.body(int(model.geom_bodyid[geom])).name or f"body {model.geom_bodyid[geom]}"
-    name = model.geom(geom).name or f"geom {geom}"
-    return (CELL, body, name) if shown else (CELL, COLLISION, body, name)
 
 
 def set_state(cell: Cell, data: mujoco.MjData, state: np.ndarray) -> None:
@@ -192,14 +190,14 @@ class PlannedPath:
             marks = rr.Points3D(points, radii=POINT_M, colors=[PLANNED])
             self._stream.at(when, WAYPOINTS, marks)
 
-    def _tool(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _tool(self, joints: Array) -> Array:
         """Return the position of the tool at joint positions, (3,), m."""
         self._data.qpos[self._cell.qpos] = joints
         mujoco.mj_kinematics(self._cell.model, self._data)
         return np.array(self._data.site_xpos[self._cell.tool])
 
 
-def in_pieces(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_pieces(corners: Array) -> Array:
     """Return the points of a joint path, (points, joints), with no piece longer than `STEP_RAD`."""
     if len(corners) < 2:
         return corners

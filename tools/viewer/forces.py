@@ -8,8 +8,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
 from rack.tools.viewer.stream import RowBlock, Sampled, Stream
@@ -20,7 +20,7 @@ FORCES = "forces"
 TASK = "task_frame"
 CONTACT = "contact"
 """Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
-ARROW_COLOUR = (0, 230, 255)
+ARROW_COLOUR = 0x00E6FFFF
 LONGEST_M = 1.0
 TOOL_SHAFT_M = 0.014
 """Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show
@@ -44,7 +44,7 @@ class ContactPlace(NamedTuple):
         """Name of the frame in the recording."""
         return f"contact/{self.name}"
 
-    def pose(self, data: mujoco.MjData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
         """Return place, m, and quaternion in `data`."""
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         if self.turned is not None:

@@ -16,7 +16,7 @@ from rack.levels.systems.force.messages import Mode
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, Moment, RowBlock, Stream
-from rack.tools.viewer.style import STATES, style_lane, write_spans
+from rack.tools.viewer.style import STATES, packed, style_lane, write_spans
 
 LEVELS = "levels"
 HIERARCHY = "hierarchy"
@@ -56,14 +56,9 @@ class ValueLane:
             write_spans(self._stream, self._lane, block.times_of(rows), names)
 
 
-def command_name(serial: int) -> str:
-    """Return a command in words; empty without one."""
-    return f"command {serial}" if serial else ""
-
-
-def request_name(serial: int) -> str:
-    """Return a motion request in words; empty without one."""
-    return f"request {serial}" if serial else ""
+def numbered(what: str, serial: int) -> str:
+    """Return a command, or a motion request, in words; empty without one."""
+    return f"{what} {serial}" if serial else ""
 
 
 def move_name(move: tuple[int, int]) -> str:
@@ -184,7 +179,7 @@ class Hierarchy:
         nodes = rr.GraphNodes(
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
-            colors=[STATES[self._shown[task]] for task in self._tasks],
+            colors=packed(STATES[self._shown[task]] for task in self._tasks),
             # A planner's node is next to its board's.
             labels=[task.partition(".")[2] or task for task in self._tasks],
         )

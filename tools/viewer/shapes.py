@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -10,16 +9,44 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Shape = Callable[[mujoco.MjModel, int], rr.AsComponents]
+from rack.levels.algebra import Array
 
 Geom = mujoco.mjtGeom
 
 
 def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
     """Return the shape of a geom; None for one that is invisible."""
-    shape = SHAPES.get(Geom(int(model.geom_type[geom])))
-    return None if shape is None or colour(model, geom)[3] == 0 else shape(model, geom)
+    rgba = colour(model, geom)
+    if rgba[3] == 0:
+        return None
+    size = model.geom_size[geom]
+    radius, half, _ = size
+    solid: dict[str, Any] = {
+        "quaternions": [xyzw(model.geom_quat[geom])],
+        "colors": [rgba],
+        "fill_mode": "solid",
+    }
+    centred = {"centers": [model.geom_pos[geom]], **solid}
+    match Geom(int(model.geom_type[geom])):
+        case Geom.mjGEOM_BOX:
+            return rr.Boxes3D(half_sizes=[size], **centred)
+        case Geom.mjGEOM_SPHERE:
+            return rr.Ellipsoids3D(half_sizes=[[radius] * 3], **centred)
+        case Geom.mjGEOM_ELLIPSOID:
+            return rr.Ellipsoids3D(half_sizes=[size], **centred)
+        case Geom.mjGEOM_CYLINDER:
+            return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **centred)
+        case Geom.mjGEOM_CAPSULE:
+            # MuJoCo's capsule is centred; rerun's begins at its origin.
+            begin = placed(model, geom, np.array([[0.0, 0.0, -half]]))
+            return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **solid)
+        case Geom.mjGEOM_PLANE:
+            return _plane(model, geom)
+        case Geom.mjGEOM_MESH | Geom.mjGEOM_SDF:
+            return _mesh(model, geom)
+        case Geom.mjGEOM_HFIELD:
+            return _height_field(model, geom)
+    return None
 
 
 def colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
@@ -29,50 +56,9 @@ def colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
     return np.asarray(np.round(rgba * 255), dtype=np.uint8)
 
 
-def xyzw(quaternions: Floats) -> Floats:
+def xyzw(quaternions: Array) -> Array:
     """Return MuJoCo's quaternions, w first, as rerun's, w last; shape (..., 4)."""
     return np.roll(quaternions, -1, axis=-1)
-
-
-def _solid(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
-    """Return orientation and colour of a solid geom."""
-    return {
-        "quaternions": [xyzw(model.geom_quat[geom])],
-        "colors": [colour(model, geom)],
-        "fill_mode": "solid",
-    }
-
-
-def _centred(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
-    """Return the same, and the centre of the solid."""
-    return {"centers": [model.geom_pos[geom]], **_solid(model, geom)}
-
-
-def _box(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    return rr.Boxes3D(half_sizes=[model.geom_size[geom]], **_centred(model, geom))
-
-
-def _sphere(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    radius = model.geom_size[geom][0]
-    return rr.Ellipsoids3D(half_sizes=[[radius] * 3], **_centred(model, geom))
-
-
-def _ellipsoid(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    return rr.Ellipsoids3D(half_sizes=[model.geom_size[geom]], **_centred(model, geom))
-
-
-def _cylinder(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    radius, half, _ = model.geom_size[geom]
-    return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **_centred(model, geom))
-
-
-def _capsule(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    radius, half, _ = model.geom_size[geom]
-    # MuJoCo's capsule is centred; rerun's begins at its origin.
-    begin = placed(model, geom, np.array([[0.0, 0.0, -half]]))
-    return rr.Capsules3D(
-        lengths=[2 * half], radii=[radius], translations=begin, **_solid(model, geom)
-    )
 
 
 def _plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
@@ -103,7 +89,7 @@ def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
 
 
 def _surface(
-    model: mujoco.MjModel, geom: int, vertices: Floats, triangles: NDArray[np.integer]
+    model: mujoco.MjModel, geom: int, vertices: Array, triangles: NDArray[np.integer]
 ) -> rr.AsComponents:
     # Flat shading: every triangle has corners of its own, so that an edge stays an edge.
     corners = placed(model, geom, vertices)[triangles]
@@ -118,21 +104,8 @@ def _surface(
     )
 
 
-def placed(model: mujoco.MjModel, geom: int, points: Floats) -> Floats:
+def placed(model: mujoco.MjModel, geom: int, points: Array) -> Array:
     """Return points of a geom's frame in the frame of its body, (points, 3), m."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     return np.asarray(model.geom_pos[geom] + points @ rotation.reshape(3, 3).T)
-
-
-SHAPES: dict[mujoco.mjtGeom, Shape] = {
-    Geom.mjGEOM_PLANE: _plane,
-    Geom.mjGEOM_HFIELD: _height_field,
-    Geom.mjGEOM_SPHERE: _sphere,
-    Geom.mjGEOM_CAPSULE: _capsule,
-    Geom.mjGEOM_ELLIPSOID: _ellipsoid,
-    Geom.mjGEOM_CYLINDER: _cylinder,
-    Geom.mjGEOM_BOX: _box,
-    Geom.mjGEOM_MESH: _mesh,
-    Geom.mjGEOM_SDF: _mesh,
-}

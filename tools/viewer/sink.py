@@ -42,10 +42,9 @@ from rack.tools.viewer.levels import (
     FiredRows,
     Hierarchy,
     ValueLane,
-    command_name,
     mode_name,
     move_name,
-    request_name,
+    numbered,
 )
 from rack.tools.viewer.parts import next_file
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
@@ -217,13 +216,14 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         and "id" in names
         and mailbox.message not in (*STREAMED, *STREAMED_DOWN)
     ):
-        parts.append(ValueLane(stream, (board, port), "id", command_name).write)
+        parts.append(ValueLane(stream, (board, port), "id", partial(numbered, "command")).write)
     if names.issuperset(FIRED):
         parts.append(FiredRows(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
         parts.append(ValueLane(stream, (board, "move"), ["current", "verb"], move_name).write)
     if mailbox.message in (MOTION_STATUS.name, SERVER_STATUS.name):
-        parts.append(ValueLane(stream, (board, "request"), "current", request_name).write)
+        name = partial(numbered, "request")
+        parts.append(ValueLane(stream, (board, "request"), "current", name).write)
     if mailbox.message == SERVER_STATUS.name:
         parts.append(ValueLane(stream, (board, "mode"), "mode", mode_name).write)
     if mailbox.message not in (

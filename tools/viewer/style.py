@@ -5,40 +5,41 @@ rerun marks the archetype of lanes as unstable, so it is used only here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from rack.tools.viewer.stream import Moment, Stream
 
-Colour = tuple[int, int, int, int]
-"""Red, green, blue, alpha, 0 to 255."""
+Colour = int
+"""0xRRGGBBAA."""
 
 _JOINTS: tuple[Colour, ...] = (
-    (86, 180, 233, 255),
-    (230, 159, 0, 255),
-    (0, 190, 140, 255),
-    (240, 228, 66, 255),
-    (204, 121, 167, 255),
-    (213, 94, 0, 255),
-    (150, 140, 255, 255),
+    0x56B4E9FF,
+    0xE69F00FF,
+    0x00BE8CFF,
+    0xF0E442FF,
+    0xCC79A7FF,
+    0xD55E00FF,
+    0x968CFFFF,
 )
 """Distinguishable without red or green vision (Okabe and Ito)."""
-COMMANDED: Colour = (130, 130, 130, 160)
-LIMIT: Colour = (200, 60, 60, 110)
-PLANNED: Colour = (255, 200, 40, 255)
-GOAL: Colour = (70, 210, 90, 255)
-CURRENT: Colour = (255, 110, 40, 255)
-FORCE: Colour = (240, 60, 60, 255)
-LOST: Colour = (230, 50, 50, 255)
+COMMANDED: Colour = 0x828282A0
+LIMIT: Colour = 0xC83C3C6E
+PLANNED: Colour = 0xFFC828FF
+GOAL: Colour = 0x46D25AFF
+CURRENT: Colour = 0xFF6E28FF
+FORCE: Colour = 0xF03C3CFF
+LOST: Colour = 0xE63232FF
 
-_GREY: Colour = (110, 110, 120, 255)
-_BLUE: Colour = (70, 140, 230, 255)
-_GREEN: Colour = (70, 180, 90, 255)
-_YELLOW: Colour = (230, 180, 60, 255)
-_ORANGE: Colour = (240, 140, 30, 255)
-_RED: Colour = (220, 50, 50, 255)
+_GREY: Colour = 0x6E6E78FF
+_BLUE: Colour = 0x468CE6FF
+_GREEN: Colour = 0x46B45AFF
+_YELLOW: Colour = 0xE6B43CFF
+_ORANGE: Colour = 0xF08C1EFF
+_RED: Colour = 0xDC3232FF
 STATES: dict[str, Colour] = {
     "idle": _GREY,
     "executing": _BLUE,
@@ -46,7 +47,7 @@ STATES: dict[str, Colour] = {
     "holding": _YELLOW,
     "error": _RED,
     "missed": _ORANGE,
-    "lost": (120, 20, 20, 255),
+    "lost": 0x781414FF,
 }
 EVENT_COLOURS: dict[str, Colour] = {
     "launch": _GREY,
@@ -55,19 +56,19 @@ EVENT_COLOURS: dict[str, Colour] = {
     "stop": _ORANGE,
     "end": _GREEN,
     "died": _RED,
-    "fault": (190, 90, 210, 255),
+    "fault": 0xBE5AD2FF,
     "detection": _ORANGE,
-    "reaction": (220, 90, 60, 255),
+    "reaction": 0xDC5A3CFF,
     "recovery": _GREEN,
 }
 """By kind; the viewer picks a colour for any other."""
 PHASES: dict[str, Colour] = {
-    "wait": (60, 62, 70, 255),
-    "read": (90, 170, 220, 255),
+    "wait": 0x3C3E46FF,
+    "read": 0x5AAADCFF,
     "process": _GREEN,
-    "plan": (150, 110, 220, 255),
+    "plan": 0x966EDCFF,
     "write": _YELLOW,
-    "missed": (230, 50, 50, 255),
+    "missed": 0xE63232FF,
 }
 
 
@@ -78,7 +79,13 @@ def of_joint(at: int) -> Colour:
 
 def dimmed(colour: Colour) -> Colour:
     """Return a colour of which less is seen."""
-    return (*colour[:3], 110)
+    return colour & ~0xFF | 110
+
+
+def packed(colours: Iterable[Colour]) -> np.ndarray:
+    """Return colours as rerun takes any number of them: three or four plain numbers are one colour
+    to it."""
+    return np.array(list(colours), np.uint32)
 
 
 def style_lane(
@@ -88,11 +95,9 @@ def style_lane(
 
     The viewer picks a colour for any other state.
     """
-    names = list(colours)
-    labels = [" " if name in quiet else name for name in names]
-    stream.static(
-        entity, rr.StateConfiguration(values=names, labels=labels, colors=list(colours.values()))
-    )
+    labels = [" " if name in quiet else name for name in colours]
+    shades = packed(colours.values())
+    stream.static(entity, rr.StateConfiguration(values=list(colours), labels=labels, colors=shades))
 
 
 def style_curves(
@@ -104,7 +109,8 @@ def style_curves(
 ) -> None:
     """Set names, colours and widths of an entity's curves; without colours the viewer picks
     them."""
-    stream.static(entity, rr.SeriesLines(names=names, colors=colours, widths=widths))
+    shades = None if colours is None else packed(colours)
+    stream.static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
 
 
 def write_spans(

@@ -159,8 +159,7 @@ def test_the_graph_of_boards_shows_who_is_lost_until_it_is_back(
 
     names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
     nodes = read(folder / "run.rrd", "/hierarchy", "GraphNodes:colors")
-    red, green, blue, alpha = STATES["lost"]
-    lost = red << 24 | green << 16 | blue << 8 | alpha
+    lost = STATES["lost"]
     at = names.index("upper")
     seen = {int(tick): row.ravel()[at] for tick, row in zip(nodes.ticks, nodes.values, strict=True)}
     ticks = [tick for tick, colour in seen.items() if colour == lost]
