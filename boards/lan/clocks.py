@@ -24,6 +24,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
+from rack.boards.lan.keys import ping_key, pong_key
 from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.peers import NONE, PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
@@ -168,7 +169,7 @@ class Responder:
         """Answer from now on."""
         self._link = link
         self._sealer = sealer
-        link.on(f"rack/*/ping/{self._rack}", self._on_ping)
+        link.on(ping_key("*", self._rack), self._on_ping)
 
     def _on_ping(self, ping: Arrived) -> None:
         received = monotonic_ns()
@@ -179,7 +180,7 @@ class Responder:
             if received < (again or 0) or (again is None and len(self._again) == MOST_ASKERS):
                 self.withheld += 1
                 return
-            head = self._sealer.opened(ping.key, ping.envelope, ping.payload)
+            head = self._sealer.opened(*ping)
             if isinstance(head, Flaw) or head.kind != _PING_KIND:
                 self.refused += 1
                 return
@@ -188,7 +189,7 @@ class Responder:
             self._answer(asker, head, received)
 
     def _answer(self, asker: str, ping: Envelope, received: int) -> None:
-        key = f"rack/{self._rack}/pong/{asker}"
+        key = pong_key(self._rack, asker)
         words = self._words
         if asker not in self._put:
             self._put[asker] = self._link.publish(key)
@@ -222,13 +223,10 @@ class Clocks:
         self.responder.open(link, sealer)
         # A tuple is whole or not there: no lock is needed.
         link.on(
-            f"rack/*/pong/{self._rack}", lambda pong: self._arrived.append((monotonic_ns(), pong))
+            pong_key("*", self._rack), lambda pong: self._arrived.append((monotonic_ns(), pong))
         )
         for rack, clock in self._clocks.items():
-            clock.put = link.publish(self._ping_key(rack))
-
-    def _ping_key(self, to: str) -> str:
-        return f"rack/{self._rack}/ping/{to}"
+            clock.put = link.publish(ping_key(self._rack, rack))
 
     def exchange(self) -> None:
         """Take the answers that have come, and ask again where it is time."""
@@ -237,9 +235,10 @@ class Clocks:
         for clock in self._clocks.values():
             clock.begin()
         for _ in range(len(self._arrived)):
-            is_taken = self._is_taken(*self._arrived.popleft())
-            self.taken = self.taken + is_taken
-            self.refused = self.refused + (not is_taken)
+            if self._is_taken(*self._arrived.popleft()):
+                self.taken += 1
+            else:
+                self.refused += 1
         self._now_ns = now = monotonic_ns()
         for rack, clock in self._clocks.items():
             if clock.peer.is_there and now >= clock.due_ns:
@@ -255,11 +254,11 @@ class Clocks:
             del clock.sent[next(iter(clock.sent))]
         clock.sent[self._serial] = sent = monotonic_ns()
         head = Envelope(_PING_KIND, self._launch, self._serial, self._serial, 0, 0, sent)
-        clock.put(b"", self._sealer.seal(self._ping_key(rack), head, b""))
+        clock.put(b"", self._sealer.seal(ping_key(self._rack, rack), head, b""))
 
     def _is_taken(self, arrived_ns: int, pong: Arrived) -> bool:
         """Take an answer; return False for one that is damaged, or to nothing that was asked."""
-        head = self._sealer.opened(pong.key, pong.envelope, pong.payload)
+        head = self._sealer.opened(*pong)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
             return False
         clock = self._clocks.get(pong.key.split("/")[1])

@@ -74,18 +74,15 @@ class Credentials:
     def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
         """Yield what is wrong with each file, now. `addresses` are those at which others reach this
         rack."""
-        authorities: list[Certificate] = []
-        chain: list[Certificate] = []
-        try:
-            authorities = _certificates(self.authority)
-        except Credential as flaw:
-            yield flaw
-        try:
-            chain = _certificates(self.certificate)
-        except Credential as flaw:
-            yield flaw
-        else:
-            yield from self._flaws_of(chain, authorities, addresses)
+        found: dict[Path, list[Certificate]] = {self.authority: [], self.certificate: []}
+        for path in found:
+            try:
+                found[path] = _certificates(path)
+            except Credential as flaw:
+                yield flaw
+        chain = found[self.certificate]
+        if chain:
+            yield from self._flaws_of(chain, found[self.authority], addresses)
         try:
             key = _public_part(self.key)
             if chain and key != chain[0].public_key():

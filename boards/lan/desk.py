@@ -204,7 +204,7 @@ class Desk:
         """Write its counts into the group of a status; in lockstep none, since they do not depend
         on ticks alone."""
         if not self._grid.is_lockstep:
-            fill_counts(record, (self.count.answered, self.count.refused, self.count.dropped))
+            fill_counts(record, vars(self.count).values())
 
     def _checked(self, question: Question, right: Right) -> Asked | None:
         """Return a question with its parts; None if it is malformed, unsigned or oversized."""
@@ -223,7 +223,9 @@ class Desk:
             return Code.NOT_PERMITTED, b""
         if asked.head.kind != VERSION:
             return Code.OTHER_VERSION, b""
-        self._renew(asked)
+        for waiting in self._waiting:
+            if waiting.session == (asked.asker, asked.head.launch):
+                waiting.until_ns = self._until_ns()
         match asked.what:
             case "stop":
                 return self._stop(asked.asker)
@@ -321,11 +323,6 @@ class Desk:
 
     def _until_ns(self) -> int:
         return time.monotonic_ns() + round(CLIENT_S * 1e9)
-
-    def _renew(self, asked: Asked) -> None:
-        for waiting in self._waiting:
-            if waiting.session == (asked.asker, asked.head.launch):
-                waiting.until_ns = self._until_ns()
 
     def _dismiss(self) -> None:
         """Let go of requests that have been issued, and withdraw those of clients that are gone."""

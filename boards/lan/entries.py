@@ -64,7 +64,7 @@ class Export:
         before = self._source.serial
         self._source.read(tick)
         if self._source.serial == self.serial != before:
-            self.sent = self.sent - 1
+            self.sent -= 1
             self.serial = before
             self.exchange(tick)
 
@@ -78,7 +78,7 @@ class Export:
         if not reading.is_there:
             return
         if source.serial != self.serial:
-            self.sent = self.sent + 1
+            self.sent += 1
             self.serial = source.serial
         elif not self.is_asked or grid.is_lockstep:
             return
@@ -184,7 +184,7 @@ class Import:
     def _opened(self, arrived: Arrived) -> Envelope | None:
         """Return the head of what came, if it may be a message of this mailbox; else count that it
         was refused."""
-        head = self._sealer.opened(arrived.key, arrived.envelope, arrived.payload)
+        head = self._sealer.opened(*arrived)
         is_fit = len(arrived.payload) == len(self._buffer.raw)
         if (
             not isinstance(head, Flaw)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import zenoh
 
@@ -47,6 +47,11 @@ class Arrived(NamedTuple):
     key: str
     envelope: bytes | None
     payload: bytes
+
+    @classmethod
+    def of(cls, sample: zenoh.Sample) -> Self:
+        """Return what a sample of the network holds."""
+        return cls(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
 
 
 class Carrier(Protocol):
@@ -117,29 +122,14 @@ class LanLink:
         oldest first."""
         subscriber = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(unread))
         self._kept.append(subscriber)
-        take = subscriber.try_recv
-
-        def arrived() -> Iterator[Arrived]:
-            # No more than may wait: a flood must not keep the cycle.
-            for _ in range(unread):
-                if (sample := take()) is None:
-                    return
-                yield Arrived(
-                    str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()
-                )
-
-        return arrived
+        return lambda: map(Arrived.of, _waiting(subscriber, unread))
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
         """Call a function in a thread of the network with everything that comes under a key
         expression, at once."""
 
         def take(sample: zenoh.Sample) -> None:
-            callback(
-                Arrived(
-                    str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes()
-                )
-            )
+            callback(Arrived.of(sample))
 
         # Direct: a thread between would add its wake-up, and a queue without a bound.
         self._kept.append(
@@ -156,9 +146,7 @@ class LanLink:
         self._kept.append(queryable)
 
         def questions() -> Iterator[Question]:
-            for _ in range(unread):
-                if (query := queryable.try_recv()) is None:
-                    return
+            for query in _waiting(queryable, unread):
                 with query:
                     asked = str(query.key_expr)
                     content = _bytes_of(query.payload) or b""
@@ -183,9 +171,7 @@ class LanLink:
         self._kept.append(subscriber)
 
         def changes() -> Iterator[tuple[str, int, bool]]:
-            for _ in range(unread):
-                if (sample := subscriber.try_recv()) is None:
-                    return
+            for sample in _waiting(subscriber, unread):
                 key = str(sample.key_expr)
                 if (found := launch_and_cycle(key)) is not None:
                     yield key.split("/")[1], found[0], sample.kind == zenoh.SampleKind.PUT
@@ -195,6 +181,15 @@ class LanLink:
     def close(self) -> None:
         """Leave the network: others see it at once."""
         self.session.close()  # type: ignore[no-untyped-call]
+
+
+def _waiting(channel: Any, most: int) -> Iterator[Any]:
+    """Yield what waits in a channel, oldest first."""
+    # No more than may wait: a flood must not keep the cycle.
+    for _ in range(most):
+        if (found := channel.try_recv()) is None:
+            return
+        yield found
 
 
 def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:
@@ -208,53 +203,52 @@ def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 def _settings(
     rack: str, table: LanTable, credentials: Credentials | None, asks: bool
 ) -> zenoh.Config:
-    config = zenoh.Config()
-
-    def put(key: str, value: Any) -> None:
-        config.insert_json5(key, json.dumps(value))
-
-    put("mode", "peer")
-    # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it leaves
-    # there.
-    for key in ("scouting/multicast", "scouting/gossip", "transport/shared_memory", "adminspace"):
-        put(f"{key}/enabled", False)
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
-    put("listen/endpoints", [f"{endpoint}{timed}" for endpoint in table.listen])
-    put("connect/endpoints", list(table.connect))
-    put("connect/timeout_ms", -1)
-    put("connect/exit_on_failure", False)
-    # A peer that is not there yet keeps nobody: opening would wait for it for half a second.
-    put("open/return_conditions/connect_scouted", False)
     shortest, longest = RETRY_MS
-    put(
-        "connect/retry",
-        {"period_init_ms": shortest, "period_max_ms": longest, "period_increase_factor": 1},
-    )
-    put("access_control", access_control(rack, table, asks))
+    protocols = {endpoint.protocol for _, endpoint in table.endpoints}
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it
+        # leaves there.
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "adminspace/enabled": False,
+        "listen/endpoints": [f"{endpoint}{timed}" for endpoint in table.listen],
+        "connect/endpoints": list(table.connect),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        # A peer that is not there yet keeps nobody: opening would wait for it for half a second.
+        "open/return_conditions/connect_scouted": False,
+        "connect/retry": {
+            "period_init_ms": shortest,
+            "period_max_ms": longest,
+            "period_increase_factor": 1,
+        },
+        "access_control": access_control(rack, table, asks),
+        "transport/link/protocols": sorted(protocols) or ["tcp"],
+        # Whoever opens a connection and says no more is forgotten; these many at once are borne.
+        "transport/unicast/accept_timeout": HANDSHAKE_MS,
+        "transport/unicast/open_timeout": HANDSHAKE_MS,
+        "transport/link/rx/max_message_size": (
+            max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES
+        ),
+        "transport/link/tx/lease": round(table.lease_ms),
+        "transport/link/tx/keep_alive": KEEP_ALIVES,
+        "transport/link/tx/queue/size/real_time": 16,
+        # An answer takes over the congestion control of its question: whoever asks must not make
+        # the adapter wait.
+        "qos/network": [NO_WAIT],
+        # What does wait for room, in lockstep, waits no longer than until the peer counts as lost.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
+            table.lease_ms * 1e3
+        ),
+    }
     if credentials is not None and table.has_tls:
-        put("transport/link/tls", _tls(credentials))
-    put(
-        "transport/link/protocols",
-        sorted({endpoint.protocol for _, endpoint in table.endpoints}) or ["tcp"],
-    )
-    # Whoever opens a connection and says no more is forgotten; these many at once are borne.
-    put("transport/unicast/accept_timeout", HANDSHAKE_MS)
-    put("transport/unicast/open_timeout", HANDSHAKE_MS)
-    put(
-        "transport/link/rx/max_message_size",
-        max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES,
-    )
-    put("transport/link/tx/lease", round(table.lease_ms))
-    put("transport/link/tx/keep_alive", KEEP_ALIVES)
-    put("transport/link/tx/queue/size/real_time", 16)
-    # An answer takes over the congestion control of its question: whoever asks must not make the
-    # adapter wait.
-    put("qos/network", [NO_WAIT])
-    # What does wait for room, in lockstep, waits no longer than until the peer counts as lost.
-    put(
-        "transport/link/tx/queue/congestion_control/block/wait_before_close",
-        round(table.lease_ms * 1e3),
-    )
+        settings["transport/link/tls"] = _tls(credentials)
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
     return config
 
 

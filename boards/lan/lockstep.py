@@ -23,7 +23,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from queue import Empty, SimpleQueue
 from typing import NoReturn
 
@@ -153,7 +152,8 @@ class Barrier:
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields what others have sent under a key expression up to this
         cycle, once."""
-        return partial(_emptied, self._imports.setdefault(key, deque()))
+        waiting = self._imports.setdefault(key, deque())
+        return lambda: (waiting.popleft() for _ in range(len(waiting)))
 
     def changes(self) -> Iterator[tuple[str, int, bool]]:
         """Yield rack, launch, and whether it has come or gone, since the last call."""
@@ -243,10 +243,9 @@ class Barrier:
             if (found := launch_and_cycle(key)) is not None:
                 self._note_sign(partner, *found, sample.kind == zenoh.SampleKind.PUT)
             return
-        content = sample.payload.to_bytes()
-        envelope = sample.attachment
-        head = self._sealer.opened(key, None if envelope is None else envelope.to_bytes(), content)
-        step = None if isinstance(head, Flaw) else unpack_step(head, content)
+        arrived = Arrived.of(sample)
+        head = self._sealer.opened(*arrived)
+        step = None if isinstance(head, Flaw) else unpack_step(head, arrived.payload)
         if step is not None and self._is_of(partner, step.launch):
             self._note_step(partner, step)
 
@@ -319,8 +318,3 @@ class Barrier:
         if is_there != partner.is_there or self._is_first:
             partner.is_there = is_there
             self._changes.append((partner.rack, partner.launch, is_there))
-
-
-def _emptied(waiting: deque[Arrived]) -> Iterator[Arrived]:
-    while waiting:
-        yield waiting.popleft()

@@ -7,11 +7,17 @@ from collections.abc import Iterable
 
 from rack.backplane.message import Field, MessageType, status
 
+
+def _counts(**meanings: str) -> tuple[Field, ...]:
+    """Return a field for each count: its name, and what is counted."""
+    return tuple(Field(name, "u4", "1", meaning) for name, meaning in meanings.items())
+
+
 EXPORT = MessageType(
     "lan_export",
     1,
     (
-        Field("sent", "u4", "1", "messages sent"),
+        *_counts(sent="messages sent"),
         Field("serial", "i8", "1", "serial of the newest message sent; 0: none"),
     ),
 )
@@ -19,19 +25,18 @@ IMPORT = MessageType(
     "lan_import",
     1,
     (
-        Field("taken", "u4", "1", "messages passed to the backplane"),
-        Field("missing", "u4", "1", "messages sent that never came, or came after a later one"),
-        Field("disordered", "u4", "1", "messages that came after a later one, and were not passed"),
-        Field("repeated", "u4", "1", "messages that came twice"),
-        Field("late", "u4", "1", "messages older than max_age_ms when they came"),
-        Field(
-            "refused",
-            "u4",
-            "1",
-            "messages refused: malformed, unsigned, oversized, or not what its type permits",
+        *_counts(
+            taken="messages passed to the backplane",
+            missing="messages sent that never came, or came after a later one",
+            disordered="messages that came after a later one, and were not passed",
+            repeated="messages that came twice",
+            late="messages older than max_age_ms when they came",
+            refused=(
+                "messages refused: malformed, unsigned, oversized, or not what its type permits"
+            ),
+            unknown_launch="messages of a launch that is over, or not there",
+            superseded="messages that a newer one overtook before the exchange",
         ),
-        Field("unknown_launch", "u4", "1", "messages of a launch that is over, or not there"),
-        Field("superseded", "u4", "1", "messages that a newer one overtook before the exchange"),
         Field(
             "launch",
             "i8",
@@ -47,55 +52,29 @@ IMPORT = MessageType(
 FLAWS = MessageType(
     "lan_flaws",
     1,
-    (
-        Field(
-            "malformed",
-            "u4",
-            "1",
-            "not of this protocol, or of another version of it; in lockstep always 0",
-        ),
-        Field(
-            "unsigned",
-            "u4",
-            "1",
-            "changed on the way, under another key, or sealed with another secret; likewise",
-        ),
-        Field("oversized", "u4", "1", "longer than most_bytes; likewise"),
+    _counts(
+        malformed="not of this protocol, or of another version of it; in lockstep always 0",
+        unsigned="changed on the way, under another key, or sealed with another secret; likewise",
+        oversized="longer than most_bytes; likewise",
     ),
 )
 CLOCKS = MessageType(
     "lan_clocks",
     1,
-    (
-        Field("taken", "u4", "1", "round trips measured"),
-        Field("answered", "u4", "1", "pings of other racks answered"),
-        Field(
-            "withheld", "u4", "1", "pings not answered: they came too fast, or from too many racks"
-        ),
-        Field(
-            "refused",
-            "u4",
-            "1",
-            "pings and answers refused: malformed, unsigned, or to nothing that was asked",
-        ),
+    _counts(
+        taken="round trips measured",
+        answered="pings of other racks answered",
+        withheld="pings not answered: they came too fast, or from too many racks",
+        refused="pings and answers refused: malformed, unsigned, or to nothing that was asked",
     ),
 )
 DESK = MessageType(
     "lan_desk",
     1,
-    (
-        Field(
-            "answered",
-            "u4",
-            "1",
-            "questions from other machines that were answered; in lockstep always 0",
-        ),
-        Field(
-            "refused", "u4", "1", "questions refused: not permitted, or not to be done; likewise"
-        ),
-        Field(
-            "dropped", "u4", "1", "questions dropped: malformed, unsigned or oversized; likewise"
-        ),
+    _counts(
+        answered="questions from other machines that were answered; in lockstep always 0",
+        refused="questions refused: not permitted, or not to be done; likewise",
+        dropped="questions dropped: malformed, unsigned or oversized; likewise",
     ),
 )
 

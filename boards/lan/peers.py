@@ -100,7 +100,7 @@ class PeerRack:
             self.presence = Presence.LOST
             self.since = tick
             self.confirm_by = -1
-            self.losses = self.losses + 1
+            self.losses += 1
             self.offset_ns = None
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 

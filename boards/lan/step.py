@@ -4,7 +4,7 @@ exports then."""
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -39,12 +39,11 @@ class Step(NamedTuple):
     exports: tuple[Arrived, ...]
 
 
-def pack_step(cycle_ns: int, racks: Iterable[str], exports: Iterable[Arrived]) -> bytes:
+def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[Arrived]) -> bytes:
     """Return the content of a step."""
     names = "\n".join(racks).encode()
-    found = list(exports)
-    parts = [_HEAD.pack(cycle_ns, len(names), len(found)), names]
-    for export in found:
+    parts = [_HEAD.pack(cycle_ns, len(names), len(exports)), names]
+    for export in exports:
         key = export.key.encode()
         envelope = export.envelope or b""
         parts += [
