@@ -149,21 +149,7 @@ def _builder(
 ) -> x509.CertificateBuilder:
     path_length = 0 if signs_certificates else None
     constraints = x509.BasicConstraints(ca=signs_certificates, path_length=path_length)
-    return (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - EARLIER)
-        .not_valid_after(expires)
-        .add_extension(constraints, critical=True)
-        .add_extension(_usage(signs_certificates), critical=True)
-    )
-
-
-def _usage(signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
+    usage = x509.KeyUsage(
         digital_signature=not signs_certificates,
         content_commitment=False,
         key_encipherment=False,
@@ -173,6 +159,17 @@ def _usage(signs_certificates: bool) -> x509.KeyUsage:
         crl_sign=signs_certificates,
         encipher_only=False,
         decipher_only=False,
+    )
+    return (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - EARLIER)
+        .not_valid_after(expires)
+        .add_extension(constraints, critical=True)
+        .add_extension(usage, critical=True)
     )
 
 

@@ -179,7 +179,8 @@ class Questioner:
             if self._launches.get(asked.rack) != asked.launch:
                 raise Failure(f"{rack} has ended, or is out of reach")
             if returned >= DENIED and not timed_out:
-                raise Failure(f"rack '{asked.rack}' {self._denied(question.what)}")
+                why = not_permitted(self._asker, NEEDED[question.what])
+                raise Failure(f"rack '{asked.rack}' {why}")
             if time.monotonic() > deadline:
                 why = "its adapter does not cycle; does `rack step` hold it?"
                 raise Failure(f"{rack} has not answered for {PATIENCE_S:g} s: {why}")
@@ -197,14 +198,11 @@ class Questioner:
             return None
         return DeskAnswer.unpacked(payload)
 
-    def _denied(self, what: What) -> str:
-        return not_permitted(self._asker, NEEDED[what])
-
     def _granted(self, rack: str, what: What, answer: DeskAnswer) -> DeskAnswer:
         if answer.code is Code.GRANTED:
             return answer
         reasons = {
-            Code.NOT_PERMITTED: self._denied(what),
+            Code.NOT_PERMITTED: not_permitted(self._asker, NEEDED[what]),
             Code.OTHER_VERSION: (
                 f"is of another version; this program asks racks of version {VERSION}"
             ),
