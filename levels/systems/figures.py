@@ -8,29 +8,25 @@ from typing import Annotated
 
 from pydantic import Field as Parameter
 
-from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.backplane.message import Message, MessageType, State, status
 from rack.backplane.process import compute_until
 from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
+from rack.levels.systems.fields import tick
 from rack.levels.tables import Table, read_params
 
 FIGURE_PLAN = MessageType(
     "figure_plan",
     1,
     (
-        Field("made_at", "i8", "tick", "release that the plan answers"),
-        Field(
-            "cycle",
-            "i8",
-            "tick",
-            "cycle of the executor whose status the plan rests on; -1: none was there",
-        ),
+        tick("made_at", "release that the plan answers"),
+        tick("cycle", "cycle of the executor whose status the plan rests on; -1: none was there"),
     ),
 )
 FIGURE_STATUS = status(
     "figure_status",
     1,
-    Field("cycle", "i8", "tick", "release of this cycle"),
-    Field("plan", "i8", "tick", "release that the plan in force answers; -1: there is none yet"),
+    tick("cycle", "release of this cycle"),
+    tick("plan", "release that the plan in force answers; -1: there is none yet"),
 )
 
 NS_PER_MS = 1e6

@@ -11,6 +11,7 @@ from enum import IntEnum
 from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.messages import OPERATED, Error
 from rack.levels.operator import MAX_JOINTS, Goal
+from rack.levels.systems.fields import by_joint, flag, number, real
 
 OBJECT_BYTES = 32
 """Longest name of an object that an order can give."""
@@ -64,30 +65,24 @@ ACTION_FIELDS = (
     Field("action", "u1", OrderAction, "what to do"),
     Field("object", f"S{OBJECT_BYTES}", "ASCII", "object of a transfer"),
     Field("goal", "u1", Goal, "form of a goto's goal: joints, pose or direction"),
-    Field(
-        "position",
-        "f8",
-        "m",
-        "where a transfer takes the object's origin, or a goto the tool",
-        (3,),
-    ),
-    Field("turned", "u1", "1", "1: a transfer turns the object to `yaw`; 0: any turn"),
-    Field("yaw", "f8", "rad", "turn of the object's x axis about the vertical"),
-    Field("lift", "f8", "m", "height of a transfer's straight motions"),
-    Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
-    Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
-    Field("count", "u1", "1", "joints that follow"),
-    Field("joints", "f8", "rad", "joint positions, for goal joints", (MAX_JOINTS,)),
-    Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
+    real("position", "m", "where a transfer takes the object's origin, or a goto the tool", 3),
+    flag("turned", "1: a transfer turns the object to `yaw`; 0: any turn"),
+    real("yaw", "rad", "turn of the object's x axis about the vertical"),
+    real("lift", "m", "height of a transfer's straight motions"),
+    real("quaternion", "1", "of the tool, for goal pose", 4),
+    real("direction", "1", "of the tool's z axis, for goal direction", 3),
+    flag("count", "joints that follow"),
+    real("joints", "rad", "joint positions, for goal joints", MAX_JOINTS),
+    real("by", "s", "simulated time by which it must be done; 0: any time"),
 )
 """An action; `by` is the time of the rack that wrote the message."""
 
 CELL_ORDER = command(
     "cell_order",
     1,
-    Field("program", "u4", "1", "checksum of the program that the order is of"),
+    number("program", "checksum of the program that the order is of"),
     Field("what", "u1", OrderVerb, "ask, do, cancel: all of the order `id`; end"),
-    Field("hold", "u1", "1", "1: the arm rests on its path while it does an order"),
+    flag("hold", "1: the arm rests on its path while it does an order"),
     Field(
         "reason",
         "S120",
@@ -100,33 +95,26 @@ CELL_ORDER = command(
 CELL_REPORT = status(
     "cell_report",
     1,
-    Field("program", "u4", "1", "as in the order that is echoed"),
+    number("program", "as in the order that is echoed"),
     Field(
         "response",
         "u1",
         Response,
         "the answer to it; `reason`: of a refusal or failure, else of waiting",
     ),
-    Field(
+    real(
         "earliest",
-        "f8",
         "s",
         "earliest end, simulated time of the rack that gave the order; 0: not known",
     ),
-    Field(
+    real(
         "until",
-        "f8",
         "s",
         "in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
     ),
     Field("moves_done", "u2", "1", "elemental moves of the order done"),
     Field("moves", "u2", "1", "elemental moves of the order; 0 before it begins"),
-    Field(
-        "halted",
-        "u1",
-        "1",
-        "1: moves were withdrawn, the arm is held until it begins another order",
-    ),
+    flag("halted", "1: moves were withdrawn, the arm is held until it begins another order"),
     OPERATED,
     errors=Error,
 )
@@ -135,20 +123,17 @@ CELL_REQUEST = MessageType(
     "cell_request",
     1,
     (
-        Field("id", "u4", "1", "serial of the plan wanted; 0: none yet"),
-        Field("program", "u4", "1", "as in the order that it serves"),
-        Field("order", "u4", "1", "that order"),
-        Field(
-            "begin", "f8", "s", "simulated time at which it must be possible to begin; 0: at once"
-        ),
-        Field(
+        number("id", "serial of the plan wanted; 0: none yet"),
+        number("program", "as in the order that it serves"),
+        number("order", "that order"),
+        real("begin", "s", "simulated time at which it must be possible to begin; 0: at once"),
+        real(
             "ahead",
-            "f8",
             "s",
             "simulated time of the rack that gave the order, in which `by` is, less that here",
         ),
-        Field("revision", "u4", "1", "of the world model then"),
-        Field("start", "f8", "rad", "where the arm rested then", ("joints",)),
+        number("revision", "of the world model then"),
+        by_joint("start", "rad", "where the arm rested then"),
         *ACTION_FIELDS,
     ),
 )
@@ -163,7 +148,7 @@ CELL_PROGRESS = MessageType(
         Field("attempt", "u2", "1", "times that the present step was asked for before"),
         Field("error", "u2", Error, "why the program ends early; 0: it does not"),
         Field("reason", "S120", "ASCII", "the error, readable"),
-        Field("ending", "f8", "s", "simulated time since when the arms are ended; 0: not yet"),
+        real("ending", "s", "simulated time since when the arms are ended; 0: not yet"),
         Field("moves", "u2", "1", "elemental moves of the steps done"),
     ),
 )

@@ -13,6 +13,7 @@ from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.systems.fields import flag, number, real, tick
 from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, state_of
 
 AXES = 6
@@ -22,19 +23,16 @@ WRENCH = MessageType(
     "wrench",
     1,
     (
-        Field("tick", "i8", "tick", "tick at which it was sensed"),
-        Field(
+        tick("tick", "tick at which it was sensed"),
+        real(
             "wrench",
-            "f8",
             "N, N m",
             "of the contact, at the tool, in the world's frame, without weights",
-            (AXES,),
+            AXES,
         ),
-        Field("sample", "f8", "N, N m", "as the sensor gives it, in the sensor's frame", (AXES,)),
-        Field("saturated", "u1", "1", "1: the sensor is at the end of its range"),
-        Field(
-            "exceeded", "u4", "1", "cycles in which the contact was beyond the arm's force limits"
-        ),
+        real("sample", "N, N m", "as the sensor gives it, in the sensor's frame", AXES),
+        flag("saturated", "1: the sensor is at the end of its range"),
+        number("exceeded", "cycles in which the contact was beyond the arm's force limits"),
     ),
 )
 """From the board of an arm with a wrist sensor, in every cycle."""
@@ -43,23 +41,16 @@ COMPLIANCE = command(
     "compliance",
     1,
     RESTS_ON,
-    Field("active", "u1", "1", "1: some axis is one of force, or guarded; 0: motion alone"),
-    Field("frame", "f8", "1", "orientation of the task frame in the world, w, x, y, z", (4,)),
-    Field("selected", "u1", "1", "1: an axis of force; 0: of motion", (AXES,)),
-    Field(
-        "wrench",
-        "f8",
-        "N, N m",
-        "wanted of the tool on the surroundings, on the axes of force",
-        (AXES,),
-    ),
-    Field("speed", "f8", "m/s, rad/s", "most on the axes of force, both ways", (AXES,)),
-    Field(
+    flag("active", "1: some axis is one of force, or guarded; 0: motion alone"),
+    real("frame", "1", "orientation of the task frame in the world, w, x, y, z", 4),
+    flag("selected", "1: an axis of force; 0: of motion", AXES),
+    real("wrench", "N, N m", "wanted of the tool on the surroundings, on the axes of force", AXES),
+    real("speed", "m/s, rad/s", "most on the axes of force, both ways", AXES),
+    real(
         "guard",
-        "f8",
         "N, N m",
         "wrench, either way, at which motion ends; 0: the axis is not guarded",
-        (AXES,),
+        AXES,
     ),
 )
 """From the motion server to the level of hybrid control. `id` rises with every change; a guard
@@ -69,18 +60,14 @@ FORCE_STATUS = status(
     "force_status",
     1,
     *ANSWER,
-    Field("sensed", "i8", "tick", "tick of the wrench; -1: none yet"),
-    Field("wrench", "f8", "N, N m", "of the contact, at the tool, in the task frame", (AXES,)),
-    Field("wanted", "f8", "N, N m", "on the axes of force; others 0", (AXES,)),
-    Field("selected", "u1", "1", "1: an axis of force", (AXES,)),
-    Field(
-        "offset",
-        "f8",
-        "m",
-        "from where the motion alone would have the tool to where it is commanded",
-        (3,),
+    tick("sensed", "tick of the wrench; -1: none yet"),
+    real("wrench", "N, N m", "of the contact, at the tool, in the task frame", AXES),
+    real("wanted", "N, N m", "on the axes of force; others 0", AXES),
+    flag("selected", "1: an axis of force", AXES),
+    real(
+        "offset", "m", "from where the motion alone would have the tool to where it is commanded", 3
     ),
-    Field("struck", "u4", "1", "id of the newest command whose guard was struck; 0: none"),
+    number("struck", "id of the newest command whose guard was struck; 0: none"),
     Field("axis", "i2", "1", "axis on which that was; -1: none"),
 )
 """From the level of hybrid control to the motion server."""
@@ -90,30 +77,20 @@ SERVER_REQUEST = MessageType(
     1,
     (
         *MOTION_REQUEST.fields,
-        Field("frame", "f8", "1", "task frame of COMPLY and GUARD, as in COMPLIANCE", (4,)),
-        Field(
-            "selected",
-            "u1",
-            "1",
-            "of COMPLY, 1: an axis of force; none: motion alone, no guard",
-            (AXES,),
-        ),
-        Field(
-            "wrench", "f8", "N, N m", "of COMPLY: wanted of the tool on the surroundings", (AXES,)
-        ),
-        Field(
+        real("frame", "1", "task frame of COMPLY and GUARD, as in COMPLIANCE", 4),
+        flag("selected", "of COMPLY, 1: an axis of force; none: motion alone, no guard", AXES),
+        real("wrench", "N, N m", "of COMPLY: wanted of the tool on the surroundings", AXES),
+        real(
             "speed",
-            "f8",
             "m/s, rad/s",
             "of COMPLY: most on the axes of force; 0: the level's default",
-            (AXES,),
+            AXES,
         ),
-        Field(
+        real(
             "guard",
-            "f8",
             "N, N m",
             "of GUARD: wrench, either way, that ends a segment; 0: not guarded",
-            (AXES,),
+            AXES,
         ),
     ),
 )
@@ -150,17 +127,13 @@ SERVER_STATUS = MessageType(
     (
         *MOTION_STATUS.fields,
         Field("mode", "u1", Mode, "motion, force, or what is left of it without a client"),
-        Field("place", "f8", "m", "tool position as sensed", (3,)),
-        Field("quaternion", "f8", "1", "tool orientation as sensed, w, x, y, z", (4,)),
-        Field("frame", "f8", "1", "orientation of the task frame, w, x, y, z", (4,)),
-        Field(
-            "wrench", "f8", "N, N m", "of the tool on the surroundings, in the task frame", (AXES,)
-        ),
-        Field(
-            "wanted", "f8", "N, N m", "the same as wanted, on the axes of force; others 0", (AXES,)
-        ),
-        Field("selected", "u1", "1", "1: an axis of force", (AXES,)),
-        Field("guarded", "u4", "1", "newest request that a guard has ended; 0: none yet"),
+        real("place", "m", "tool position as sensed", 3),
+        real("quaternion", "1", "tool orientation as sensed, w, x, y, z", 4),
+        real("frame", "1", "orientation of the task frame, w, x, y, z", 4),
+        real("wrench", "N, N m", "of the tool on the surroundings, in the task frame", AXES),
+        real("wanted", "N, N m", "the same as wanted, on the axes of force; others 0", AXES),
+        flag("selected", "1: an axis of force", AXES),
+        number("guarded", "newest request that a guard has ended; 0: none yet"),
         Field("axis", "i2", "1", "axis on which that was; -1: none yet"),
     ),
 )

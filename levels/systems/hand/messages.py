@@ -15,6 +15,7 @@ from enum import IntEnum
 from rack.backplane.message import Field, command, status
 from rack.backplane.words import Demand
 from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.systems.fields import by_joint, flag, number, real, tick
 
 FLEXOR = 0
 EXTENSOR = 1
@@ -42,23 +43,18 @@ class GraspKind(IntEnum):
 
 
 MOTION = (
-    Field("position", "f8", "rad", "joint positions", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
+    by_joint("position", "rad", "joint positions"),
+    by_joint("velocity", "rad/s", "joint velocities"),
 )
-DRIVEN = Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",))
-SENSED = Field("sensed", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet")
+DRIVEN = flag("driven", "1: the joint is one of this board's", "joints")
+SENSED = tick("sensed", "tick of the hand's status that it rests on; -1: none yet")
 
 TENSION_COMMAND = command(
     "tension_command",
     1,
     RESTS_ON,
-    Field(
-        "sampled",
-        "i8",
-        "tick",
-        "tick of the hand's status that it rests on; -1: none yet, so no tension",
-    ),
-    Field("tension", "f8", "N", "of the tendons of the board's own joints", (2, "joints")),
+    tick("sampled", "tick of the hand's status that it rests on; -1: none yet, so no tension"),
+    real("tension", "N", "of the tendons of the board's own joints", 2, "joints"),
     DRIVEN,
 )
 """From the boards of tendon loops to the board of the hand."""
@@ -67,21 +63,19 @@ HAND_STATUS = status(
     "hand_status",
     1,
     *ANSWER,
-    Field("tick", "i8", "tick", "tick at which the hand was sensed"),
+    tick("tick", "tick at which the hand was sensed"),
     *MOTION,
-    Field("torque", "f8", "N m", "of the tendons on the joints", ("joints",)),
-    Field("tension", "f8", "N", "of the tendons, as sensed", (2, "joints")),
-    Field("wanted", "f8", "N", "tensions commanded of the valves", (2, "joints")),
-    Field("force", "f8", "N", "of the surroundings on the fingertips, as sensed", ("fingers", 3)),
-    Field("holding", "u1", "1", "1: no fresh tensions: the valves are closed"),
-    Field(
-        "stopped", "u1", "1", "1: tensions are not followed: a demand, an operator, or a lost board"
-    ),
+    by_joint("torque", "N m", "of the tendons on the joints"),
+    real("tension", "N", "of the tendons, as sensed", 2, "joints"),
+    real("wanted", "N", "tensions commanded of the valves", 2, "joints"),
+    real("force", "N", "of the surroundings on the fingertips, as sensed", "fingers", 3),
+    flag("holding", "1: no fresh tensions: the valves are closed"),
+    flag("stopped", "1: tensions are not followed: a demand, an operator, or a lost board"),
     Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
-    Field("clipped", "u4", "1", "cycles in which a tension was cut to its limits"),
-    Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
-    Field("violations", "u4", "1", "substeps in which a tendon drove a joint beyond a limit"),
-    Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+    number("clipped", "cycles in which a tension was cut to its limits"),
+    number("touches", "unintended contacts, counted at every substep"),
+    number("violations", "substeps in which a tendon drove a joint beyond a limit"),
+    number("pushed", "substeps in which a blow pushed a joint beyond a limit"),
 )
 """From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
 
@@ -89,8 +83,8 @@ TENDON_TORQUE = command(
     "tendon_torque",
     1,
     RESTS_ON,
-    Field("sampled", "i8", "tick", "tick of the hand's status that it rests on; -1: none yet"),
-    Field("torque", "f8", "N m", "of the joints", ("joints",)),
+    tick("sampled", "tick of the hand's status that it rests on; -1: none yet"),
+    by_joint("torque", "N m", "of the joints"),
 )
 """From the joint loop to the tendon loop."""
 
@@ -98,22 +92,18 @@ FINGER_TARGET = command(
     "finger_target",
     1,
     RESTS_ON,
-    Field("active", "u1", "1", "0: no target yet, hold"),
+    flag("active", "0: no target yet, hold"),
     *MOTION,
-    Field(
-        "stiff",
-        "f8",
-        "1",
-        "part of the joint loop's stiffness that acts, 0 to 1; its damping acts",
-        ("joints",),
+    by_joint(
+        "stiff", "1", "part of the joint loop's stiffness that acts, 0 to 1; its damping acts"
     ),
-    Field("torque", "f8", "N m", "in addition: of the forces of tips", ("joints",)),
-    Field(
+    by_joint("torque", "N m", "in addition: of the forces of tips"),
+    real(
         "spring",
-        "f8",
         "N m/rad",
         "in addition: stiffness of tips, by joint and joint",
-        ("joints", "joints"),
+        "joints",
+        "joints",
     ),
 )
 """From the fingertip loop to the joint loop."""
@@ -122,20 +112,14 @@ GRASP_TARGET = command(
     "grasp_target",
     1,
     RESTS_ON,
-    Field("active", "u1", "1", "0: no target yet, hold"),
+    flag("active", "0: no target yet, hold"),
     Field("mode", "u1", FingerMode, "how each finger is controlled", ("fingers",)),
-    Field("position", "f8", "rad", "joint positions, for JOINTS", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities, for JOINTS", ("joints",)),
-    Field("tip", "f8", "m", "points of the tips, for POINT and FORCE", ("fingers", 3)),
-    Field("tip_velocity", "f8", "m/s", "their velocities", ("fingers", 3)),
-    Field("stiffness", "f8", "N/m", "of each tip about its point, for FORCE", ("fingers",)),
-    Field(
-        "force",
-        "f8",
-        "N",
-        "of each tip on the surroundings, at its point, for FORCE",
-        ("fingers", 3),
-    ),
+    by_joint("position", "rad", "joint positions, for JOINTS"),
+    by_joint("velocity", "rad/s", "joint velocities, for JOINTS"),
+    real("tip", "m", "points of the tips, for POINT and FORCE", "fingers", 3),
+    real("tip_velocity", "m/s", "their velocities", "fingers", 3),
+    real("stiffness", "N/m", "of each tip about its point, for FORCE", "fingers"),
+    real("force", "N", "of each tip on the surroundings, at its point, for FORCE", "fingers", 3),
 )
 """From the grasp loop to the fingertip loop, or to the boards of fingers."""
 
@@ -145,12 +129,10 @@ LOOP_STATUS = status(
     *ANSWER,
     DRIVEN,
     SENSED,
-    Field("clipped", "u4", "1", "cycles in which a torque was cut to what tendons can give"),
-    Field("holding", "u1", "1", "1: no fresh command from above: what was commanded last is kept"),
-    Field(
+    number("clipped", "cycles in which a torque was cut to what tendons can give"),
+    flag("holding", "1: no fresh command from above: what was commanded last is kept"),
+    flag(
         "stopped",
-        "u1",
-        "1",
         "1: commands are not followed: the hand is stopped, or an operator holds the loop",
     ),
 )
@@ -160,18 +142,15 @@ FINGER_STATUS = status(
     "finger_status",
     1,
     *ANSWER,
-    Field("driven", "u1", "1", "1: the finger is one of this board's", ("fingers",)),
+    flag("driven", "1: the finger is one of this board's", "fingers"),
     SENSED,
-    Field("position", "f8", "rad", "joint positions, from the hand's status", ("joints",)),
-    Field("target", "f8", "rad", "joint positions wanted", ("joints",)),
-    Field("tip", "f8", "m", "points of the tips", ("fingers", 3)),
-    Field("force", "f8", "N", "of the surroundings on the tips", ("fingers", 3)),
-    Field("holding", "u1", "1", "1: no fresh target: the fingers stay"),
-    Field(
-        "stopped",
-        "u1",
-        "1",
-        "1: targets are not followed: the hand is stopped, or an operator holds a loop",
+    by_joint("position", "rad", "joint positions, from the hand's status"),
+    by_joint("target", "rad", "joint positions wanted"),
+    real("tip", "m", "points of the tips", "fingers", 3),
+    real("force", "N", "of the surroundings on the tips", "fingers", 3),
+    flag("holding", "1: no fresh target: the fingers stay"),
+    flag(
+        "stopped", "1: targets are not followed: the hand is stopped, or an operator holds a loop"
     ),
 )
 """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp loop."""
@@ -183,15 +162,15 @@ GRASP_STATUS = status(
     Field("step", "u2", "1", "steps of the program that are done"),
     Field("steps", "u2", "1", "steps of the program"),
     Field("kind", "u1", GraspKind, "of the step under way"),
-    Field("passed", "f8", "s", "time for which that step is under way"),
+    real("passed", "s", "time for which that step is under way"),
     Field("object", "i2", "1", "row of the object grasped, in the world model; -1: none"),
-    Field("touching", "u1", "1", "1: the finger touches the object", ("fingers",)),
-    Field("grip", "f8", "N", "internal force of the finger that opposes the others; they share it"),
-    Field("load", "f8", "N", "that the grasp makes up for: weight and pull", (3,)),
-    Field("anchor", "f8", "m", "where the object is to be", (3,)),
-    Field("moved", "f8", "m", "distance of the object from there"),
-    Field("farthest", "f8", "m", "largest such distance since the object was gripped"),
-    Field("plan", "u4", "1", "id of the grasp plan in use; 0: none"),
+    flag("touching", "1: the finger touches the object", "fingers"),
+    real("grip", "N", "internal force of the finger that opposes the others; they share it"),
+    real("load", "N", "that the grasp makes up for: weight and pull", 3),
+    real("anchor", "m", "where the object is to be", 3),
+    real("moved", "m", "distance of the object from there"),
+    real("farthest", "m", "largest such distance since the object was gripped"),
+    number("plan", "id of the grasp plan in use; 0: none"),
 )
 """From the grasp loop. Points and forces are in the frame of the palm."""
 
@@ -200,23 +179,13 @@ GRASP_PLAN = command(
     1,
     RESTS_ON,
     Field("object", "i2", "1", "row of the object in the world model"),
-    Field("sensed", "i8", "tick", "tick of the world model that it rests on"),
-    Field("posture", "f8", "rad", "joint positions from which the fingers close", ("joints",)),
-    Field(
-        "contact",
-        "f8",
-        "m",
-        "of each tip, on the object's surface, in the object's frame",
-        ("fingers", 3),
+    tick("sensed", "tick of the world model that it rests on"),
+    by_joint("posture", "rad", "joint positions from which the fingers close"),
+    real(
+        "contact", "m", "of each tip, on the object's surface, in the object's frame", "fingers", 3
     ),
-    Field(
-        "normal",
-        "f8",
-        "1",
-        "direction of each tip's force there, in the object's frame",
-        ("fingers", 3),
-    ),
-    Field("grip", "f8", "N", "force of each finger; the opposing one bears their sum"),
+    real("normal", "1", "direction of each tip's force there, in the object's frame", "fingers", 3),
+    real("grip", "N", "force of each finger; the opposing one bears their sum"),
 )
 """From a planner, on a board or on the host side, to the grasp loop: where the fingers take hold of
 an object, and from which posture they close. The newest with an `id` above 0 counts."""

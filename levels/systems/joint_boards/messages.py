@@ -18,30 +18,25 @@ begins again where they hold the arm.
 
 from __future__ import annotations
 
-from rack.backplane.message import Field, command, status
+from rack.backplane.message import command, status
 from rack.levels.messages import DRIVEN_ARM, JOINT_SET_POINT, SERVO_STATUS
 from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.systems.fields import by_joint, flag, real, tick
 
 JOINT_REFERENCE = command(
     "joint_reference",
     1,
     RESTS_ON,
-    Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point, hold"),
-    Field("position", "f8", "rad", "joint positions", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
-    Field("acceleration", "f8", "rad/s2", "joint accelerations", ("joints",)),
-    Field("inertia", "f8", "kg m2", "diagonal of the joint-space inertia there", ("joints",)),
-    Field(
-        "load",
-        "f8",
-        "N m",
-        "torques of gravity and motion there, without acceleration",
-        ("joints",),
-    ),
-    Field("opening", "f8", "m", "gripper joint position to go to"),
-    Field("force", "f8", "N", "largest gripper force"),
-    Field("payload_mass", "f8", "kg", "mass in the gripper, which `inertia` and `load` include"),
-    Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
+    tick("due", "tick at which the arm should be there; 0: no set point, hold"),
+    by_joint("position", "rad", "joint positions"),
+    by_joint("velocity", "rad/s", "joint velocities"),
+    by_joint("acceleration", "rad/s2", "joint accelerations"),
+    by_joint("inertia", "kg m2", "diagonal of the joint-space inertia there"),
+    by_joint("load", "N m", "torques of gravity and motion there, without acceleration"),
+    real("opening", "m", "gripper joint position to go to"),
+    real("force", "N", "largest gripper force"),
+    real("payload_mass", "kg", "mass in the gripper, which `inertia` and `load` include"),
+    real("payload_offset", "m", "its centre, in the frame of the tool", 3),
 )
 """From the trajectory level to all boards that servo joints; these interpolate between its set
 points."""
@@ -50,26 +45,15 @@ JOINT_TORQUE = command(
     "joint_torque",
     1,
     RESTS_ON,
-    Field(
-        "sampled",
-        "i8",
-        "tick",
-        "tick of the arm's status that it rests on; -1: none yet, so no torque",
+    tick("sampled", "tick of the arm's status that it rests on; -1: none yet, so no torque"),
+    by_joint("torque", "N m", "of the board's own joints; others 0"),
+    by_joint(
+        "target", "rad", "where the board wants its own joints when the torque acts; others 0"
     ),
-    Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
-    Field(
-        "target",
-        "f8",
-        "rad",
-        "where the board wants its own joints when the torque acts; others 0",
-        ("joints",),
-    ),
-    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
-    Field("grip_force", "f8", "N", "of the gripper, from the board that drives it; others 0"),
-    Field(
-        "payload_mass", "f8", "kg", "mass in the gripper, from the board that drives it; others 0"
-    ),
-    Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
+    by_joint("target_velocity", "rad/s", "likewise"),
+    real("grip_force", "N", "of the gripper, from the board that drives it; others 0"),
+    real("payload_mass", "kg", "mass in the gripper, from the board that drives it; others 0"),
+    real("payload_offset", "m", "its centre, in the frame of the tool", 3),
 )
 """From a board that servoes joints to the board of the arm, which adds them up; id rises with every
 cycle."""
@@ -78,22 +62,14 @@ JOINT_STATUS = status(
     "joint_status",
     1,
     *ANSWER,
-    Field("position", "f8", "rad", "joint positions, from the arm's status", ("joints",)),
-    Field(
-        "target",
-        "f8",
-        "rad",
-        "set point of the board's own joints in this cycle; others 0",
-        ("joints",),
-    ),
-    Field("target_velocity", "f8", "rad/s", "likewise", ("joints",)),
-    Field("torque", "f8", "N m", "of the board's own joints; others 0", ("joints",)),
-    Field("driven", "u1", "1", "1: the joint is one of this board's", ("joints",)),
-    Field("holding", "u1", "1", "1: no fresh set point, the joints ramp to rest and stay"),
-    Field(
-        "stopped", "u1", "1", "1: set points are not followed: an operator, or the arm is braked"
-    ),
-    Field("due", "i8", "tick", "newest set point taken over; 0: none"),
+    by_joint("position", "rad", "joint positions, from the arm's status"),
+    by_joint("target", "rad", "set point of the board's own joints in this cycle; others 0"),
+    by_joint("target_velocity", "rad/s", "likewise"),
+    by_joint("torque", "N m", "of the board's own joints; others 0"),
+    flag("driven", "1: the joint is one of this board's", "joints"),
+    flag("holding", "1: no fresh set point, the joints ramp to rest and stay"),
+    flag("stopped", "1: set points are not followed: an operator, or the arm is braked"),
+    tick("due", "newest set point taken over; 0: none"),
 )
 """From a board that servoes joints to the trajectory level."""
 
@@ -101,7 +77,7 @@ ARM_STATUS = status(
     "arm_status",
     1,
     *ANSWER,
-    Field("tick", "i8", "tick", "tick at which the arm was sensed"),
+    tick("tick", "tick at which the arm was sensed"),
     *DRIVEN_ARM,
 )
 """From the board of the arm to those that servo joints; a servo level's status without set points

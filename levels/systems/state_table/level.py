@@ -28,6 +28,7 @@ from rack.levels.operator import (
     Operation,
     Orders,
 )
+from rack.levels.systems.fields import flag, number
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.table import (
     LATE,
@@ -55,7 +56,7 @@ from rack.levels.tables import SceneConfig, Table, read_params
 
 COMMAND_HEAD = (
     RESTS_ON,
-    Field("hold", "u1", "1", "1: come to rest and stay, whatever is under way"),
+    flag("hold", "1: come to rest and stay, whatever is under way"),
     Field(
         "words", f"S{PHRASE_BYTES}", "ASCII", "the command with its parameters, as in 'pick block1'"
     ),
@@ -64,18 +65,15 @@ COMMAND_HEAD = (
 STATUS_HEAD = (
     *ANSWER,
     Field("table", f"S{NAME_BYTES}", "ASCII", "state table in force"),
-    Field("checksum", "u4", "1", "CRC-32 of its file"),
+    number("checksum", "CRC-32 of its file"),
     Field("in_state", f"S{NAME_BYTES}", "ASCII", "state after this cycle"),
     Field("row", "u2", "1", "row that fired in this cycle, from 1; 0: none"),
     Field("fired", f"S{ROW_NAME_BYTES}", "ASCII", "its name"),
     Field("words", f"S{PHRASE_BYTES}", "ASCII", "command in force; empty: none"),
-    Field(
-        "ordered",
-        "u4",
-        "1",
-        "serial of an operator's command, if it is in force; 0: it is the level above's",
+    number(
+        "ordered", "serial of an operator's command, if it is in force; 0: it is the level above's"
     ),
-    Field("done", "u4", "1", "newest command of the level above that is done; 0: none"),
+    number("done", "newest command of the level above that is done; 0: none"),
 )
 """First fields of the status of every level of this kind: with them a restarted board goes on."""
 WORD_COMMAND = command("word_command", 1, *COMMAND_HEAD)

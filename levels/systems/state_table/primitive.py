@@ -19,6 +19,7 @@ from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
 from rack.levels.servo.curves import Curve, Passage, Ramp
+from rack.levels.systems.fields import by_joint, flag, real
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.state_table.level import (
     COMMAND_HEAD,
@@ -49,21 +50,21 @@ JOINT_MOVE = command(
     "joint_move",
     1,
     *COMMAND_HEAD,
-    Field("joints", "f8", "rad", "where a motion ends", ("joints",)),
-    Field("speed", "f8", "1", "part of the joints' limits"),
+    by_joint("joints", "rad", "where a motion ends"),
+    real("speed", "1", "part of the joints' limits"),
     Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
-    Field("aim", "f8", "m", "where the object, or the place, was for this command", (3,)),
-    Field("yaw", "f8", "rad", "how it was turned about the vertical"),
+    real("aim", "m", "where the object, or the place, was for this command", 3),
+    real("yaw", "rad", "how it was turned about the vertical"),
 )
 JOINT_MOVE_STATUS = status(
     "joint_move_status",
     1,
     *STATUS_HEAD,
-    Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
-    Field("end", "f8", "rad", "where the newest motion ends", ("joints",)),
-    Field("moving", "u1", "1", "1: they still change"),
-    Field("closed", "u1", "1", "1: the gripper is commanded to close"),
-    Field("held", "u1", "1", "1: it holds something"),
+    by_joint("position", "rad", "joint positions commanded last"),
+    by_joint("end", "rad", "where the newest motion ends"),
+    flag("moving", "1: they still change"),
+    flag("closed", "1: the gripper is commanded to close"),
+    flag("held", "1: it holds something"),
     Field("object", "i2", "1", "row of the object that it holds; -1: none"),
 )
 

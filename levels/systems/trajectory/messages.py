@@ -7,6 +7,7 @@ from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.systems.fields import by_joint, flag, number, real
 
 HELD = 16
 """Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than
@@ -47,35 +48,24 @@ MOTION_REQUEST = command(
     1,
     RESTS_ON,
     Field("kind", "u1", MotionKind, "what to do"),
-    Field("joints", "f8", "rad", "goal of JOINTS", ("joints",)),
-    Field("position", "f8", "m", "goal of POSE: tool position, in the frame of `body`", (3,)),
-    Field("quaternion", "f8", "1", "goal of POSE: tool orientation, in the frame of `body`", (4,)),
+    by_joint("joints", "rad", "goal of JOINTS"),
+    real("position", "m", "goal of POSE: tool position, in the frame of `body`", 3),
+    real("quaternion", "1", "goal of POSE: tool orientation, in the frame of `body`", 4),
     Field(
         "body",
         "i2",
         "1",
         "row of the body in the world model in whose frame the goal is; -1: the world",
     ),
-    Field(
-        "live",
-        "u1",
-        "1",
-        "1: the goal follows the body; 0: its frame is copied when the request begins",
+    flag("live", "1: the goal follows the body; 0: its frame is copied when the request begins"),
+    real(
+        "acceleration", "s", "half the time of the blend into this request; 0: the level's default"
     ),
-    Field(
-        "acceleration",
-        "f8",
-        "s",
-        "half the time of the blend into this request; 0: the level's default",
-    ),
-    Field(
-        "segment", "f8", "s", "time for the request; 0: from the speed limits; too short: stretched"
-    ),
-    Field("opening", "f8", "m", "gripper joint position to go to, for GRIP"),
-    Field("force", "f8", "N", "largest gripper force, for GRIP"),
-    Field(
+    real("segment", "s", "time for the request; 0: from the speed limits; too short: stretched"),
+    real("opening", "m", "gripper joint position to go to, for GRIP"),
+    real("force", "N", "largest gripper force, for GRIP"),
+    real(
         "touch",
-        "f8",
         "N m",
         "lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard",
     ),
@@ -91,8 +81,8 @@ def state_of(name: str, request: MessageType) -> MessageType:
         name,
         1,
         (
-            Field("begun", "u1", "1", "1: the first of `requests` is under way"),
-            Field("passed", "f8", "s", "time that it has stayed or gripped"),
+            flag("begun", "1: the first of `requests` is under way"),
+            real("passed", "s", "time that it has stayed or gripped"),
             Field(
                 "goal",
                 request,
@@ -112,15 +102,15 @@ MOTION_STATUS = status(
     "motion_status",
     1,
     *ANSWER,
-    Field("taken", "u4", "1", "newest request taken from the queue; 0: none yet"),
-    Field("current", "u4", "1", "request under way; 0: none"),
-    Field("done", "u4", "1", "newest request ended, however; 0: none yet"),
+    number("taken", "newest request taken from the queue; 0: none yet"),
+    number("current", "request under way; 0: none"),
+    number("done", "newest request ended, however; 0: none yet"),
     Field("ended", "u4", "1", "ids of the last requests ended, newest first; 0: none", (ENDED,)),
     Field("ends", "u1", RequestEnd, "how they ended", (ENDED,)),
-    Field("progress", "f8", "1", "part of the current request's time that has passed, 0 to 1"),
-    Field("resting", "u1", "1", "1: commanded velocity is zero"),
-    Field("position", "f8", "rad", "joint positions commanded last", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities commanded last", ("joints",)),
-    Field("tool", "f8", "m", "tool position commanded last", (3,)),
-    Field("astray", "f8", "m", "distance of that from a live goal, once reached; 0: there is none"),
+    real("progress", "1", "part of the current request's time that has passed, 0 to 1"),
+    flag("resting", "1: commanded velocity is zero"),
+    by_joint("position", "rad", "joint positions commanded last"),
+    by_joint("velocity", "rad/s", "joint velocities commanded last"),
+    real("tool", "m", "tool position commanded last", 3),
+    real("astray", "m", "distance of that from a live goal, once reached; 0: there is none"),
 )
