@@ -2,9 +2,8 @@
 that gives them."""
 
 from rack.levels.systems.cell.coordinator import Coordinator
-from rack.levels.systems.cell.executor import OrderedTaskExecutor
 from rack.levels.systems.cell.messages import CELL_ORDER, CELL_REPORT
-from rack.levels.systems.cell.planner import OrderedTaskPlanner
+from rack.levels.systems.cell.ordered_task import OrderedTaskExecutor, OrderedTaskPlanner
 from rack.levels.systems.cell.program import CellProgram
 from rack.levels.systems.cell.sharing_executor import SharingServoExecutor
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.levels.level import Executor, Input, LevelContext, MadePorts, Output, Ports, Reading
@@ -17,12 +17,36 @@ from rack.levels.systems.cell.messages import (
     CELL_ORDER,
     CELL_PROGRESS,
     CELL_REPORT,
+    MailboxName,
     OrderVerb,
     Phase,
 )
-from rack.levels.systems.cell.params import CoordinatorParams
-from rack.levels.systems.cell.program import CellProgram
-from rack.levels.tables import read_params
+from rack.levels.systems.cell.program import ArmName, CellProgram
+from rack.levels.tables import Positive, Table, read_params
+
+
+class CoordinatorParams(Table):
+    """The arms that a coordinator orders about, and how long it waits for them."""
+
+    arms: dict[ArmName, MailboxName] = Field(
+        min_length=1,
+        description=(
+            "mailbox with an arm's report, by the arm's name; its orders are in order_<name>"
+        ),
+    )
+    stalled_s: Positive = Field(
+        180.0,
+        description=(
+            "time without any progress after which the program ends, unless an operator holds it;"
+            " longer than an arm's, s"
+        ),
+    )
+    farewell_s: Positive = Field(
+        10.0,
+        description=(
+            "time that the arms have to come to rest and to confirm the end of the program, s"
+        ),
+    )
 
 
 class Coordinator(Executor):

@@ -7,12 +7,16 @@ says all there is to know, so that those that are lost, or overtaken by a newer 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Annotated
+
+from pydantic import StringConstraints
 
 from rack.backplane.message import Field, MessageType, command, status
 from rack.levels.messages import OPERATED, Error
 from rack.levels.operator import MAX_JOINTS, Goal
 from rack.levels.systems.fields import by_joint, flag, number, real
 
+MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 OBJECT_BYTES = 32
 """Longest name of an object that an order can give."""
 

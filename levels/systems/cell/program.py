@@ -7,16 +7,16 @@ import zlib
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, StringConstraints
 
 from rack.levels.level import Program
 from rack.levels.operator import MAX_JOINTS
 from rack.levels.systems.cell.messages import OBJECT_BYTES
-from rack.levels.systems.cell.params import ArmName
 from rack.levels.tables import RobotConfig, SceneConfig, Table
 from rack.levels.task.program import Goto, Home, Transfer
 
 MAX_STEPS = 1000
+ArmName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,22}$")]
 ARM = Field(description="arm that does it")
 
 

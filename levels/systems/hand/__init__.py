@@ -12,11 +12,13 @@ from rack.backplane.exports import on_first_use
 
 if TYPE_CHECKING:
     from rack.levels.systems.hand.executor import HandExecutor
-    from rack.levels.systems.hand.finger import FingerExecutor
-    from rack.levels.systems.hand.fingertip_loop import FingertipLoop
     from rack.levels.systems.hand.grasp import GraspExecutor
-    from rack.levels.systems.hand.joint_loop import JointLoop
-    from rack.levels.systems.hand.tendon_loop import TendonLoop
+    from rack.levels.systems.hand.loop_boards import (
+        FingerExecutor,
+        FingertipLoop,
+        JointLoop,
+        TendonLoop,
+    )
 
 __all__ = [
     "FingerExecutor",
@@ -28,11 +30,13 @@ __all__ = [
 ]
 _PLACES = {
     "rack.levels.systems.hand.executor": ("HandExecutor",),
-    "rack.levels.systems.hand.finger": ("FingerExecutor",),
-    "rack.levels.systems.hand.fingertip_loop": ("FingertipLoop",),
     "rack.levels.systems.hand.grasp": ("GraspExecutor",),
-    "rack.levels.systems.hand.joint_loop": ("JointLoop",),
-    "rack.levels.systems.hand.tendon_loop": ("TendonLoop",),
+    "rack.levels.systems.hand.loop_boards": (
+        "FingerExecutor",
+        "FingertipLoop",
+        "JointLoop",
+        "TendonLoop",
+    ),
 }
 
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these

@@ -14,9 +14,8 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
-from rack.levels.systems.force.client import ForceMotions
+from rack.levels.systems.force.client import ForceMotions, ForceProgram
 from rack.levels.systems.force.messages import SERVER_STATUS, Mode
-from rack.levels.systems.force.program import ForceProgram
 from rack.levels.systems.force.server import ForceServer
 from rack.levels.systems.trajectory.messages import MotionKind
 from tests.levels.arms import config

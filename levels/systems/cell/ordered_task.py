@@ -1,32 +1,60 @@
-"""The executor of an ordered task level: takes its actions from a coordinator, one order at a
-time."""
+"""An ordered task level: takes its actions from a coordinator, one order at a time.
+
+Its planner makes elemental moves of an order, or finds the reason why it cannot be done.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, StringConstraints, ValidationError
 
 from rack.backplane.message import Message, MessageType, State, fill_counts
-from rack.levels.errors import ProgramError
+from rack.levels.errors import ProgramError, Refused
 from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
 from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
 from rack.levels.operator import Operation
 from rack.levels.peer import PEER, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
-from rack.levels.systems.cell.messages import CELL_ORDER, CELL_REPORT, CELL_REQUEST, Response
-from rack.levels.systems.cell.params import OrderedTaskParams
+from rack.levels.systems.cell.messages import (
+    CELL_ORDER,
+    CELL_REPORT,
+    CELL_REQUEST,
+    MailboxName,
+    Response,
+)
 from rack.levels.systems.cell.taken import TakenOrder
-from rack.levels.tables import read_params
+from rack.levels.tables import Positive, read_params
 from rack.levels.task.executor import TaskExecutor
-from rack.levels.task.program import AnyAction
+from rack.levels.task.planner import TaskPlanner
+from rack.levels.task.program import AnyAction, TaskConfig, TaskParams
+from rack.levels.task.rehearsal import Rehearsed, finish_times
 
+RackName = Annotated[str, StringConstraints(pattern=r"^([a-z0-9][a-z0-9_-]{0,39})?$")]
 PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
 """Answers to an order that rest on its plan."""
 MAX_STRAY_RAD = 0.005
 """A plan holds if no joint has moved farther since it was requested."""
+
+
+class OrderedTaskParams(TaskParams):
+    """From where a task level takes its orders, and for how long it keeps a promise."""
+
+    coordinator: RackName = Field(
+        "",
+        description=(
+            "rack that gives the orders over the network; empty: a board of this rack gives them"
+        ),
+    )
+    orders: MailboxName = Field("lan.orders", description="mailbox with the orders")
+    decision: Positive = Field(
+        5.0,
+        description=(
+            "time between an answer and the order to do it, for which a promised time holds, s"
+        ),
+    )
 
 
 class OrderedTaskExecutor(TaskExecutor):
@@ -312,3 +340,46 @@ class OrderedTaskExecutor(TaskExecutor):
             return State.DONE if self._is_end_reported else State.EXECUTING
         waits = self._taken.is_asked or self._taken.is_under_way or self._absent
         return State.EXECUTING if waits else State.IDLE
+
+
+class OrderedTaskPlanner(TaskPlanner):
+    """Plans what its executor requests: the action of an order, to begin later or at once."""
+
+    inputs = {**TaskPlanner.inputs, "request": Input(CELL_REQUEST, "own.request")}
+    params = OrderedTaskParams
+    program = None
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._id = 0
+        self._begin_s = 0.0  # simulated time at which the plan may have to begin
+
+    def _first_program(self) -> TaskConfig:
+        return TaskConfig()
+
+    def wanted(self, read: Ports, tick: int) -> bool:
+        """Return whether a request is not answered yet, and the world is known and at rest."""
+        request: Message = read.request.value
+        if request.id not in (0, self._id):
+            # Whoever requests it has found that it suits the arm.
+            action = read_action(request, self.context.robot, self.context.scene)
+            self._program = TaskConfig(action=(action,))
+            self._id = request.id
+            self._plan = None
+            self._begin_s = request.begin
+            self._ahead_s = request.ahead
+        return super().wanted(read, tick)
+
+    def _reason(self, refused: Refused) -> str:
+        """Return why the order is refused; it is one action, without a number."""
+        return str(refused)
+
+    def _visible_s(self, tick: int) -> float:
+        return max(super()._visible_s(tick), self._begin_s + self.context.period_s)
+
+    def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
+        super()._promise(moves, visible_s, write)
+        unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
+        write.earliest = (
+            finish_times(unhurried, visible_s, self._periods, self._needs)[-1] + self._ahead_s
+        )
