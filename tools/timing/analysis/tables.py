@@ -18,16 +18,14 @@ SHOWN = 10
 """Most cycles in the list of those that broke an equation; the document has them all."""
 LEVELS = ["level", "", "R_i", "t_exec", "C", "R", "W", "t_comm", "t_residual", "t_plan", "d"]
 BY_THE_CLOCK = [
-    *(
-        "late p50",
-        "late p99",
-        "late p99.9",
-        "late max",
-        "response p99",
-        "response max",
-        "of",
-        "largest gap",
-    ),
+    "late p50",
+    "late p99",
+    "late p99.9",
+    "late max",
+    "response p99",
+    "response max",
+    "of",
+    "largest gap",
 ]
 TASKS = ["task", "cycles", "missed", "skipped", "deviation", "overhead", *BY_THE_CLOCK]
 TASKS_DROPPED = (
