@@ -14,7 +14,7 @@ from rack.levels.algebra import Array
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import STATE, Cell
 from rack.tools.viewer.forces import contacts_of
-from rack.tools.viewer.levels import verb_name
+from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw
 from rack.tools.viewer.stream import Changes, RowBlock, Sampled, Stream
 from rack.tools.viewer.style import CURRENT, FORCE, GOAL, PLANNED
@@ -256,7 +256,7 @@ class Goals:
             self._stream.at(block.when(row), CURRENT_GOAL, point)
 
     def _name(self, move: np.void) -> str:
-        return f"{verb_name(int(move['verb']))} {self._object(move)}".strip()
+        return f"{worded(Verb, int(move['verb']))} {self._object(move)}".strip()
 
     def _object(self, move: np.void) -> str:
         row = int(move["object"])

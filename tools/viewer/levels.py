@@ -4,6 +4,8 @@ graph."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,6 @@ import rerun as rr
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State
 from rack.levels.messages import Verb
-from rack.levels.systems.force.messages import Mode
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, Moment, RowBlock, Stream
@@ -63,17 +64,12 @@ def numbered(what: str, serial: int) -> str:
 
 def move_name(move: tuple[int, int]) -> str:
     """Return the verb of a move, which is its serial and its verb; empty without one."""
-    return verb_name(move[1]) if move[0] else ""
+    return worded(Verb, move[1]) if move[0] else ""
 
 
-def mode_name(mode: int) -> str:
-    """Return the mode of a server in words."""
-    return Mode(mode).name.lower()
-
-
-def verb_name(verb: int) -> str:
-    """Return the verb of an elemental move in words."""
-    return Verb(verb).name.lower().replace("_", " ")
+def worded(kind: type[IntEnum], number: int) -> str:
+    """Return a number that stands for a name in words: a state, a verb, a mode."""
+    return kind(number).name.lower().replace("_", " ")
 
 
 class Activity:
@@ -85,7 +81,7 @@ class Activity:
         # An adapter also writes the statuses of other racks' levels.
         lane = "state" if port == "status" else port
         own = (self._board, lane)
-        self._states = ValueLane(stream, own, "state", lambda state: State(state).name.lower())
+        self._states = ValueLane(stream, own, "state", partial(worded, State))
         self._errors = Changes()
         style_lane(stream, (LEVELS, *own), STATES)
 

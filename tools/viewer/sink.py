@@ -26,7 +26,7 @@ from rack.levels.messages import (
     WORLD_MODEL,
 )
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH
+from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH, Mode
 from rack.levels.systems.hand.messages import HAND_STATUS, STREAMED_DOWN
 from rack.levels.systems.joint_boards.messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.systems.trajectory.messages import MOTION_STATUS
@@ -42,9 +42,9 @@ from rack.tools.viewer.levels import (
     FiredRows,
     Hierarchy,
     ValueLane,
-    mode_name,
     move_name,
     numbered,
+    worded,
 )
 from rack.tools.viewer.parts import next_file
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
@@ -225,7 +225,7 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         name = partial(numbered, "request")
         parts.append(ValueLane(stream, (board, "request"), "current", name).write)
     if mailbox.message == SERVER_STATUS.name:
-        parts.append(ValueLane(stream, (board, "mode"), "mode", mode_name).write)
+        parts.append(ValueLane(stream, (board, "mode"), "mode", partial(worded, Mode)).write)
     if mailbox.message not in (
         *SHOWN_IN_3D,
         *DRIVING,
