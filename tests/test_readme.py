@@ -31,7 +31,8 @@ BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 ELSEWHERE = re.compile(
     r"<|\.toml|RUN|rack"
-    r" (status|top|stop|record|replay|inject|estop|command|prompt)|kill-each-board|--view|--step"
+    r" (status|top|watch|mailbox|stop|record|replay|inject|estop|command|prompt)"
+    r"|kill-each-board|--view|--step"
     r"|bench (response|systems|lan|hand)|rack run cell|--lan|rack lan"
 )
 """Commands that need a run, or a running rack, of another line: they have tests of their own in

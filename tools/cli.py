@@ -45,6 +45,16 @@ COMMANDS = (
     ),
     ("status", "rack.tools.commands.status:status", "Show a running rack once."),
     ("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
+    (
+        "watch",
+        "rack.tools.commands.watch:watch",
+        "Show signals of a running rack, or what was around a moment.",
+    ),
+    (
+        "mailbox",
+        "rack.tools.commands.mailbox:mailbox",
+        "Show what is in a mailbox of a running rack.",
+    ),
     ("stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."),
     (
         "clean",
@@ -101,7 +111,7 @@ COMMANDS = (
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 GROUPS = {
     "Run": ("run", "stop", "step", "list", "clean"),
-    "Watch": ("status", "top", "record", "replay", "report"),
+    "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "report"),
     "Command and disturb": ("command", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),
     "Compare": ("bench", "reproduce"),

@@ -184,6 +184,7 @@ class Column:
     kind: str
     shape: tuple[int, ...]
     unit: str
+    values: tuple[tuple[str, int], ...] = ()  # names and numbers of an enum
 
     @property
     def field(self) -> pa.Field:
@@ -196,11 +197,15 @@ class Column:
             self.name, arrow, metadata={"shape": json.dumps(self.shape), "unit": self.unit}
         )
 
-    def array(self, messages: np.ndarray) -> pa.Array:
-        """Return the column of a block of messages, shape (rows,)."""
+    def of(self, messages: np.ndarray) -> np.ndarray:
+        """Return the field in a block of messages, shape (rows, *shape)."""
         for key in self.path:
             messages = messages[key]
-        flat = np.ascontiguousarray(messages).reshape(-1)
+        return messages
+
+    def array(self, messages: np.ndarray) -> pa.Array:
+        """Return the column of a block of messages, shape (rows,)."""
+        flat = np.ascontiguousarray(self.of(messages)).reshape(-1)
         values = pa.array(
             np.strings.decode(flat, "ascii", "replace") if self.kind[1] == "S" else flat
         )
@@ -225,4 +230,5 @@ def _columns(
         if field.fields:
             yield from _columns(mailbox, inner, shape, field.fields)
         else:
-            yield Column(".".join((mailbox, *inner)), inner, field.kind, shape, field.unit)
+            name = ".".join((mailbox, *inner))
+            yield Column(name, inner, field.kind, shape, field.unit, field.values)

@@ -1,0 +1,147 @@
+"""`rack watch` and `rack mailbox`, on racks that run: what they show is what was written."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.tools.commands.step import Stepper
+from tests.boards.table_racks import counting
+from tests.processes import RACK, in_thread, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
+
+
+@pytest.fixture
+def held(rack_name: str, tmp_path: Path) -> Iterator[str]:
+    """The name of a rack that counts, held before tick 20."""
+    path = tmp_path / "counting.toml"
+    path.write_text(counting(tmp_path))
+    command = [*RACK, "run", str(path), "--no-record", "--lockstep", "--step"]
+    process = subprocess.Popen(
+        [*command, "--set", f"name={rack_name}"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_until(lambda: is_held(rack_name), BOUND_S)
+    assert rack("step", rack_name, "--ticks", "20").returncode == 0
+    yield rack_name
+    process.kill()
+    process.communicate()
+    rack("clean")
+
+
+def is_held(name: str) -> bool:
+    """Return whether a rack is there and held."""
+    try:
+        return bool(Segment.attach(name).words[System.HELD])
+    except Exception:
+        return False
+
+
+@pytest.mark.slow
+def test_mailboxes_are_listed_and_their_newest_messages_shown(held: str) -> None:
+    listed = json.loads(rack("mailbox", held, "--json").stdout)
+    (counter,) = [row for row in listed if row["mailbox"] == "counter.status"]
+    assert (counter["writer"], counter["period_ms"], counter["written"]) == ("counter", 10.0, 5)
+    assert "counter.status" in rack("mailbox", held).stdout
+    newest = json.loads(rack("mailbox", held, "counter.status", "--json").stdout)
+    # Released at ticks 0, 4, ..., 16; the rack is at tick 19.
+    assert (newest["serial"], newest["tick"], newest["age_ticks"]) == (5, 16, 3)
+    assert newest["fields"]["fired"] == "count up"
+    assert newest["fields"]["state"] == "executing"
+    text = rack("mailbox", held, "counter.status").stdout
+    assert text.startswith("counter.status: serial 5, of tick 16, 3 ticks (7.5 ms) old\n")
+
+
+@pytest.mark.slow
+def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
+    cases = {
+        ("mailbox", held, "counter.stat"): "NAME = counter.stat: no such mailbox; mailboxes: coun",
+        ("mailbox", held, "--watch"): "--watch needs the NAME of a mailbox",
+        ("watch", held, "counter.status.rwo"): "counter.status.rwo: no such signal; nearest: count",
+        ("watch", held, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
+        ("watch", held, "counter.status.row", "--every", "1"): "--every 1: not a time; permitted: ",
+        ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: not a time; permi",
+        ("watch", "no-such-rack", "a.b"): "rack 'no-such-rack' does not exist",
+    }
+    for words, why in cases.items():
+        done = rack(*words, folder=tmp_path)
+        assert (done.returncode, done.stdout) == (2 if held in words else 1, "")
+        assert done.stderr.startswith(why)
+        assert done.stderr.count("\n") == 1
+    assert [*tmp_path.glob("*.csv")] == []
+
+
+@pytest.mark.slow
+def test_lines_show_every_message_until_the_run_ends(held: str) -> None:
+    with in_thread(lambda: go_on(held, "count down")):
+        done = rack("watch", held, "counter.status.fired", "--every", "0s", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    ticks = [line["tick"] for line in lines]
+    assert ticks == [*range(ticks[0], ticks[-1] + 1, 4)]
+    assert {line["counter.status.fired"] for line in lines} >= {"count up", "count down"}
+
+
+@pytest.mark.slow
+def test_a_moment_is_saved_with_what_was_around_it(held: str, tmp_path: Path) -> None:
+    signals = ("counter.status.fired", "watch.status.state")
+    condition = "counter.status.row == 4"
+    with in_thread(lambda: go_on(held, '"rows"')):
+        words = ("--when", condition, "--before", "50ms", "--after", "30ms", "--json")
+        done = rack("watch", held, *signals, *words, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    saved = (tmp_path / f"{held}-{found['tick']}.csv").read_text()
+    head, *rows = csv.reader(saved.splitlines())
+    assert head == ["time, s", "tick", *signals]
+    assert len(rows) == found["rows"]
+    # It turns in its 4th row; clock 2.5 ms, a message every 10 ms.
+    ticks = [int(row[1]) for row in rows]
+    assert ticks == [*range(found["tick"] - 20, found["tick"] + 13, 4)]
+    assert [row[2] for row in rows][5] == "turn"
+    assert "turn" not in [row[2] for row in rows][:5]
+
+
+@pytest.mark.slow
+def test_a_moment_that_does_not_come_is_said(held: str, tmp_path: Path) -> None:
+    with in_thread(lambda: go_on(held, "", ticks=80)):
+        done = rack("watch", held, "watch.status.state", "--when", "counter.status.row > 99")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"rack '{held}': the condition has not held; the run is over\n"
+
+
+@pytest.mark.slow
+def test_a_mailbox_is_watched_message_by_message(held: str) -> None:
+    with in_thread(lambda: go_on(held, '"tick"')):
+        done = rack("mailbox", held, "counter.status", "--watch", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    serials = [json.loads(line)["serial"] for line in done.stdout.splitlines()]
+    assert serials == [*range(serials[0], serials[-1] + 1)]
+
+
+def go_on(name: str, until: str, ticks: int = 8000) -> None:
+    """Step a rack by 8 ticks until this text was printed, for so many ticks at most; end its
+    run."""
+    stepper = Stepper(name)
+    tick = stepper.hold()
+    for step in range(0, ticks, 8):
+        # Before the command begins, stdout is pytest's.
+        printed = sys.stdout.getvalue() if isinstance(sys.stdout, StringIO) else ""
+        if until and until in printed:
+            break
+        stepper.go(tick + step + 8)
+        time.sleep(0.002)
+    Segment.attach(name).words[System.STOP_REQUEST] = 1

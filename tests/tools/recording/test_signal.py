@@ -1,0 +1,148 @@
+"""Signals by name: fields of messages, single numbers of them, names in place of numbers; and
+conditions on them."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+import pytest
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.message import Field, MessageType
+from rack.boards.config.layout import field_specs
+from rack.tools.console.answer import Failure
+from rack.tools.recording.parquet import columns_of
+from rack.tools.recording.signal import Signal, Trigger
+
+
+class Gait(IntEnum):
+    """What the walker does."""
+
+    STANDS = 0
+    WALKS = 1
+
+
+LEG = MessageType("leg", 1, (Field("angle", "f8", "rad", "of hip and knee", (2,)),))
+WALKER = MessageType(
+    "walker",
+    1,
+    (
+        Field("gait", "u1", Gait, "what it does"),
+        Field("speed", "f8", "m/s", "forwards"),
+        Field("name", "S8", "ASCII", "its name"),
+        Field("legs", LEG, "", "left and right", (2,)),
+    ),
+)
+DTYPE = WALKER.dtype({})
+BOX = MailboxSpec(
+    name="walker.status",
+    writer="walker",
+    readers=(),
+    protocol="time-slice",
+    every=1,
+    delay=1,
+    depth=8,
+    message=WALKER.name,
+    version=1,
+    size=DTYPE.itemsize,
+    fields=field_specs(WALKER, {}),
+)
+
+
+@pytest.fixture
+def messages() -> np.ndarray:
+    """Three messages of a walker that starts, then falls."""
+    found = np.zeros(3, DTYPE)
+    found["gait"] = [0, 1, 1]
+    found["speed"] = [0.0, 1.5, np.nan]
+    found["name"] = b"ada"
+    found["legs"]["angle"] = np.arange(12.0).reshape(3, 2, 2)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("speed", [0.0, 1.5, None]),
+        ("gait", ["stands", "walks", "walks"]),
+        ("name", ["ada"] * 3),
+        ("legs.angle", [[[0, 1], [2, 3]], [[4, 5], [6, 7]], [[8, 9], [10, 11]]]),
+        ("legs.angle[1]", [[2, 3], [6, 7], [10, 11]]),
+        ("legs.angle[1][0]", [2, 6, 10]),
+    ],
+)
+def test_a_signal_is_a_field_or_a_part_of_it(
+    messages: np.ndarray, name: str, values: list[object]
+) -> None:
+    signal = Signal.of(f"walker.status.{name}", [BOX])
+    assert [signal.plain(value) for value in signal.values(messages)] == values
+
+
+def test_units_are_those_of_numbers() -> None:
+    units = {column.path[0]: Signal("", "", column, ()).unit for column in columns_of(BOX)}
+    assert units == {"gait": "", "speed": "m/s", "name": "", "legs": "rad"}
+    heads = [Signal.of(f"walker.status.{name}", [BOX]).head for name in ("gait", "legs.angle[1]")]
+    assert heads == ["walker.status.gait", "walker.status.legs.angle[1], rad"]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("walker.status.sped", "no such signal; nearest: walker.status.speed"),
+        ("xyz", "no such signal; mailboxes: walker.status"),
+        ("walker.status.speed]", "no such signal; nearest: walker.status.speed"),
+        (
+            "walker.status.legs.angle[2]",
+            "no such index; permitted: walker.status.legs.angle[0 to 1][0 to 1]",
+        ),
+        ("walker.status.speed[0]", "no such index; permitted: walker.status.speed"),
+    ],
+)
+def test_a_name_that_is_not_known_is_one_line(name: str, why: str) -> None:
+    with pytest.raises(Failure) as failure:
+        Signal.of(name, [BOX])
+    assert str(failure.value).startswith(f"{name}: {why}")
+    assert failure.value.status == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "holds"),
+    [
+        ("walker.status.speed > 1", [False, True, False]),
+        ("walker.status.speed>=1.5", [False, True, False]),
+        ("walker.status.speed < 1.5", [True, False, False]),
+        ("walker.status.speed <= 1.5", [True, True, False]),
+        ("walker.status.gait == walks", [False, True, True]),
+        ("walker.status.gait != 1", [True, False, False]),
+        ("walker.status.legs.angle[0][1] == 5", [False, True, False]),
+    ],
+)
+def test_a_condition_compares_a_number(messages: np.ndarray, text: str, holds: list[bool]) -> None:
+    assert Trigger.of(text, [BOX]).holds(messages).tolist() == holds
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (
+            "walker.status.speed",
+            '"walker.status.speed": not a condition; permitted: as in'
+            ' "servo.status.position[2] > 1.2"',
+        ),
+        (
+            "walker.status.legs.angle[0] > 1",
+            "walker.status.legs.angle[0]: numbers of shape [2]; a condition needs a single number",
+        ),
+        ("walker.status.name == 1", "walker.status.name: text; a condition needs a single number"),
+        ("walker.status.speed > x", '"walker.status.speed > x": x is not a number'),
+        (
+            "walker.status.gait == runs",
+            '"walker.status.gait == runs": runs is not a number or one of stands, walks',
+        ),
+    ],
+)
+def test_a_condition_that_is_none_is_one_line(text: str, why: str) -> None:
+    with pytest.raises(Failure) as failure:
+        Trigger.of(text, [BOX])
+    assert (str(failure.value), failure.value.status) == (why, 2)

@@ -1,0 +1,155 @@
+"""`rack mailbox`: the mailboxes of a running rack, and what is in one."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import nullcontext
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box, System
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import Json, RackName
+from rack.tools.console.tables import console, table, terminal_width
+from rack.tools.live.signals import cell
+from rack.tools.recording.parquet import HEAD, columns_of
+from rack.tools.recording.signal import Signal
+
+LOOK_S = 0.1
+PLAIN_S = 1.0
+"""Times between looks, real time: on a terminal or as JSON, and as plain text."""
+COLUMNS = ("mailbox", "message", "writer", "readers", "protocol", "period_ms", "bytes", "written")
+"""Of the list of mailboxes, as in its JSON."""
+DROPPED = ("bytes", "message", "protocol", "readers")
+"""Columns that a narrow terminal leaves out, in this order."""
+
+Name = Annotated[
+    str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
+]
+Watch = Annotated[
+    bool, typer.Option("--watch", help="show each message, until Ctrl-C or the end of the run")
+]
+
+
+def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Json = False) -> None:
+    """Show the newest message in a mailbox of a running rack, field by field with units; or list
+    the rack's mailboxes.
+
+    Looking costs the boards nothing. With --watch and --json each message is one line.
+
+    Exit status: 0 shown; 1 there is no such rack, or no message yet; 2 usage.
+
+    \b
+    Examples:
+      rack mailbox nasrem
+      rack mailbox nasrem servo.status
+      rack mailbox nasrem primitive.command --watch
+    """
+    segment = Segment.attach(rack)
+    if name is None:
+        if watch:
+            raise Failure("--watch needs the NAME of a mailbox", 2)
+        rows = [_row(segment, box) for box in segment.layout.mailboxes]
+        cells = [[str(row[column]) for column in COLUMNS] for row in rows]
+        print_answer(rows, table(COLUMNS, cells, terminal_width(), DROPPED), as_json)
+        return
+    names = [box.name for box in segment.layout.mailboxes]
+    if name not in names:
+        raise Failure(f"NAME = {name}: no such mailbox; mailboxes: {', '.join(names)}", 2)
+    messages = Messages(segment, name)
+    if watch:
+        _watch(segment, messages, as_json)
+        return
+    for newest in messages.new():
+        print_answer(newest, messages.lines(newest), as_json)
+        return
+    raise Failure(f"mailbox '{name}' has no message yet")
+
+
+def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
+    """Show messages until the run is over: all as JSON, for people the newest of each look."""
+    from rich.live import Live
+    from rich.text import Text
+
+    terminal = console()
+    is_drawn = terminal.is_terminal and not as_json
+    live = Live(console=terminal, auto_refresh=False) if is_drawn else None
+    ended = threading.Event()
+    is_over = False
+    with INTERRUPT.orderly(ended.set), live or nullcontext():
+        while not is_over:
+            # Asked before the look: what is written until the end is shown.
+            is_over = segment.run_is_over or ended.wait(LOOK_S if is_drawn or as_json else PLAIN_S)
+            found = [*messages.new()]
+            if as_json:
+                for document in found:
+                    print(json.dumps(document), flush=True)
+            elif live is not None and found:
+                live.update(Text("\n".join(messages.lines(found[-1]))), refresh=True)
+            elif found:
+                print(*messages.lines(found[-1]), "", sep="\n", flush=True)
+
+
+def _row(segment: Segment, box: MailboxSpec) -> dict[str, Any]:
+    return {
+        "mailbox": box.name,
+        "message": f"{box.message} {box.version}",
+        "writer": box.writer,
+        "readers": ", ".join(box.readers) or "-",
+        "protocol": box.protocol,
+        "period_ms": round(box.every * segment.layout.clock_ns * 1e-6, 6),
+        "bytes": box.size,
+        "written": segment.words[segment.map.mailboxes[box.name] // 8 + Box.HEAD],
+    }
+
+
+class Messages:
+    """The messages of one mailbox, as documents."""
+
+    def __init__(self, segment: Segment, name: str) -> None:
+        self._segment = segment
+        self._box = box = segment.layout.mailbox(name)
+        self._ring = MailboxRing(segment, name)
+        self._has_looked = False
+        self._signals = [Signal(column.name, name, column, ()) for column in columns_of(box)]
+
+    def new(self) -> Iterator[dict[str, Any]]:
+        """Yield the messages written since the last look; at the first one the newest alone."""
+        rows = self._ring.drain().rows
+        yield from map(self._document, rows if self._has_looked else rows[-1:])
+        self._has_looked = True
+
+    def _document(self, row: np.ndarray) -> dict[str, Any]:
+        message = row["message"][None]
+        return {
+            "mailbox": self._box.name,
+            **{name: int(row[name]) for name in HEAD},
+            "age_ticks": self._segment.words[System.TICK] - int(row["tick"]),
+            "fields": {
+                signal.name.removeprefix(f"{self._box.name}."): signal.plain(
+                    signal.values(message)[0]
+                )
+                for signal in self._signals
+            },
+        }
+
+    def lines(self, document: dict[str, Any]) -> list[str]:
+        """Return a message as lines for people."""
+        age_ms = document["age_ticks"] * self._segment.layout.clock_ns * 1e-6
+        head = (
+            f"{self._box.name}: serial {document['serial']}, of tick {document['tick']},"
+            f" {document['age_ticks']} ticks ({age_ms:g} ms) old"
+        )
+        rows = [
+            [name, cell(value), signal.unit]
+            for (name, value), signal in zip(document["fields"].items(), self._signals, strict=True)
+        ]
+        return [head, *table(("field", "value", "unit"), rows, terminal_width())]

@@ -1,0 +1,126 @@
+"""A signal, as users name it: a field of the messages of a mailbox, or one number of it, as in
+`servo.status.position[2]`; and a condition on one, as in `servo.status.position[2] > 1.2`."""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.layout import MailboxSpec
+from rack.tools.console.answer import Failure
+from rack.tools.recording.parquet import Column, columns_of
+
+NAME = re.compile(r"([\w.]+)((?:\[\d+\])*)")
+CONDITION = re.compile(r"\s*(\S+?)\s*(==|!=|<=|>=|<|>)\s*(\S+)\s*")
+COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<=": operator.le,
+    ">=": operator.ge,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+NEAREST = 3
+"""Names offered in place of one that is not known, at most."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Numbers, or text, in every message of a mailbox."""
+
+    name: str
+    mailbox: str
+    column: Column
+    index: tuple[int, ...]  # of an array field, as far as it is given
+
+    @classmethod
+    def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
+        """Return the signal of that name. Raises `Failure` with the nearest names, or the permitted
+        indices."""
+        known = {column.name: (box.name, column) for box in boxes for column in columns_of(box)}
+        found = NAME.fullmatch(text)
+        if found is None or found[1] not in known:
+            near = get_close_matches(text.partition("[")[0], known, NEAREST)
+            what = "nearest" if near else "mailboxes"
+            names = near or [box.name for box in boxes]
+            raise Failure(f"{text}: no such signal; {what}: {', '.join(names)}", 2)
+        mailbox, column = known[found[1]]
+        index = tuple(int(number) for number in re.findall(r"\d+", found[2]))
+        shape = column.shape[: len(index)]
+        if len(shape) < len(index) or any(i >= n for i, n in zip(index, shape, strict=True)):
+            ends = "".join(f"[0 to {size - 1}]" for size in column.shape)
+            raise Failure(f"{text}: no such index; permitted: {column.name}{ends}", 2)
+        return cls(text, mailbox, column, index)
+
+    @property
+    def unit(self) -> str:
+        """Its unit; empty for counts, names and text."""
+        column = self.column
+        return "" if column.values or column.kind[1] == "S" or column.unit == "1" else column.unit
+
+    @property
+    def head(self) -> str:
+        """Its name with its unit."""
+        return f"{self.name}, {self.unit}".removesuffix(", ")
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is a single number."""
+        return len(self.index) == len(self.column.shape) and self.column.kind[1] != "S"
+
+    def values(self, messages: np.ndarray) -> np.ndarray:
+        """Return it in each of these messages, shape (messages, *what is left of its own)."""
+        return self.column.of(messages)[(slice(None), *self.index)]
+
+    def plain(self, value: Any) -> Any:
+        """Return one value as a user reads it: a number, the name of a state, text, or a list; None
+        for what is not finite."""
+        found = np.asarray(value)
+        if found.ndim:
+            return [self.plain(part) for part in found]
+        plain = found.item()
+        if isinstance(plain, bytes):
+            return plain.decode("ascii", "replace")
+        if isinstance(plain, float) and not np.isfinite(plain):
+            return None
+        names = {number: name for name, number in self.column.values}
+        return names.get(plain, plain)
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """A comparison of a signal, a single number, with a number."""
+
+    signal: Signal
+    sign: str
+    number: float
+
+    @classmethod
+    def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Trigger:
+        """Return the condition in a text. Raises `Failure`."""
+        found = CONDITION.fullmatch(text)
+        if found is None:
+            example = "servo.status.position[2] > 1.2"
+            raise Failure(f'"{text}": not a condition; permitted: as in "{example}"', 2)
+        signal = Signal.of(found[1], boxes)
+        if not signal.is_number:
+            shape = list(signal.column.shape[len(signal.index) :])
+            what = f"numbers of shape {shape}" if shape else "text"
+            raise Failure(f"{signal.name}: {what}; a condition needs a single number", 2)
+        names = dict(signal.column.values)
+        try:
+            number = names[found[3]] if found[3] in names else float(found[3])
+        except ValueError:
+            known = f" or one of {', '.join(names)}" if names else ""
+            raise Failure(f'"{text}": {found[3]} is not a number{known}', 2) from None
+        return cls(signal, found[2], number)
+
+    def holds(self, messages: np.ndarray) -> np.ndarray:
+        """Return whether it holds in each of these messages, (messages,)."""
+        return np.asarray(COMPARISONS[self.sign](self.signal.values(messages), self.number))
