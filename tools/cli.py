@@ -80,6 +80,7 @@ COMMANDS = (
         "rack.tools.commands.replay:replay",
         "Open recordings in the viewer, of several racks on one time line.",
     ),
+    ("export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."),
     (
         "report",
         "rack.tools.commands.report:report",
@@ -111,7 +112,7 @@ COMMANDS = (
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 GROUPS = {
     "Run": ("run", "stop", "step", "list", "clean"),
-    "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "report"),
+    "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "export", "report"),
     "Command and disturb": ("command", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),
     "Compare": ("bench", "reproduce"),

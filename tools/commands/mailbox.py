@@ -134,9 +134,7 @@ class Messages:
             **{name: int(row[name]) for name in HEAD},
             "age_ticks": self._segment.words[System.TICK] - int(row["tick"]),
             "fields": {
-                signal.name.removeprefix(f"{self._box.name}."): signal.plain(
-                    signal.values(message)[0]
-                )
+                signal.name.removeprefix(f"{self._box.name}."): signal.plain(message)[0]
                 for signal in self._signals
             },
         }

@@ -64,8 +64,7 @@ class Strip:
         own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
         if not own:
             return
-        columns = [[signal.plain(v) for v in signal.values(written.messages)] for signal in own]
-        values = map(list, zip(*columns, strict=True))
+        values = map(list, zip(*(signal.plain(written.messages) for signal in own), strict=True))
         rows = self._rows[written.mailbox]
         rows.extend(zip(written.ticks.tolist(), values, strict=True))
         while len(rows) > 1 and rows[1][0] < rows[-1][0] - self._span:

@@ -65,6 +65,14 @@ class Signal:
         return "" if column.values or column.kind[1] == "S" or column.unit == "1" else column.unit
 
     @property
+    def json_type(self) -> str:
+        """The JSON type of one of its values."""
+        kind = np.dtype(self.column.kind).kind
+        if kind == "S" or self.column.values:
+            return "string"
+        return "number" if kind == "f" else "integer"
+
+    @property
     def head(self) -> str:
         """Its name with its unit."""
         return f"{self.name}, {self.unit}".removesuffix(", ")
@@ -78,19 +86,19 @@ class Signal:
         """Return it in each of these messages, shape (messages, *what is left of its own)."""
         return self.column.of(messages)[(slice(None), *self.index)]
 
-    def plain(self, value: Any) -> Any:
-        """Return one value as a user reads it: a number, the name of a state, text, or a list; None
-        for what is not finite."""
-        found = np.asarray(value)
-        if found.ndim:
-            return [self.plain(part) for part in found]
-        plain = found.item()
-        if isinstance(plain, bytes):
-            return plain.decode("ascii", "replace")
-        if isinstance(plain, float) and not np.isfinite(plain):
-            return None
-        names = {number: name for name, number in self.column.values}
-        return names.get(plain, plain)
+    def plain(self, messages: np.ndarray) -> list[Any]:
+        """Return it in each of these messages as users read it: numbers, names of states, text,
+        lists of them; None for what is not finite."""
+        values = self.values(messages)
+        if values.dtype.kind == "S":
+            values = np.strings.decode(values, "ascii", "replace")
+        elif self.column.values:
+            names = {number: name for name, number in self.column.values}
+            values = np.vectorize(lambda number: names.get(number, number), "O")(values)
+        elif values.dtype.kind == "f" and not np.isfinite(values).all():
+            values = np.where(np.isfinite(values), values, None)
+        found: list[Any] = values.tolist()
+        return found
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,60 @@
+"""`rack export`: a recorded run as a file for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.progress import reading_progress
+from rack.tools.recording.recording import Recording
+
+To = Annotated[Literal["mcap"], typer.Option("--to", help="kind of the file")]
+Out = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="file to write; default: RUN/run.mcap")
+]
+
+
+def export(run: RunFolder, to: To = "mcap", out: Out = None, as_json: Json = False) -> None:
+    """Write a recorded run as an MCAP file, which Foxglove and others read.
+
+    Each mailbox is a channel of JSON messages, whose schema has units and meanings; events are one,
+    too. Log time is simulated time, publish time the wall clock. It needs mcap: pip install
+    'nasrem-rack[export]'.
+
+    Exit status: 0 written; 1 it could not be, or mcap is missing; 2 RUN is no run, or FILE exists.
+
+    \b
+    Examples:
+      rack export runs/nasrem-20250101-120000
+      rack export runs/nasrem-20250101-120000 --to mcap --out nasrem.mcap
+    """
+    try:
+        from rack.tools.recording import exchange_file
+    except ImportError as error:
+        if error.name is None or not error.name.startswith("mcap"):
+            raise
+        raise Failure(f"--to {to} needs mcap: pip install 'nasrem-rack[export]'") from None
+    recording = Recording(run)
+    path = run / "run.mcap" if out is None else out
+    if path.exists():
+        raise Failure(f"{path}: exists; remove it, or give another --out", 2)
+    # Whole or not at all, also after Ctrl-C.
+    part = path.with_name(f"{path.name}.part")
+    try:
+        with INTERRUPT.raising():
+            count = exchange_file.export(recording, part, reading_progress(as_json, "exported"))
+        part.rename(path)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise Failure(f"{path}: {error.strerror}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    size = path.stat().st_size
+    document = {"file": str(path), "messages": count, "bytes": size}
+    print_answer(document, f"{path}: {count:,} messages, {size * 1e-6:.1f} MB", as_json)

@@ -1,0 +1,131 @@
+"""A recording as an MCAP file, for other viewers: a channel for each mailbox, its messages as JSON
+by a JSON schema, with units and meanings.
+
+A message's log time is simulated time since the start of the run; its publish time is the wall
+clock when it was written. Events are a channel of their own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from heapq import merge
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.writer import Writer
+
+from rack.backplane.layout import FieldSpec, MailboxSpec
+from rack.tools.recording.parquet import CONFIG, columns_of
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.signal import Signal
+
+EVENTS = "events"
+EVENT_SCHEMA = {
+    "type": "object",
+    "properties": {
+        name: {"type": "string"} for name in ("kind", "board", "code", "text", "subject")
+    },
+}
+ENCODING = "jsonschema"
+BLOCK = 1024
+"""Messages of a mailbox that are made into JSON at once."""
+
+
+class Sample(NamedTuple):
+    """A message of a channel. They sort by time."""
+
+    log_ns: int  # simulated, since the start of the run
+    channel: int
+    sequence: int
+    publish_ns: int  # on the wall clock
+    data: bytes
+
+
+def export(recording: Recording, path: Path, show: Callable[[float], None]) -> int:
+    """Write the file; return its number of messages. `show` is called with the part that is
+    done."""
+    boxes = {box.name: box for box in recording.whole_layout.mailboxes}
+    found = [boxes[name] for name in recording.mailboxes]
+    total = sum(len(recording.signal(box.name, "serial")) for box in found)
+    count = 0
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="nasrem-rack")
+        writer.add_metadata("rack", {"name": recording.layout.rack, CONFIG: recording.config})
+        channels = [_channel(writer, box.name, box.message, _schema(box.fields)) for box in found]
+        streams = [_samples(recording, *pair) for pair in zip(found, channels, strict=True)]
+        events = _channel(writer, EVENTS, "event", EVENT_SCHEMA)
+        for sample in merge(_events(recording, events), *streams):
+            writer.add_message(
+                sample.channel, sample.log_ns, sample.data, sample.publish_ns, sample.sequence
+            )
+            count += 1
+            if count % BLOCK == 0:
+                show(count / total)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return count
+
+
+def _channel(writer: Writer, topic: str, message: str, schema: dict[str, Any]) -> int:
+    made = writer.register_schema(message, ENCODING, json.dumps(schema).encode())
+    return writer.register_channel(topic, "json", made)
+
+
+def _schema(fields: Sequence[FieldSpec]) -> dict[str, Any]:
+    """Return the JSON schema of a message; groups of fields are flattened, as in the parquet
+    files."""
+    head = {
+        "serial": {"type": "integer", "description": "of the message, rising by one"},
+        "tick": {"type": "integer", "description": "release of the cycle that wrote it"},
+    }
+    box = MailboxSpec("", "", (), "time-slice", 1, 1, 1, "", 1, 0, tuple(fields))
+    meanings = dict(_meanings("", fields))
+    for column in columns_of(box):
+        name = column.name.removeprefix(".")
+        signal = Signal(name, "", column, ())
+        head[name] = _of_shape(signal.json_type, column.shape)
+        head[name]["description"] = f"{meanings[name]} ({signal.unit})".removesuffix(" ()")
+    return {"type": "object", "properties": head}
+
+
+def _meanings(path: str, fields: Sequence[FieldSpec]) -> Iterator[tuple[str, str]]:
+    for field in fields:
+        name = f"{path}{field.name}"
+        yield name, field.meaning
+        yield from _meanings(f"{name}.", field.fields)
+
+
+def _of_shape(kind: str, shape: Sequence[int]) -> dict[str, Any]:
+    found: dict[str, Any] = {"type": kind}
+    for _ in shape:
+        found = {"type": "array", "items": found}
+    return found
+
+
+def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[Sample]:
+    """Yield the messages of a mailbox, oldest first."""
+    rows = recording.rows(box.name)
+    signals = [Signal(column.name, box.name, column, ()) for column in columns_of(box)]
+    names = ["serial", "tick", *(signal.name.removeprefix(f"{box.name}.") for signal in signals)]
+    clock_ns = recording.layout.clock_ns
+    wall_ns = recording.launch.wall_offset_ns
+    for first in range(0, len(rows), BLOCK):
+        block = rows[first : first + BLOCK]
+        heads = [block[name].tolist() for name in ("serial", "tick")]
+        columns = [*heads, *(signal.plain(block["message"]) for signal in signals)]
+        for values, stamp_ns in zip(
+            zip(*columns, strict=True), block["stamp_ns"].tolist(), strict=True
+        ):
+            serial, tick = values[:2]
+            data = json.dumps(dict(zip(names, values, strict=True))).encode()
+            sequence = serial & 0xFFFFFFFF
+            yield Sample(tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data)
+
+
+def _events(recording: Recording, channel: int) -> Iterator[Sample]:
+    ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
+    clock_ns = recording.layout.clock_ns
+    for number, event in enumerate(sorted(ticked, key=lambda event: int(event["tick"]))):
+        data = json.dumps(event).encode()
+        yield Sample(event["tick"] * clock_ns, channel, number, event["time_ns"], data)
