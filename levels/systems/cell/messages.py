@@ -75,7 +75,7 @@ ACTION_FIELDS = (
     real("lift", "m", "height of a transfer's straight motions"),
     real("quaternion", "1", "of the tool, for goal pose", 4),
     real("direction", "1", "of the tool's z axis, for goal direction", 3),
-    flag("count", "joints that follow"),
+    Field("count", "u1", "1", "joints that follow"),
     real("joints", "rad", "joint positions, for goal joints", MAX_JOINTS),
     real("by", "s", "simulated time by which it must be done; 0: any time"),
 )
