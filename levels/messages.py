@@ -56,6 +56,8 @@ class Error(IntEnum):
     FORCE = 18  # a contact stronger than the arm's limits
     CLIENT = 19  # a server's client is lost or silent
     CONTACT = 20  # a contact was not made, or was lost
+    DISABLED = 21  # the arm is not enabled yet, or no more: its operator enables it
+    DRIVES = 22  # the arm's drives report a fault: its operator resets it
 
 
 class Verb(IntEnum):

@@ -38,6 +38,10 @@ class Operation(IntEnum):
     TABLE = 6  # decide by the state table `name` from now on
     # do the level's own command `name` in place of those of the level above, and stay until RESUME
     DO = 7
+    ENABLE = 8  # ask the arm's drives for torque
+    DISABLE = 9  # brake the arm, and take the torque from its drives
+    RESET = 10  # let the arm's drives leave their fault
+    RELEASE = 11  # end the bring-up: full speed from now on
 
 
 class Goal(IntEnum):
@@ -55,6 +59,8 @@ class Goal(IntEnum):
 SETTINGS = (Operation.MODIFY, Operation.TABLE)
 """Operations that are done at once and leave the command in force as it is; each names what it
 sets."""
+DRIVES = (Operation.ENABLE, Operation.DISABLE, Operation.RESET, Operation.RELEASE)
+"""Operations on the arm itself, which leave the command in force as it is, too."""
 NAMED = (*SETTINGS, Operation.DO)
 """Operations that give a name: see `Executor.wording`."""
 
@@ -171,7 +177,7 @@ class Orders:
         taken = False
         for message in (*operator.earlier, operator.value):
             if self._take_up(message):
-                taken = taken or message.what not in SETTINGS
+                taken = taken or message.what not in (*SETTINGS, *DRIVES)
                 if judge is not None:
                     judge(message)
         return taken
@@ -195,7 +201,7 @@ class Orders:
             )
             return False
         self.basis = self.serial
-        if what not in SETTINGS:
+        if what not in (*SETTINGS, *DRIVES):
             self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
         self.answer = Answer.DONE if what in (Operation.RESUME, *SETTINGS) else Answer.TAKEN
         return True

@@ -9,9 +9,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from rack.levels.errors import LevelError
 from rack.levels.references import module_and_name
@@ -225,6 +232,28 @@ class RobotConfig(Table):
     min_armature: Finite = Field(
         0.05, ge=0, description="least drive inertia of every joint, kg m2: light wrists need it"
     )
+    enable: Literal["at-start", "by-command"] | None = Field(
+        None,
+        description=(
+            "when drives are asked for torque: at the start, or by `rack command RACK servo"
+            " enable`; default: at-start for the simulated arm, by-command for every other"
+        ),
+    )
+    guessed: tuple[str, ...] = Field(
+        (),
+        description=(
+            "keys of this table whose values were guessed, as in gripper.force: an arm that is"
+            " not simulated is not enabled before each is confirmed, by removing it here"
+        ),
+    )
+
+    @field_validator("guessed")
+    @classmethod
+    def _are_keys(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if name.partition(".")[0] not in cls.model_fields:
+                raise ValueError(f"'{name}' is no key of [robot]; `rack schema robot` lists them")
+        return names
 
 
 class MotionConfig(Table):

@@ -66,7 +66,7 @@ RUNS = (
     "configs/examples/own-servo/pd.toml --seconds 2",
     "configs/examples/own-modification/gentle.toml --seconds 2",
     "configs/examples/own-planner/trapezoid.toml --seconds 4",
-    "configs/examples/own-hardware/hardware.toml --seconds 2",
+    "configs/examples/own-hardware/hardware.toml --seconds 2 --set robot.enable=at-start",
     "configs/examples/own-arm/desk-arm.toml --seconds 2",
 )
 """As one would call `rack run`, but for --lockstep. The script `overload` needs real time."""
@@ -89,7 +89,7 @@ def digest(run: str, name: str) -> str:
     place = FILE.parents[1] / words[0]
     config = load(
         place if place.is_file() else words[0],
-        [f"name={name}", "clock.mode=lockstep"],
+        [f"name={name}", "clock.mode=lockstep", *options.get("--set", "").split()],
         options.get("--faults"),
     )
     with Rack(config) as rack:

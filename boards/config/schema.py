@@ -409,11 +409,24 @@ class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"] = Field(
+    what: Literal[
+        "hold",
+        "resume",
+        "setpoint",
+        "goto",
+        "modify",
+        "table",
+        "do",
+        "enable",
+        "disable",
+        "reset",
+        "release",
+    ] = Field(
         description=(
             "hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there;"
             " modify: put a control modification in or take it out; table: decide by another state"
-            " table; do: do one of the level's own commands"
+            " table; do: do one of the level's own commands; enable, disable: give torque to the"
+            " arm, or take it; reset: clear a fault of its drives; release: end robot.bring_up"
         )
     )
     tick: int | None = Field(

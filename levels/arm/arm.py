@@ -11,6 +11,7 @@ any crash; report a broken arm in `fault` instead.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.plant import Plant
 from rack.levels.level import Finding
+from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig, named_class
@@ -27,6 +29,15 @@ from rack.levels.tables import SceneConfig, named_class
 TORQUE_MARGIN = 1.001
 """Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits
 itself."""
+
+
+class DriveState(IntEnum):
+    """State of an arm's drives: those of CiA 402, reduced to what a level above must tell apart."""
+
+    DISABLED = 0  # up to "switched on", without a request: no power, brakes engaged
+    ENABLING = 1  # asked for: on the way to "operation enabled", homing included
+    ENABLED = 2  # "operation enabled": torques act; in "quick stop active" none would
+    FAULT = 3  # "fault reaction active" and "fault": until `Arm.reset`
 
 
 class Sensed(NamedTuple):
@@ -83,6 +94,7 @@ class Arm(Plant, ABC):
         self.waited = self.patience
         self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
         self.grip_force = 0.0  # N: given to the gripper last
+        self.state = DriveState.DISABLED  # of the drives, as of the last `step`
         self.dynamics = Dynamics(
             cell
         )  # for the level that drives the arm; one that senses exactly shares it with it
@@ -109,6 +121,29 @@ class Arm(Plant, ABC):
 
         `ticks` exceeds the level's cycle after missed cycles, and may be 0.
         """
+
+    def enable(self) -> None:
+        """Ask the drives for torque; does not block: `state` becomes ENABLED in a later `step`.
+
+        Until then, and whenever the arm is not enabled, it is braked in every cycle. Default:
+        drives that know no states are enabled at once.
+        """
+        self.state = DriveState.ENABLED
+
+    def disable(self) -> None:
+        """Ask the drives to give no torque any more. Default: the brakes do it, at once."""
+        self.brake()
+        self.state = DriveState.DISABLED
+
+    def reset(self) -> None:
+        """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
+        were in it. Default: they cannot."""
+
+    def restore(self, state: Message) -> None:
+        """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
+        super().restore(state)
+        was_disabled = state.error == Error.DISABLED
+        self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
 
     def refused(self, torque: Array) -> Finding | None:
         """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;

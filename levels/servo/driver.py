@@ -14,6 +14,7 @@ from rack.backplane.watch.alarms import AT_START, BY_DEMAND, NO_TORQUE
 from rack.levels.algebra import Array
 from rack.levels.arm import (
     Arm,
+    DriveState,
     FaultyLink,
     GuardedArm,
     Link,
@@ -33,6 +34,7 @@ from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
 from rack.levels.servo.control import ArmParams
 from rack.levels.servo.curves import Motion
+from rack.levels.servo.enabling import Enabling
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
 
@@ -94,6 +96,7 @@ class ArmDriver(Executor):
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         self.motors = ActuatorMonitor(cell, params.following, context.period_s)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
+        self.enabling = Enabling(self.arm, context)
         self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
         self._brakes = BrakeLog(self.arm, every)
         self._wanted = np.zeros(
@@ -106,6 +109,7 @@ class ArmDriver(Executor):
         self._show_numbers = show.load()
         self._shown: SteadyStatus | None = None  # in the last status
         self._started = False  # the first cycle has begun
+        self._adopted = False  # the arm is enabled, and its pose then was taken over
         self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
         self.command = self.rests_on = (
             0  # serials of the newest command, and of the operator's that it rests on
@@ -192,15 +196,17 @@ class ArmDriver(Executor):
         sensed = self._link.sense()
         sensors = self.sensors
         contact = self.arm.contact
-        sensors.look(
-            sensed, tick, None if missed or self.abandoned else self._wanted, contact is not None
-        )
+        if self._is_judged(sensed, tick):
+            wanted = None if missed or self.abandoned else self._wanted
+            sensors.look(sensed, tick, wanted, contact is not None)
         if contact is not None:
             self.stopping.struck(contact, self.arm.named(contact), tick)
-        if self._guard is not None and self._guard.exceeded is not None:
+        if self._adopted and self._guard is not None and self._guard.exceeded is not None:
             self.stopping.exceeds(*self._guard.exceeded, tick)
         self.feel(tick)
-        reaction = self.stopping.decide(self.demand, sensors, tick)
+        if self.enabling.arrived(self.orders.serial):
+            self.orders.done()
+        reaction = self._decide(tick)
         if reaction is Reaction.BRAKE:
             self.brake()
         elif sensors.fresh:
@@ -231,12 +237,32 @@ class ArmDriver(Executor):
         self.motors.drop()
         return True
 
+    def _is_judged(self, sensed: Sensed, tick: int) -> bool:
+        """Return whether this sample can be judged: until the arm is enabled, it only says where
+        the arm is, and may be missing."""
+        is_enabled = self.arm.state is DriveState.ENABLED
+        if self._adopted and is_enabled:
+            return True
+        is_adopted = self.sensors.adopt(sensed, tick)
+        self._adopted = is_adopted and is_enabled
+        return is_adopted or is_enabled
+
+    def _decide(self, tick: int) -> Reaction:
+        """Return the reaction of this cycle; an arm that is not enabled is braked, and waits."""
+        state = self.arm.state
+        if state is DriveState.ENABLED:
+            return self.stopping.decide(self.demand, self.sensors, tick)
+        error = Error.DRIVES if state is DriveState.FAULT else Error.DISABLED
+        return self.stopping.wait(error, self.enabling.reason, tick)
+
     def _start(self, before: Message | None, tick: int) -> None:
+        self.enabling.start(before is not None)
         if before is not None:
             self.arm.restore(before)
             self.sensors.recall(before)
             self.stopping.recall(before)
             self.started()
+            self._adopted = self.arm.state is DriveState.ENABLED
         if self.arm.braked:
             self._brakes.start(self.arm.tick, AT_START if before is None else NO_TORQUE)
         self.arm.step(tick - self.arm.tick)
@@ -330,7 +356,11 @@ class ArmDriver(Executor):
         status.touches = shown.touches
         status.violations = shown.violations
         status.pushed = shown.pushed
-        if shown.fault:
+        if self.stopping.is_disabled:
+            status.state = State.HOLDING
+            status.error = self.stopping.cause
+            status.reason = kept
+        elif shown.fault:
             status.state = State.ERROR
             status.error = Error.SIMULATION
             status.reason = shown.fault

@@ -12,7 +12,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.level import Input, LevelContext, Ports, Verdict
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_STATUS
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import control, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
@@ -45,6 +45,7 @@ class ServoExecutor(ArmDriver):
         Operation.RESUME: (),
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
+        **dict.fromkeys(DRIVES, ()),
     }
     params: ClassVar[type[ServoParams]] = ServoParams
 
@@ -58,8 +59,9 @@ class ServoExecutor(ArmDriver):
         self._loop = ComputedTorque(cell, params, self.arm.dynamics)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         joints = context.robot.joints
-        modify = self._modified.obey
-        self.operator = OperatorControl(self.commands, joints, cell.limits.position, modify=modify)
+        self.operator = OperatorControl(
+            self.commands, joints, cell.limits.position, obey=self._obey
+        )
         self.orders = self.operator.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
 
@@ -96,6 +98,12 @@ class ServoExecutor(ArmDriver):
             self.reference.take(command)
             if self._grip is not None:
                 self._grip.take(command)
+
+    def _obey(self, command: Message) -> str:
+        """Do what leaves the command in force as it is; return why not, empty: it does."""
+        if command.what == Operation.MODIFY:
+            return self._modified.obey(command)
+        return self.enabling.obey(command)
 
     def started(self) -> None:
         """Keep the grip on a part."""

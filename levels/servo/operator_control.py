@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.operator import Commands, Operation, Orders, joints_of
+from rack.levels.operator import DRIVES, SETTINGS, Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
 
@@ -33,19 +33,19 @@ class OperatorControl:
         ranges: Array,
         driven: Mask | None = None,
         *,
-        modify: Callable[[Message], str],
+        obey: Callable[[Message], str],
     ) -> None:
         """Permit set points of the joints `driven`, (joints,), default all, within `ranges`
         (joints, 2), rad.
 
-        `modify` obeys a command to modify the law, or returns why not.
+        `obey` obeys a command that leaves the one in force as it is, or returns why not.
         """
         self.orders = Orders(commands)
         self.stands = False  # the level follows the operator, not the level above
         self._driven = np.full(len(joints), True) if driven is None else driven
         self._joints = [joint for joint, own in zip(joints, self._driven, strict=True) if own]
         self._ranges = ranges[self._driven]
-        self._modify = modify
+        self._obey = obey
         self._position = np.zeros(len(joints))  # (joints,), rad: of the arm, at the newest command
         self._goal: Array | None = None  # (joints,), rad
         self._way: list[
@@ -76,9 +76,9 @@ class OperatorControl:
         return f"{what} by the operator; `resume` releases it"
 
     def _judge(self, command: Message) -> None:
-        """Take the goal of a set point, or refuse it; modify the law."""
-        if command.what == Operation.MODIFY:
-            if why := self._modify(command):
+        """Take the goal of a set point, or refuse it; do what leaves the command in force."""
+        if command.what in (*SETTINGS, *DRIVES):
+            if why := self._obey(command):
                 self.orders.refuse(why)
         elif self.orders.standing is Operation.SETPOINT:
             try:

@@ -121,6 +121,23 @@ class SensorMonitor:
         self.doubt[:] = state.doubt
         self._tick = state.tick
 
+    def adopt(self, sensed: Sensed, tick: int) -> bool:
+        """Take the arm to be where this sample of `tick` has it; return whether it is one that can
+        be taken.
+
+        For an arm that is not driven yet: where it has been, and was moved to, nobody knows.
+        """
+        q, qd, _, _, sampled = sensed
+        if sampled != tick or not (np.isfinite(q).all() and np.isfinite(qd).all()):
+            return False
+        self._table[2:6] = 0.0
+        for row, before in enumerate((q - self._every * self._tick_s * qd, qd)):
+            self._table[2 + row] = self._table[4 + row] = before
+        self.doubt[:] = 0.0
+        self._tick = tick - self._every
+        self._trust()
+        return True
+
     def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
         """Check a sample at `tick`, and add faults to `findings`, once per episode.
 
@@ -296,12 +313,16 @@ class SensorMonitor:
         self._streak = self._streak + 1 if good else 0
         if self._streak < (self._retry_cycles if self._unproven.any() else self._good_cycles):
             return False
+        self._trust()
+        return True
+
+    def _trust(self) -> None:
+        """End an episode."""
         self.faulty = False
         self._streak = 0
         self._unproven[:] = False
         self._suspect[:] = False
         self._rung.clear()
-        return True
 
 
 @compiled

@@ -82,16 +82,23 @@ class Stopping:
         """Continue from the state in an `ARM_STATE`."""
         self._tick = state.tick
         self._kept = state.kept
-        self.error = Error(state.error)
-        self.reason = state.reason
+        if state.error != Error.DISABLED:
+            self.error = Error(state.error)
+            self.reason = state.reason
 
     def remember(self, state: Message) -> None:
         """Fill in the state for `recall`."""
-        if (self._kept, self.error) != self._remembered:
-            self._remembered = self._kept, self.error
+        error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
+        if (self._kept, error) != self._remembered:
+            self._remembered = self._kept, error
             state.kept = self._kept
-            state.error = self.error
+            state.error = error
             state.reason = self.reason if self.error else ""
+
+    @property
+    def is_disabled(self) -> bool:
+        """Whether the arm is not enabled, and nothing worse is known."""
+        return self.cause in (Error.DISABLED, Error.DRIVES)
 
     @property
     def trying(self) -> bool:
@@ -135,6 +142,15 @@ class Stopping:
         self._on_blow = reaction if self._struck_until is None else max(self._on_blow, reaction)
         self._struck_until = tick + self._retry_ticks
         self._blow = blow
+
+    def wait(self, error: Error, why: str, tick: int) -> Reaction:
+        """Return the reaction of this cycle while the arm is not enabled, which no patience
+        bounds: `error` is DISABLED or DRIVES."""
+        self._tick = tick
+        if not self.error:
+            self.cause = error
+            self.reason = why
+        return Reaction.BRAKE
 
     def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
         """Return the reaction of this cycle."""

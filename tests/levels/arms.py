@@ -69,6 +69,7 @@ def pendulum(
         "velocity": (2.0, 3.0),
         "acceleration": (6.0, 9.0),
         "jerk": (60.0, 90.0),
+        "enable": "at-start",
     }
     return RobotConfig(**{**tables, **robot})
 

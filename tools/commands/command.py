@@ -20,7 +20,7 @@ from rack.tools.console.parameters import (
 )
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
-DONE_AT_ONCE = ("resume", "modify", "table")
+DONE_AT_ONCE = ("resume", "modify", "table", "enable", "disable", "reset", "release")
 """Commands that leave none in force."""
 
 Level = Annotated[
@@ -31,7 +31,7 @@ Level = Annotated[
 ]
 What = Annotated[
     str | None,
-    typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, modify, table or do"),
+    typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, enable, ...; see above"),
 ]
 Goals = Annotated[
     list[str] | None,
@@ -84,9 +84,13 @@ def command(
               between two samples and without a step in the torque
     table     decide by another state table from now on
     do        do one of the level's own commands, in place of the level above
+    enable    ask the arm's drives for torque; the arm goes on from where it is
+    disable   brake the arm, and take the torque from its drives
+    reset     clear a fault of the arm's drives, which are then disabled
+    release   end the bring-up of an arm: full speed from now on
 
-    All but `modify` and `table` stay in force until `resume`. They survive a restart of the level's
-    board. An emergency stop takes precedence.
+    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`. They survive a restart of the
+    level's board. An emergency stop takes precedence.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.
@@ -99,6 +103,7 @@ def command(
       rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
+      rack command hardware servo enable --wait
       rack command brown joints modify friction on --at 2.5
       rack command nist-state-table task table careful
       rack command nist-state-table elemental_move do pick block1 --wait

@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.level import Input, LevelContext, Ports, Reading
 from rack.levels.messages import ARM_STATE
-from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams
 from rack.levels.servo.curves import Motion
@@ -42,7 +43,7 @@ class ArmExecutor(ArmDriver):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = {Operation.HOLD: (), Operation.RESUME: (), **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -98,7 +99,12 @@ class ArmExecutor(ArmDriver):
     def take_messages(self, read: Ports) -> None:
         """Take over what is new."""
         self._torques = read.torques
-        self.orders.take(read.operator)
+        self.orders.take(read.operator, self._judge)
+
+    def _judge(self, command: Message) -> None:
+        """Obey what leaves the command in force as it is, or refuse it."""
+        if command.what in DRIVES and (why := self.enabling.obey(command)):
+            self.orders.refuse(why)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return where the boards above want the arm; None: not all of them drive it."""

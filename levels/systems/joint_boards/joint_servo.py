@@ -89,7 +89,7 @@ class JointServo(Executor):
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         modify = self._modified.obey
         self.operator = OperatorControl(
-            self.commands, robot.joints, cell.limits.position, self._driven, modify=modify
+            self.commands, robot.joints, cell.limits.position, self._driven, obey=modify
         )
         # What the law sets for its modifications.
         self._unmodified: Array = np.zeros(7 * len(robot.joints))

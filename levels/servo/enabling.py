@@ -1,0 +1,78 @@
+"""Whether the arm is enabled: asks its drives at the start or by an operator's command, and says
+what they wait for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from rack.backplane.message import Message
+from rack.levels.arm import Arm, DriveState
+from rack.levels.level import LevelContext
+from rack.levels.operator import Operation
+
+
+class Enabling:
+    """Follows the states of an arm's drives. Only an enabled arm is driven, and judged.
+
+    Whoever enables an arm sees it: after a fault, or after drives took their torque by themselves,
+    it must be enabled again. A restarted board finds the arm as it is, and asks for nothing.
+    """
+
+    def __init__(self, arm: Arm, context: LevelContext) -> None:
+        robot = context.robot
+        self._arm = arm
+        self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
+        self._say = f"rack command {context.rack} {context.board}"
+        self._guessed = "" if arm.keeps_limits else ", ".join(robot.guessed)
+        self._restarted = False  # in the first cycle, in which old commands are read again
+        self._serial = 0  # of the newest command, while drives are on their way; 0: they are not
+        self._goal: Collection[DriveState] = ()  # states in which it is done
+
+    def start(self, restarted: bool) -> None:
+        """Begin: ask for torque where that is not the operator's to do."""
+        self._restarted = restarted
+        if self._at_start and not (restarted or self._guessed):
+            self._arm.enable()
+
+    def obey(self, command: Message) -> str:
+        """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
+        arm = self._arm
+        self._serial = command.id
+        self._goal = list(DriveState)
+        if command.what == Operation.ENABLE and arm.state is not DriveState.ENABLED:
+            if self._restarted:
+                return "its board was restarted since; if it still stands, command it again"
+            if self._guessed or arm.state is DriveState.FAULT:
+                return self.reason
+            self._goal = (DriveState.ENABLED,)
+            arm.enable()
+        elif command.what == Operation.DISABLE:
+            self._goal = (DriveState.DISABLED, DriveState.FAULT)
+            arm.disable()
+        elif command.what == Operation.RESET and not self._restarted:
+            self._goal = set(DriveState) - {DriveState.FAULT}
+            arm.reset()
+        return ""
+
+    def arrived(self, serial: int) -> bool:
+        """Return whether the drives are where the newest command, `serial`, wants them: once."""
+        self._restarted = False
+        if not self._serial or self._arm.state not in self._goal:
+            return False
+        is_newest = self._serial == serial
+        self._serial = 0
+        return is_newest
+
+    @property
+    def reason(self) -> str:
+        """Why the arm is not enabled, and what enables it; empty: it is."""
+        state = self._arm.state
+        if state is DriveState.ENABLED:
+            return ""
+        if state is DriveState.FAULT:
+            return f"drives: {self._arm.fault}; to clear: {self._say} reset, then enable"
+        if state is DriveState.ENABLING:
+            return "drives are being enabled"
+        if self._guessed:
+            return f"confirm, then remove from robot.guessed, before it is enabled: {self._guessed}"
+        return f"disabled; to enable: {self._say} enable"
