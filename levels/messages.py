@@ -354,10 +354,13 @@ DRIVEN_ARM = (
         "substeps in which the arm drove a position, velocity or torque beyond its limit",
     ),
     Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+    Field(
+        "slowed", "u1", "1", "1: speeds are scaled down by robot.bring_up, until the release of it"
+    ),
 )
 """Fields of the status of a level that drives an arm."""
 
-SERVO_STATUS = status("servo_status", 4, *ANSWER, *DRIVEN_ARM)
+SERVO_STATUS = status("servo_status", 5, *ANSWER, *DRIVEN_ARM)
 
 ARM_STATE = MessageType(
     "arm_state",

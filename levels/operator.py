@@ -203,7 +203,8 @@ class Orders:
         self.basis = self.serial
         if what not in (*SETTINGS, *DRIVES):
             self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
-        self.answer = Answer.DONE if what in (Operation.RESUME, *SETTINGS) else Answer.TAKEN
+        is_done = what in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
+        self.answer = Answer.DONE if is_done else Answer.TAKEN
         return True
 
     def refuse(self, why: str) -> None:

@@ -112,6 +112,21 @@ class SensorConfig(Table):
     )
 
 
+class CalibrationConfig(Table):
+    """`[robot.calibration]`: how the drives' samples become positions of the joints."""
+
+    offset: tuple[Finite, ...] | None = Field(
+        None, description="added to every position that the drives give, rad; default: nothing"
+    )
+    homing: bool = Field(
+        False,
+        description=(
+            "the drives find their reference while they are being enabled, and know no position"
+            " before that"
+        ),
+    )
+
+
 class GripperConfig(Table):
     """A gripper driven by one actuator along one joint."""
 
@@ -190,7 +205,12 @@ class RobotConfig(Table):
     tool: str = Field(
         description="MJCF site whose pose is the tool's; for a model without one, its last body"
     )
-    home: tuple[Finite, ...] = Field(description="joint positions at the start, rad")
+    home: tuple[Finite, ...] = Field(
+        description="joint positions to which tasks return, and the simulated start, rad"
+    )
+    start: tuple[Finite, ...] | None = Field(
+        None, description="where the simulated arm starts, rad; default: home"
+    )
     velocity: tuple[Positive, ...] = Field(description="velocity limits, rad/s")
     acceleration: tuple[Positive, ...] = Field(
         description="acceleration limits of planned motion, rad/s2"
@@ -203,8 +223,15 @@ class RobotConfig(Table):
         None, description="position limits, rad; default: the model's joint ranges"
     )
     gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
-    sensors: SensorConfig = Field(
-        SensorConfig(), description="resolution and noise of the joints' encoders"
+    sensors: SensorConfig | None = Field(
+        None,
+        description=(
+            "resolution and noise of the joints' encoders; default: exact if they are simulated,"
+            " 1e-4 and 5e-5 rad otherwise, see `rack.levels.arm.Arm.sensors`"
+        ),
+    )
+    calibration: CalibrationConfig = Field(
+        CalibrationConfig(), description="from the drives' samples to positions"
     )
     latency_ticks: int = Field(
         0,
@@ -239,6 +266,14 @@ class RobotConfig(Table):
             " enable`; default: at-start for the simulated arm, by-command for every other"
         ),
     )
+    bring_up: Positive | None = Field(
+        None,
+        le=1.0,
+        description=(
+            "part of full speed at which the arm moves until `rack command RACK servo release`;"
+            " default: full speed from the start"
+        ),
+    )
     guessed: tuple[str, ...] = Field(
         (),
         description=(
@@ -246,6 +281,13 @@ class RobotConfig(Table):
             " not simulated is not enabled before each is confirmed, by removing it here"
         ),
     )
+
+    @property
+    def per_joint(self) -> dict[str, tuple[Any, ...] | None]:
+        """The lists with one value per joint, by key; None: not given."""
+        keys = ("home", "start", "velocity", "acceleration", "jerk", "torque", "position")
+        lists = {key: getattr(self, key) for key in keys}
+        return {**lists, "calibration.offset": self.calibration.offset}
 
     @field_validator("guessed")
     @classmethod

@@ -3,6 +3,7 @@ two."""
 
 from rack.levels.arm import drives, poses, substeps
 from rack.levels.arm.arm import Arm, DriveState, Link, Sensed, find_arm
+from rack.levels.arm.calibration import CalibratedLink
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.present import PresentLink
@@ -11,6 +12,7 @@ from rack.levels.robot import dynamics
 
 __all__ = [
     "Arm",
+    "CalibratedLink",
     "DriveState",
     "FaultyLink",
     "GuardedArm",

@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, Sensed
+from rack.levels.arm.arm import Arm, DriveState, Link, Sensed
 from rack.levels.arm.drives import LimitGate
 from rack.levels.arm.present import PresentLink
 from rack.levels.errors import RobotError
@@ -45,23 +45,37 @@ class GuardedArm:
         cell: Cell,
         joints: Sequence[str],
         tick_s: float,
-        present: PresentLink | None = None,
+        below: Link | None = None,
+        part: float = 1.0,
     ) -> None:
-        """Guard an arm with these `joints`; `present` brings its samples to the present, if they
-        are late. Raises `RobotError` for encoders too coarse to tell a limit."""
+        """Guard an arm with these `joints`, sensed by the link `below`, if it has one of its own.
+        Raises `RobotError` for encoders too coarse to tell a limit, velocities by `part`."""
         self._arm = arm
-        self._present = present
-        bounds = cell.bounds
+        self._below: Link = below or arm
+        self._cell = cell
+        self._joints = joints
+        self._span_s = arm.patience * tick_s
+        self._dynamics = Dynamics(cell)
+        self._state: Sensed | None = None
+        self.exceeded: Exceeded | None = None
+        """Of the newest sample."""
+        self.permit(part)
+
+    def permit(self, part: float) -> None:
+        """Keep velocities within `part` of their limits. Raises `RobotError`."""
+        cell = self._cell
+        joints = self._joints
+        position = cell.bounds.position
+        velocity = part * cell.bounds.velocity
         off = cell.encoders.off
         speed_off = cell.encoders.speed_off
-        self._low = bounds.position[:, 0] - off
-        self._high = bounds.position[:, 1] + off
-        self._fastest = bounds.velocity + speed_off
-        self._joints = joints
+        self._low = position[:, 0] - off
+        self._high = position[:, 1] + off
+        self._fastest = velocity + speed_off
         kept = Bounds(
-            position=bounds.position + np.stack((off, -off), axis=1),
-            velocity=bounds.velocity - speed_off,
-            torque=bounds.torque,
+            position=position + np.stack((off, -off), axis=1),
+            velocity=velocity - speed_off,
+            torque=cell.bounds.torque,
         )
         coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
         if coarse.any():
@@ -70,20 +84,16 @@ class GuardedArm:
             raise RobotError(
                 f"robot.{name}: '{joints[joint]}' may be off by {off[joint]:g} rad,"
                 f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
-                f" {bounds.velocity[joint]:g} rad/s; permitted: less than half of that"
+                f" {velocity[joint]:g} rad/s; permitted: less than half of that"
             )
-        span_s = arm.patience * tick_s
-        self._gate = LimitGate(kept, cell.limits.acceleration, span_s, Dynamics(cell))
-        self._state: Sensed | None = None
-        self.exceeded: Exceeded | None = None
-        """Of the newest sample."""
+        self._gate = LimitGate(kept, cell.limits.acceleration, self._span_s, self._dynamics)
 
     def sense(self) -> Sensed:
         """Return the newest sample, judged."""
-        if self._present is None:
-            state = sample = self._arm.sense()
+        if isinstance(self._below, PresentLink):
+            _, state, sample = self._below.look()
         else:
-            _, state, sample = self._present.look()
+            state = sample = self._below.sense()
         is_new = self._state is None or state.tick != self._state.tick
         self._state = state
         if is_new:
@@ -125,6 +135,7 @@ class GuardedArm:
             what = f"velocity {value:.4g} rad/s"
         text = f"{what} of joint '{self._joints[joint]}' as sensed; permitted: {permitted}"
         arm = self._arm
-        arm.violations += 1
-        arm.first_violation = arm.first_violation or f"{text}, at tick {sample.tick}"
+        if arm.state is DriveState.ENABLED:  # before that it is moved by others
+            arm.violations += 1
+            arm.first_violation = arm.first_violation or f"{text}, at tick {sample.tick}"
         self.exceeded = Exceeded(Finding(Alarm.LIMIT_EXCEEDED, joint, value), text)

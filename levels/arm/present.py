@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array, solve
-from rack.levels.arm.arm import Arm, Sensed, copied
+from rack.levels.arm.arm import Arm, Link, Sensed, copied
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -40,8 +40,10 @@ class PresentLink:
     is passed on as it is.
     """
 
-    def __init__(self, arm: Arm, cell: Cell, tick_s: float) -> None:
+    def __init__(self, arm: Arm, cell: Cell, tick_s: float, below: Link | None = None) -> None:
+        """Sense the `arm` by the link `below`, if it has one of its own."""
         self._arm = arm
+        self._below: Link = below or arm
         self._braking = cell.limits.acceleration
         self._dynamics = Dynamics(cell)
         self._latency = cell.encoders.latency_ticks
@@ -57,7 +59,7 @@ class PresentLink:
         """Return the newest sample, and the present state."""
         arm = self._arm
         last = self._last
-        sample = copied(arm.sense())
+        sample = copied(self._below.sense())
         self._driven.append(Driven(arm.tick, None if arm.braked else arm.torque.copy()))
         if not 0 < arm.tick - sample.tick <= self._latency:
             self._last = Present(sample, sample, sample)

@@ -18,7 +18,7 @@ from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.engine import one_view
-from rack.levels.tables import SceneConfig
+from rack.levels.tables import SceneConfig, SensorConfig
 
 
 class SimulatedArm(Simulation, Arm):
@@ -31,6 +31,7 @@ class SimulatedArm(Simulation, Arm):
     """
 
     keeps_limits = True
+    sensors = SensorConfig()
 
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
@@ -46,7 +47,7 @@ class SimulatedArm(Simulation, Arm):
         self._gripper = cell.gripper
         dynamics = Dynamics(cell)
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
-        self._brake = Brake(cell.limits.acceleration, dynamics, cell.home)
+        self._brake = Brake(cell.limits.acceleration, dynamics, cell.begin)
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._latency = cell.encoders.latency_ticks
@@ -86,6 +87,8 @@ class SimulatedArm(Simulation, Arm):
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
+        if (offset := self.cell.encoders.offset) is not None:
+            position = position - offset
         gripper = self._gripper
         if gripper is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)

@@ -77,6 +77,7 @@ class PrimitiveExecutor(Executor):
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
         self._gripper = context.robot.gripper
+        self._bring_up = context.robot.bring_up or 1.0
         self._sight = Sight(
             self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies)
         )
@@ -117,6 +118,8 @@ class PrimitiveExecutor(Executor):
         self._orders.take(read.operator)
         serials = window(read.command.value)
         self._plans.accept(read.plan, serials)
+        if servo.error == Error.DISABLED:
+            self._await_enabling(servo)
         if self._tracking.update(read.status):
             self._resume(servo, tick)
         self._sight.update(read.world, servo.position, tick)
@@ -131,10 +134,16 @@ class PrimitiveExecutor(Executor):
         self._write_status(read, write.status, serials, tick)
         self._answer(write, read.command.value.operator)
 
+    def _await_enabling(self, servo: Message) -> None:
+        """Plan from where the arm is: while it is not enabled, it may be moved by hand."""
+        self._displaced = True
+        if self._memory is None:
+            self._position[:] = servo.position
+
     def _resume(self, servo: Message, tick: int) -> None:
         """Continue from the position at which the servo holds the arm."""
         work = self._work
-        self._displaced = self._memory is not None
+        self._displaced |= self._memory is not None
         if self._memory is None:
             force = self._gripper.force if self._gripper is not None else 0.0
             self._memory = Memory(opening=servo.opening, force=force)
@@ -179,7 +188,8 @@ class PrimitiveExecutor(Executor):
             )
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
-            work.step(WorkCycle(hold, plan, read.world.value, due_s, passed_s))
+            part = self._bring_up if read.status.value.slowed else 1.0
+            work.step(WorkCycle(hold, plan, read.world.value, due_s, passed_s, part))
             self._position[:] = work.motion.set_point.position
 
     def _finish(self, servo: Message, tick: int) -> None:
@@ -301,8 +311,11 @@ class PrimitiveExecutor(Executor):
         status.progress = (
             path_work.progress if path_work is not None else memory.progress * bool(interrupted)
         )
+        servo = read.status.value
         status.operated = (
-            self._orders.standing is not Operation.NONE or read.status.value.standing > 0
+            self._orders.standing is not Operation.NONE
+            or servo.standing > 0
+            or servo.error == Error.DISABLED
         )
         # Out of step, the world is not the reason why motion holds.
         status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step

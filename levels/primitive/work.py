@@ -134,6 +134,7 @@ class WorkCycle(NamedTuple):
     world: Message  # WORLD_MODEL
     due_s: float  # simulated time of the set point commanded last
     passed_s: float  # since the cycle before
+    part: float = 1.0  # of full speed, for a trajectory that begins
 
 
 class PathWork:
@@ -227,6 +228,8 @@ class PathWork:
         return due_s + self.motion.remaining_s + self._rules.latency_s
 
     def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
+        if cycle.part < 1.0:
+            plan = plan.stretched(1.0 / cycle.part)
         clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
         self._clear_cycles = self._clear_cycles + 1 if clear else 0
         wanted = self._rules.cycles(self._rules.params.clear) if self.blocked else 1

@@ -25,7 +25,7 @@ from rack.levels.robot.limits import (
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.robot.wrist import Wrist, find_wrist
-from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, SensorConfig
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything the next step depends on: a simulation restored from it continues bit for bit."""
@@ -49,11 +49,13 @@ class Cell:
 
     model: mujoco.MjModel
     """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
-    Keyframe 0 is the start: the arm at home, the gripper open."""
+    Keyframe 0 is the start, the gripper open."""
     qpos: NDArray[np.int_]  # (joints,), the arm's joints in qpos
     dof: NDArray[np.int_]  # (joints,), the same in qvel
     actuators: NDArray[np.int_]  # (joints,), their motors in ctrl; of a hand, its flexors
-    home: NDArray[np.float64]  # (joints,), rad: positions at the start
+    home: NDArray[np.float64]  # (joints,), rad: where tasks return to
+    begin: NDArray[np.float64]  # (joints,), rad: positions at the start
+    homing: bool  # drives know no position before they are enabled: they find their reference
     tool: int  # site
     gripper: Gripper | None  # None: there is none
     arm_geoms: NDArray[np.int_]  # geoms that the arm moves, gripper included
@@ -71,8 +73,7 @@ class Cell:
     patience: MotorPatience  # of its motors, or valves
 
     def start(self) -> mujoco.MjData:
-        """Return data of the start: the arm at home, the gripper open, objects where the model puts
-        them."""
+        """Return data of the start: the gripper is open, objects are where the model puts them."""
         data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, data, 0)
         mujoco.mj_forward(self.model, data)
@@ -103,9 +104,16 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
         motors, torque = fit_tendons(spec, robot, robot.hand, clock_ns * 1e-9 / robot.substeps)
     prepare(spec, robot, clock_ns)
     cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
-    cell.model.key_qpos[0] = start_qpos(cell)
-    check_start(cell, robot)
+    for key, position in (("home", cell.home), ("start", cell.begin)):
+        cell.model.key_qpos[0] = start_qpos(cell, position)
+        check_start(cell, robot, key, position)
     return cell
+
+
+def sensed_by(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
+    """Return the cell with encoders of `sensors`, unless `[robot.sensors]` says what they are."""
+    tick_s = robot.substeps * cell.model.opt.timestep
+    return replace(cell, encoders=Encoders.of(robot, tick_s, sensors))
 
 
 def sizes(cell: Cell) -> dict[str, int]:
@@ -156,6 +164,8 @@ def index(
         dof=model.jnt_dofadr[joints].astype(int),
         actuators=np.array([model.actuator(name).id for name in motors]),
         home=np.array(robot.home),
+        begin=np.array(robot.start or robot.home),
+        homing=robot.calibration.homing,
         tool=tool,
         gripper=_gripper(model, robot.gripper, joint, linked),
         arm_geoms=arm_geoms,
@@ -235,40 +245,40 @@ def _gripper(
     )
 
 
-def start_qpos(cell: Cell) -> NDArray[np.float64]:
-    """Return qpos of the start: arm at home, gripper and its linkage open, the rest as in the
+def start_qpos(cell: Cell, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return qpos of a start: arm at `position`, gripper and its linkage open, the rest as in the
     model."""
     qpos = np.array(cell.model.qpos0)
-    qpos[cell.qpos] = cell.home
+    qpos[cell.qpos] = position
     if cell.gripper is not None:
         cell.gripper.linkage.set(qpos, cell.gripper.open)
     return qpos
 
 
-def check_start(cell: Cell, robot: RobotConfig) -> None:
-    """Raise `RobotError` when home is outside the limits, too heavy to hold, in unintended contact,
-    or not finite."""
-    for name, q, (low, high) in zip(robot.joints, cell.home, cell.limits.position, strict=True):
+def check_start(cell: Cell, robot: RobotConfig, key: str, position: NDArray[np.float64]) -> None:
+    """Raise `RobotError` when the start at robot.`key` is outside the limits, too heavy to hold, in
+    unintended contact, or not finite."""
+    for name, q, (low, high) in zip(robot.joints, position, cell.limits.position, strict=True):
         if not low <= q <= high:
             raise RobotError(
-                f"robot.home: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid"
+                f"robot.{key}: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid"
             )
     data = cell.start()
     if not np.isfinite(data.qacc).all():
         raise RobotError(
-            f"model '{robot.model}': acceleration at home is not finite; check masses, inertias,"
+            f"model '{robot.model}': acceleration at {key} is not finite; check masses, inertias,"
             " gravity"
         )
     load = np.abs(data.qfrc_bias - data.qfrc_passive)[cell.dof]
     for name, needed, limit in zip(robot.joints, load, cell.bounds.torque, strict=True):
         if needed > limit:
             raise RobotError(
-                f"robot.home: joint '{name}' carries {needed:.4g} N m there; its torque limit is"
+                f"robot.{key}: joint '{name}' carries {needed:.4g} N m there; its torque limit is"
                 f" {limit:g}"
             )
     for pair in unintended_contacts(data, cell.touch):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
-            f"robot.home: '{first}' touches '{second}'; move home or the object, name a support, or"
-            " exclude the pair"
+            f"robot.{key}: '{first}' touches '{second}'; move {key} or the object, name a support,"
+            " or exclude the pair"
         )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
-from rack.levels.tables import RobotConfig
+from rack.levels.tables import RobotConfig, SensorConfig
 
 VELOCITY_ROOM = 0.05
 """Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the
@@ -79,16 +79,18 @@ class Encoders:
     latency_ticks: int = 0  # age of a sample when it is read
     off_late: NDArray[np.float64] | float = 0.0  # (joints,), rad: largest error due to that
     speed_off_late: NDArray[np.float64] | float = 0.0  # (joints,), rad/s: likewise
+    offset: NDArray[np.float64] | None = None  # (joints,), rad: added to what the drives give
 
     @classmethod
-    def of(cls, robot: RobotConfig, tick_s: float) -> Encoders:
-        """Return the encoders of a `[robot]` table.
+    def of(cls, robot: RobotConfig, tick_s: float, default: SensorConfig | None = None) -> Encoders:
+        """Return the encoders of a `[robot]` table; if it does not say, `default`, or exact ones.
 
         A sample is brought to the present by the arm's equation of motion, which may be wrong by as
         much as the acceleration that is planned with.
         """
         joints = len(robot.joints)
-        sensors = robot.sensors
+        sensors = robot.sensors or default or SensorConfig()
+        offset = robot.calibration.offset
         late_s = robot.latency_ticks * tick_s
         wrong = np.array(robot.acceleration)
         return cls(
@@ -97,6 +99,7 @@ class Encoders:
             robot.latency_ticks,
             0.5 * wrong * late_s**2,
             wrong * late_s,
+            None if offset is None else np.array(offset),
         )
 
     @property

@@ -14,6 +14,7 @@ from rack.backplane.watch.alarms import AT_START, BY_DEMAND, NO_TORQUE
 from rack.levels.algebra import Array
 from rack.levels.arm import (
     Arm,
+    CalibratedLink,
     DriveState,
     FaultyLink,
     GuardedArm,
@@ -27,8 +28,8 @@ from rack.levels.arm.faulty import STEPS
 from rack.levels.compiled import compiled
 from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
 from rack.levels.messages import SCENE, Error
-from rack.levels.operator import Orders
-from rack.levels.robot.cell import build_cell
+from rack.levels.operator import Operation, Orders
+from rack.levels.robot.cell import build_cell, sensed_by
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
@@ -56,6 +57,7 @@ class SteadyStatus(NamedTuple):
     touches: int
     violations: int
     pushed: int
+    slowed: bool
     error: Error  # latched
     fault: str  # of the arm
     note: str  # the rest of what the status says
@@ -79,18 +81,24 @@ class ArmDriver(Executor):
     def __init__(self, context: LevelContext, params: ArmParams) -> None:
         super().__init__(context)
         every = context.every
-        self.cell = cell = build_cell(context.robot, context.scene, context.clock_ns)
-        self.arm: Arm = find_arm(params.arm)(
-            cell, context.scene, context.clock_ns, every, context.seed
-        )
+        robot = context.robot
+        kind = find_arm(params.arm)
+        cell = sensed_by(build_cell(robot, context.scene, context.clock_ns), robot, kind.sensors)
+        self.cell = cell
+        self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
+        self.part = robot.bring_up or 1.0  # of full speed, until the operator's release
         # The path to the arm; through `_faulty` while faults are injected.
-        present = None
-        if context.robot.latency_ticks:
-            present = PresentLink(self.arm, cell, context.tick_s)
+        link: Link = self.arm
+        if cell.encoders.offset is not None:
+            link = CalibratedLink(self.arm, cell.encoders.offset)
+        if robot.latency_ticks:
+            link = PresentLink(self.arm, cell, context.tick_s, link)
         self._guard = None
         if not self.arm.keeps_limits:
-            self._guard = GuardedArm(self.arm, cell, context.robot.joints, context.tick_s, present)
-        self._sound: Link = self._guard or present or self.arm
+            link = self._guard = GuardedArm(
+                self.arm, cell, robot.joints, context.tick_s, link, self.part
+            )
+        self._sound = link
         self._link: Link = self._sound
         self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._sound)
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
@@ -179,6 +187,15 @@ class ArmDriver(Executor):
     @property
     def note(self) -> str:
         """What the status says while there is nothing worse to say. Default: nothing."""
+        return ""
+
+    def obey(self, command: Message) -> str:
+        """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
+        if command.what != Operation.RELEASE:
+            return self.enabling.obey(command)
+        self.part = 1.0
+        if self._guard is not None:
+            self._guard.permit(self.part)
         return ""
 
     def feel(self, tick: int) -> None:
@@ -336,6 +353,7 @@ class ArmDriver(Executor):
             arm.touches,
             arm.violations,
             arm.pushed,
+            self.part < 1.0,
             self.stopping.error,
             arm.fault,
             self.note,
@@ -356,6 +374,7 @@ class ArmDriver(Executor):
         status.touches = shown.touches
         status.violations = shown.violations
         status.pushed = shown.pushed
+        status.slowed = shown.slowed
         if self.stopping.is_disabled:
             status.state = State.HOLDING
             status.error = self.stopping.cause
@@ -375,7 +394,8 @@ class ArmDriver(Executor):
                 Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
             )
             broken = self.arm.first_violation if shown.violations else self.arm.first_touch
-            status.reason = kept or broken or shown.note
+            slow = self.enabling.slow if shown.slowed else ""
+            status.reason = kept or broken or slow or shown.note
 
 
 def numbers(message: Message, first: str, last: str) -> Array:

@@ -23,6 +23,8 @@ class Enabling:
         self._arm = arm
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
         self._say = f"rack command {context.rack} {context.board}"
+        speed = f"{robot.bring_up or 1.0:.0%} of full speed"
+        self.slow = f"{speed}; to end that: {self._say} release"
         self._guessed = "" if arm.keeps_limits else ", ".join(robot.guessed)
         self._restarted = False  # in the first cycle, in which old commands are read again
         self._serial = 0  # of the newest command, while drives are on their way; 0: they are not
@@ -70,7 +72,7 @@ class Enabling:
         if state is DriveState.ENABLED:
             return ""
         if state is DriveState.FAULT:
-            return f"drives: {self._arm.fault}; to clear: {self._say} reset, then enable"
+            return f"drives: {self._arm.fault}; to go on: `reset`, then `enable`"
         if state is DriveState.ENABLING:
             return "drives are being enabled"
         if self._guessed:

@@ -56,6 +56,7 @@ class ServoExecutor(ArmDriver):
         self.reference = Reference(
             cell.bounds, cell.limits, context.tick_s
         )  # set points, interpolated
+        self.reference.part = self.part
         self._loop = ComputedTorque(cell, params, self.arm.dynamics)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         joints = context.robot.joints
@@ -103,7 +104,9 @@ class ServoExecutor(ArmDriver):
         """Do what leaves the command in force as it is; return why not, empty: it does."""
         if command.what == Operation.MODIFY:
             return self._modified.obey(command)
-        return self.enabling.obey(command)
+        why = self.obey(command)
+        self.reference.part = self.part
+        return why
 
     def started(self) -> None:
         """Keep the grip on a part."""

@@ -64,6 +64,7 @@ class Reference:
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # the set point to follow after that
+        self.part = 1.0  # of full speed: of the motion of `to`, and of joining the set points
         self.goal: Array | None = (
             None  # (joints,), rad: goal of `to`, until another motion begins; None: none
         )
@@ -132,7 +133,9 @@ class Reference:
         if now.velocity.any():
             return now
         limits = self._limits
-        self._curve = Passage(now.position, goal, limits.velocity, limits.acceleration)
+        fastest = self.part * limits.velocity
+        hardest = self.part**2 * limits.acceleration
+        self._curve = Passage(now.position, goal, fastest, hardest)
         self._from = tick
         self._difference = None
         self.goal = goal
@@ -185,7 +188,7 @@ class Reference:
     def _join(self, position: Array, velocity: Array, tick: int) -> None:
         """Let the difference between a motion at `tick` and the curve decay."""
         curve = self._curve.at((tick - self._from) * self._tick_s)
-        fastest = JOINING_SPEED_PART * self._limits.velocity
+        fastest = JOINING_SPEED_PART * self.part * self._limits.velocity
         self._difference = Decay(
             position - curve.position, velocity - curve.velocity, fastest, self._limits.acceleration
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,21 @@ DOUBTFUL = 0
 GOOD = 1
 TAKEN = 2
 """Verdicts on a sample; a good one is taken at once where no joint was in doubt."""
+
+
+class Tolerance(NamedTuple):
+    """What a good sample of an arm's sensors may be off by."""
+
+    position: Array  # (joints,), rad
+    velocity: Array  # (joints,), rad/s
+    jitter_s: float  # by which it may be taken too early or too late, with all joints at full speed
+
+
+def tolerance(cell: Cell) -> Tolerance:
+    """Return what a `SensorMonitor` takes for good: two samples may be off either way."""
+    off = 0.5 * FIT_RAD + cell.encoders.off
+    jitter_s = float(np.min(off / cell.bounds.velocity))
+    return Tolerance(off, cell.encoders.speed_off, jitter_s)
 
 
 class SensorMonitor:

@@ -105,13 +105,12 @@ def robot(wiring: Wiring) -> Iterator[Mistake]:
     joints = len(robot.joints)
     if file_at(robot.model) is None:
         yield Mistake("robot.model", str(robot.model), "no such file")
-    for key in ("home", "velocity", "acceleration", "jerk", "torque", "position"):
-        values = getattr(robot, key)
+    for key, values in robot.per_joint.items():
         if values is not None and len(values) != joints:
             yield Mistake(
                 f"robot.{key}", values, f"{len(values)} values; permitted: {joints}, one per joint"
             )
-    for key, values in robot.sensors:
+    for key, values in robot.sensors or ():
         if isinstance(values, tuple) and len(values) != joints:
             why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
             yield Mistake(f"robot.sensors.{key}", values, why)

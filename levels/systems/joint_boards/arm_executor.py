@@ -103,7 +103,7 @@ class ArmExecutor(ArmDriver):
 
     def _judge(self, command: Message) -> None:
         """Obey what leaves the command in force as it is, or refuse it."""
-        if command.what in DRIVES and (why := self.enabling.obey(command)):
+        if command.what in DRIVES and (why := self.obey(command)):
             self.orders.refuse(why)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:

@@ -75,7 +75,7 @@ JOINT_STATUS = status(
 
 ARM_STATUS = status(
     "arm_status",
-    1,
+    2,
     *ANSWER,
     tick("tick", "tick at which the arm was sensed"),
     *DRIVEN_ARM,

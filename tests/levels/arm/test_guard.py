@@ -19,7 +19,7 @@ from rack.levels.arm import Arm, GuardedArm, Sensed, SimulatedArm
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.tables import SceneConfig
+from rack.levels.tables import SceneConfig, SensorConfig
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
 from tests.levels.lockstep import CLOCK_NS
@@ -68,6 +68,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 
 def driven(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[Array, Array]:
     """Drive an arm cycle by cycle; return the positions, and the velocities, that it had."""
+    arm.enable()
     true = []
     for torque in torques:
         link.sense()
@@ -141,7 +142,7 @@ def test_as_coarse_as_its_encoders_may_be_it_keeps_them_too(
     tmp_path: Path, kind: type[IdealArm], seed: int
 ) -> None:
     robot = pendulum(tmp_path)
-    sensors = robot.sensors.model_copy(update={"resolution": 2e-3, "noise": 3e-4})
+    sensors = SensorConfig(resolution=2e-3, noise=3e-4)
     cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
     assert cell.encoders.off.min() > 2e-3
     arm = kind(cell, SceneConfig(), CLOCK_NS)
@@ -179,6 +180,7 @@ def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path, seed: int) ->
     def moved(is_guarded: bool) -> float:
         arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
         link = GuardedArm(arm, cell, robot.joints, TICK_S) if is_guarded else arm
+        arm.enable()
         worst = -np.inf
         for torque in random_torques(cell, seed, 1500):
             link.sense()
@@ -203,6 +205,7 @@ def test_nothing_is_driven_on_a_sample_that_is_not_finite(
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     FarArm.jumps = {1: sample}
     arm = FarArm(cell, SceneConfig(), CLOCK_NS)
+    arm.enable()
     guard = GuardedArm(arm, cell, robot.joints, TICK_S)
     guard.sense()
     assert guard.drive(np.zeros(2), 0.0) is None
@@ -220,7 +223,7 @@ def test_nothing_is_driven_on_a_sample_that_is_not_finite(
 
 def test_encoders_too_coarse_to_tell_a_limit_are_refused(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
-    sensors = robot.sensors.model_copy(update={"resolution": 0.25})
+    sensors = SensorConfig(resolution=0.25)
     cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
     with pytest.raises(RobotError) as error:
@@ -259,6 +262,24 @@ def test_a_sample_beyond_a_limit_is_said_counted_and_brakes(
     if what == "position":
         # Once the samples are right again, it goes on; a velocity that lied leaves doubt.
         assert np.abs(servo.status.position - GOAL).max() < 5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_during_bring_up_no_torques_lead_beyond_its_part_of_the_speed(
+    tmp_path: Path, seed: int
+) -> None:
+    robot = pendulum(tmp_path)
+    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
+    guard = GuardedArm(arm, cell, robot.joints, TICK_S, part=0.1)
+    _, slow = driven(guard, arm, random_torques(cell, seed, 1500))
+    assert (np.abs(slow) / cell.bounds.velocity).max() <= 0.1
+    assert (arm.violations, arm.clipped > 50) == (0, True)
+    guard.permit(1.0)
+    motion = driven(guard, arm, random_torques(cell, seed, 1500))
+    assert (np.abs(motion[1]) / cell.bounds.velocity).max() > 0.1
+    assert max(excess(cell, motion)) <= 0.0
 
 
 def test_an_arm_that_keeps_its_limits_itself_is_driven_directly(tmp_path: Path) -> None:

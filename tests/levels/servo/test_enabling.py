@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.arm import DriveState
+from rack.boards.config import load
+from rack.levels.arm import DriveState, Sensed, SimulatedArm
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.servo import ServoExecutor
 from rack.levels.tables import SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
-from tests.levels.lockstep import Operator
+from tests.levels.lockstep import Lockstep, Operator
 from tests.levels.servo.rig import Course, ServoRig
+from tests.levels.whole_rack import WholeRack
 
 AWAY = np.array([0.3, -0.2])
 
@@ -45,6 +50,14 @@ class StatefulArm(IdealArm):
         super().step(ticks)
         if self.state is DriveState.ENABLING and self.tick >= self._ready_at:
             self.state = DriveState.ENABLED
+
+
+class OffArm(IdealArm):
+    """Its drives count from elsewhere."""
+
+    def sense(self) -> Sensed:
+        sample = super().sense()
+        return sample._replace(position=sample.position - (0.1, -0.2))
 
 
 def rig(folder: Path, arm: str = "StatefulArm", **robot: object) -> ServoRig:
@@ -91,9 +104,7 @@ def test_a_fault_of_the_drives_is_the_reason_until_reset_and_enable(tmp_path: Pa
     servo.run(200, course.at)
     status = servo.status
     assert (status.state, status.error, status.braked) == (State.HOLDING, Error.DRIVES, 1)
-    assert status.reason == (
-        "drives: j2: bus voltage too low; to clear: rack command own servo reset, then enable"
-    )
+    assert status.reason == ("drives: j2: bus voltage too low; to go on: `reset`, then `enable`")
     operator.say("servo", Operation.ENABLE)
     servo.run(2, course.at)
     assert servo.status.answer == Answer.REFUSED
@@ -130,6 +141,54 @@ def test_a_disabled_arm_is_disabled_after_a_restart_and_an_enabled_one_goes_on(
     assert (servo.status.braked, servo.status.error) == (1, Error.DISABLED)
 
 
+def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_restart(
+    tmp_path: Path,
+) -> None:
+    servo = rig(tmp_path, "IdealArm", enable="at-start", bring_up=0.1)
+    operator = Operator(servo.rack)
+    servo.run(2)
+    assert servo.status.reason == "10% of full speed; to end that: rack command own servo release"
+    limits = servo.servo.cell.limits.velocity
+    operator.say("servo", Operation.SETPOINT, joints=(0.5, 0.0))
+    servo.run(1)
+    assert servo.status.reason == "at the setpoint by the operator; `resume` releases it"
+    servo.run(2000)
+    assert servo.status.slowed
+    fastest = np.abs(np.diff(servo.positions, axis=0)).max(axis=0) / 2.5e-3
+    assert (0.05 * limits < fastest).any()
+    assert (fastest <= 0.1 * limits).all()
+    operator.say("servo", Operation.RELEASE)
+    servo.run(1)
+    assert (servo.status.slowed, servo.status.answer) == (0, Answer.DONE)
+    servo.restart()
+    servo.run(2)
+    assert not servo.status.slowed
+    operator.say("servo", Operation.SETPOINT, joints=(0.0, 0.5))
+    servo.positions.clear()
+    servo.run(400)
+    fastest = np.abs(np.diff(servo.positions, axis=0)).max(axis=0) / 2.5e-3
+    assert (0.1 * limits < fastest).any()
+
+
+@pytest.mark.parametrize("latency_ticks", [0, 2])
+def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_ticks: int) -> None:
+    calibration = {"offset": (0.1, -0.2)}
+    own = rig(tmp_path, "OffArm", enable="at-start", calibration=calibration)
+    simulated = ServoRig(
+        pendulum(tmp_path, calibration=calibration, latency_ticks=latency_ticks), SceneConfig()
+    )
+    course = Course(START, GOAL, 0.8)
+    for servo in (own, simulated):
+        servo.run(500, course.at)
+        assert np.abs(servo.status.position - GOAL).max() < 5e-3
+        assert not servo.alarms(Alarm.BRAKES_OPENED)
+    assert np.abs(own.servo.arm._q - GOAL).max() < 5e-3  # type: ignore[attr-defined]
+    assert np.abs(simulated.servo.arm._state[0] - GOAL).max() < 5e-3  # type: ignore[attr-defined]
+    scene = own.rack.read("servo.scene")
+    position, _ = Dynamics(own.servo.cell).pose(own.servo.arm._q)  # type: ignore[attr-defined]
+    assert np.abs(scene.tool_position - position).max() < 1e-3
+
+
 def test_guessed_values_keep_an_arm_of_ones_own_disabled_and_a_simulated_one_not(
     tmp_path: Path,
 ) -> None:
@@ -144,3 +203,77 @@ def test_guessed_values_keep_an_arm_of_ones_own_disabled_and_a_simulated_one_not
     simulated = ServoRig(pendulum(tmp_path, enable=None, guessed=guessed), SceneConfig())
     simulated.run(20)
     assert not simulated.status.braked
+
+
+def whole(**robot: object) -> tuple[WholeRack, Operator, SimulatedArm]:
+    """Return the PUMA's rack, which tours three poses."""
+    config = load("nasrem-three-poses")
+    assert config.robot is not None
+    arm = config.robot.model_copy(update=robot), config.scene
+    rack = WholeRack("nasrem-three-poses", arm, params={"task": {"stalled_s": 3.0}})
+    simulated = cast(ServoExecutor, rack.tasks["servo"].level).arm
+    assert isinstance(simulated, SimulatedArm)
+    return rack, Operator(rack), simulated
+
+
+@pytest.mark.slow
+def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
+    rack, operator, arm = whole(enable="by-command", start=(0.3, 1.2, -2.8, 0.1, -1.2, 0.2))
+    rack.run(9.0)  # longer than a task may stall
+    assert rack.task.state == State.HOLDING
+    assert rack.task.reason.startswith("waiting for servo: disabled; to enable:")
+    # By hand, once the first path is planned.
+    arm._data.qpos[arm.cell.qpos[0]] -= 0.5
+    arm._refresh()
+    arm._brake.hold_at(arm._state[0])
+    rack.run(0.5)
+    operator.say("servo", Operation.ENABLE)
+    assert rack.run_to_end(30.0).state == State.DONE
+    status = rack.read("servo.status")
+    assert (status.touches, status.violations) == (0, 0)
+
+
+@pytest.mark.slow
+def test_an_arm_moved_by_hand_in_the_middle_of_a_path_goes_on_to_its_end() -> None:
+    rack, operator, arm = whole()
+    rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)
+    operator.say("servo", Operation.DISABLE)
+    rack.run(5.0)
+    assert rack.task.state == State.HOLDING
+    arm._data.qpos[arm.cell.qpos[0]] += 0.3
+    arm._refresh()
+    arm._brake.hold_at(arm._state[0])
+    rack.run(0.1)
+    operator.say("servo", Operation.ENABLE)
+    assert rack.run_to_end(30.0).state == State.DONE
+    assert rack.read("servo.status").touches == 0
+
+
+@pytest.mark.slow
+def test_a_fault_of_the_drives_that_nobody_resets_is_the_tasks() -> None:
+    rack, _, arm = whole()
+    rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)
+    arm.fault, arm.state = "j2: encoder lost", DriveState.FAULT
+    task = rack.run_to_end(20.0)
+    assert (task.state, task.error) == (State.ERROR, Error.STALLED)
+    assert "waiting for servo: drives: j2: encoder lost" in task.reason
+
+
+@pytest.mark.slow
+def test_planned_motion_is_slow_until_the_release() -> None:
+    rack, operator, arm = whole(bring_up=0.2)
+    limits = arm.cell.limits.velocity
+    fastest = np.zeros(len(limits))
+
+    def look(rack: Lockstep) -> bool:
+        np.maximum(fastest, np.abs(arm._state[1]), out=fastest)
+        return bool(rack.read("task.status").action)
+
+    assert rack.run(60.0, look)
+    assert rack.read("servo.status").slowed
+    assert 0.1 < (fastest / limits).max() <= 0.2
+    operator.say("servo", Operation.RELEASE)
+    fastest[:] = 0.0
+    rack.run(30.0, lambda rack: look(rack) and rack.read("task.status").state == State.DONE)
+    assert rack.task.state == State.DONE
+    assert (fastest / limits).max() > 0.25

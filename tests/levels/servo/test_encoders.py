@@ -10,11 +10,14 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.arm import SimulatedArm
+from rack.levels.algebra import Array
+from rack.levels.arm import Arm, Sensed, SimulatedArm
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error
-from rack.levels.robot.cell import build_cell
-from rack.levels.tables import RobotConfig, SensorConfig
+from rack.levels.robot.cell import build_cell, sensed_by
+from rack.levels.servo.sensor_monitor import tolerance
+from rack.levels.tables import RobotConfig, SceneConfig, SensorConfig
+from tests.levels.arm.test_own_arm import IdealArm
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo.rig import Course, ServoRig
 from tests.levels.whole_rack import WholeRack
@@ -124,3 +127,47 @@ def test_a_list_of_another_length_is_refused_with_both_numbers(tmp_path: Path) -
         RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one per joint: 2"
     ):
         build_cell(robot, config("puma560")[1], CLOCK_NS)
+
+
+class JitteryArm(IdealArm):
+    """Takes its samples up to 0.1 ms early or late, as a bus does that is not synchronized."""
+
+    def sense(self) -> Sensed:
+        sample = super().sense()
+        by_s = np.random.default_rng(self.tick).uniform(-1e-4, 1e-4, 2)
+        return sample._replace(position=sample.position + by_s * sample.velocity)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sensors", "brakes"), [({"resolution": 0.0}, True), (None, False)])
+def test_by_default_an_arm_of_ones_own_may_be_sampled_early_or_late(
+    tmp_path: Path, sensors: dict[str, float] | None, brakes: bool
+) -> None:
+    robot = pendulum(tmp_path, sensors=sensors)
+    rig = ServoRig(robot, SceneConfig(), arm=f"{__name__}:JitteryArm")
+    ends = np.array([0.0, 0.5]), np.array([0.7, -1.4])
+
+    def back_and_forth(time_s: float) -> tuple[Array, Array]:
+        turn = int(time_s / 1.5)
+        start, goal = ends[::-1] if turn % 2 else ends
+        return Course(start, goal, 1.4).at(time_s - 1.5 * turn)
+
+    rig.run(3600, back_and_forth)  # 9 s
+    assert np.abs(rig.servo.arm._qd).max() < 3.0  # type: ignore[attr-defined]
+    closed = rig.alarms().count(Alarm.BRAKES_CLOSED)
+    assert (closed > 0) == brakes
+    assert (Alarm.SENSOR_MODEL in rig.alarms()) == brakes
+
+
+def test_the_monitor_says_what_it_stands(tmp_path: Path) -> None:
+    robot = pendulum(tmp_path)
+    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    exact = tolerance(cell)
+    own = tolerance(sensed_by(cell, robot, Arm.sensors))
+    assert exact.position.tolist() == [2.5e-5, 2.5e-5]
+    assert own.position == pytest.approx([3.75e-4, 3.75e-4])
+    assert own.velocity == pytest.approx([3.5e-3, 3.5e-3])
+    # The joint that is faster, 3 rad/s.
+    assert own.jitter_s == pytest.approx(0.125e-3)
+    given = robot.model_copy(update={"sensors": SensorConfig()})
+    assert tolerance(sensed_by(cell, given, Arm.sensors)).jitter_s == exact.jitter_s
