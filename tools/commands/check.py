@@ -13,10 +13,13 @@ import typer
 
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
+from rack.boards.classes import find_class
 from rack.boards.config import load, shared_out
 from rack.boards.config.cell import built_cell
 from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
 from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
+from rack.levels.level import Executor
+from rack.levels.tables import read_params
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.rack import spanned
 from rack.tools.console.answer import Failure, print_json
@@ -61,6 +64,11 @@ PATIENCE = (
     "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
     " {permitted_ms} ms). Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors"
     " at full torque put in {energy_j} J"
+)
+
+MONITORS = (
+    "monitors: '{board}' takes samples for good that are off by {position_mrad} mrad,"
+    " {velocity_mrad_s} mrad/s; or, at full speed, {jitter_ms} ms early or late"
 )
 
 
@@ -136,6 +144,7 @@ def check(
             lines += [
                 *rest[len(lacking) :],
                 *(PATIENCE.format(**one) for one in stock["patience"]),
+                *(MONITORS.format(**one) for one in stock["monitors"]),
                 *forecast_lines(forecast, width),
             ]
         else:
@@ -236,6 +245,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
         "hosts": [_host(name, host, layout) for name, host in config.host.items()],
         "network": _network(config),
         "patience": list(_patience(config, layout)),
+        "monitors": list(_monitors(config)),
         "mailboxes": mailboxes,
         "notes": notes,
     }
@@ -257,6 +267,32 @@ def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
             "permitted_ms": round(cell.patience.seconds * 1e3, 3),
             "angle_mrad": angle_mrad.round(1).tolist(),
             "energy_j": round(float((angle_mrad * cell.bounds.torque).sum()) * 1e-3, 3),
+        }
+
+
+def _monitors(config: RackConfig) -> Iterator[dict[str, Any]]:
+    """Yield what the sensors of an arm may be off by before it is braked, joint by joint."""
+    robot = config.robot
+    if robot is None:
+        return
+    # As for `_abilities`: MuJoCo.
+    from rack.levels.arm import find_arm
+    from rack.levels.robot.cell import sensed_by
+    from rack.levels.servo.control import ArmParams
+    from rack.levels.servo.sensor_monitor import tolerance
+
+    for board, given in config.board.items():
+        kind = find_class(given.executor, Executor).params
+        if kind is None or not issubclass(kind, ArmParams):
+            continue
+        sensors = find_arm(read_params(kind, given.params).arm).sensors
+        cell = built_cell(robot, config.scene, config.clock_ns)
+        stands = tolerance(sensed_by(cell, robot, sensors))
+        yield {
+            "board": board,
+            "position_mrad": (1e3 * stands.position).round(3).tolist(),
+            "velocity_mrad_s": (1e3 * stands.velocity).round(3).tolist(),
+            "jitter_ms": round(1e3 * stands.jitter_s, 3),
         }
 
 

@@ -18,6 +18,7 @@ from rack.backplane.words import Block, System
 from rack.boards.events import Event
 from rack.boards.lan.awaited import awaited
 from rack.boards.operator import describe
+from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
 
 STILL_S = 5.0
@@ -25,6 +26,8 @@ STILL_S = 5.0
 PASSED_ON = re.compile(r"(?:holding|waiting for \w+): ")
 SAME = 60
 """Characters that identify a reason: the end of a long one is truncated on its way up."""
+ASKED = {Error.DISABLED: "enable", Error.DRIVES: "reset"}
+"""What an arm that is not enabled waits for, by the error of its status."""
 OPERATED = frozenset({"standing", "order", "answer"})
 """Fields in the status of a level that takes an operator's commands."""
 
@@ -127,7 +130,10 @@ class Holds:
             yield self._hold(level, since, why, resume_command(self._segment.rack, level))
         elif status.state == State.HOLDING:
             since = self._segment.block(level)[Block.LEVEL_SINCE]
-            yield self._hold(level, since, f"holding: {status.reason or 'no reason given'}", "")
+            asks = ASKED.get(status.error) if level == self._arm else None
+            release = f"rack command {self._segment.rack} {level} {asks}" if asks else ""
+            why = f"holding: {status.reason or 'no reason given'}"
+            yield self._hold(level, since, why, release)
 
     def _standing(self, level: str, status: Message) -> tuple[int, str]:
         """Return the tick of the command in force, and its text."""
