@@ -10,7 +10,7 @@ from typing import NamedTuple
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import NO_TORQUE, Alarm
 from rack.backplane.words import Demand
-from rack.levels.arm import Arm
+from rack.levels.arm import Arm, DriveState
 from rack.levels.level import Finding
 from rack.levels.messages import Error
 from rack.levels.servo.control import ArmParams
@@ -255,6 +255,10 @@ class BrakeLog:
         arm = self._arm
         if arm.braked and self._engaged is None:
             # The arm itself engaged them, between two cycles.
+            if arm.state is not DriveState.ENABLED:
+                self._engaged = Error.DRIVES, tick
+                findings.append(Finding(Alarm.BRAKES_CLOSED, Error.DRIVES))
+                return
             self._engaged = NO_TORQUE, tick - max(arm.waited - arm.patience, 1)
             findings.append(Finding(Alarm.BRAKES_CLOSED, NO_TORQUE, arm.waited - self._every))
 

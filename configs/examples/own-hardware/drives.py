@@ -1,5 +1,5 @@
-"""Stand-in for the driver of your motion controller: six to seven drives with encoders, brakes and
-a time-out.
+"""Stand-in for the driver of your motion controller: six to seven drives with encoders, brakes, a
+time-out, and the states that CiA 402 gives to drives.
 
 Replace this file with calls of your fieldbus library. What the real drives do by themselves, this
 one computes: it integrates the arm's equation of motion, and engages the brakes when no torque has
@@ -12,12 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import solve
+from rack.levels.arm import DriveState
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 
 Array = NDArray[np.float64]
 STEPS = 5
 """Steps of the integration per tick."""
+ENABLING_TICKS = 100
+HOMING_TICKS = 400
+"""Ticks that the drives take to be enabled, and to find their reference before that."""
 
 
 class Drives:
@@ -27,11 +31,27 @@ class Drives:
         self._dynamics = Dynamics(cell)
         self._step_s = tick_s / STEPS
         self._timeout_ticks = timeout_ticks
-        self.position: Array = cell.home.copy()  # (joints,), rad
+        self.position: Array = cell.begin.copy()  # (joints,), rad
         self.velocity: Array = np.zeros_like(self.position)  # (joints,), rad/s
         self.torque: Array = np.zeros_like(self.position)  # (joints,), N m
         self.braked = True
         self._silent_ticks = 0
+        self.state = DriveState.DISABLED
+        self.fault = ""  # why they are in FAULT
+        # (joints,), rad: position that they count as 0, until they have found their reference.
+        self.zero: Array = self.position * cell.homing
+        self._waited_ticks = 0  # since they were asked for torque
+
+    def enable(self) -> None:
+        """Find the reference, if it is not known, and become ready for torques."""
+        self.state = DriveState.ENABLING
+        self._waited_ticks = -HOMING_TICKS if self.zero.any() else 0
+
+    def leave(self, state: DriveState, fault: str = "") -> None:
+        """Brake, and give no torque any more: DISABLED, or FAULT."""
+        self.brake()
+        self.state = state
+        self.fault = fault
 
     def write(self, torque: Array) -> None:
         """Release the brakes and apply torques, (joints,), N m."""
@@ -47,6 +67,8 @@ class Drives:
     def pass_ticks(self, ticks: int) -> None:
         """Let time pass: on real hardware it passes by itself."""
         for _ in range(ticks):
+            if self.state is DriveState.ENABLING:
+                self._make_ready()
             if self._silent_ticks >= self._timeout_ticks:
                 self.brake()
             for _ in range(0 if self.braked else STEPS):
@@ -55,3 +77,10 @@ class Drives:
                 self.velocity += self._step_s * solve(inertia, self.torque - bias - friction)
                 self.position += self._step_s * self.velocity
             self._silent_ticks += 1
+
+    def _make_ready(self) -> None:
+        self._waited_ticks += 1
+        if self._waited_ticks == 0:
+            self.zero[:] = 0.0
+        if self._waited_ticks >= ENABLING_TICKS:
+            self.state = DriveState.ENABLED

@@ -7,7 +7,7 @@ from drives import Drives
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.arm import Arm, Sensed
+from rack.levels.arm import Arm, DriveState, Sensed
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
@@ -26,7 +26,25 @@ class HardwareArm(Arm):
 
     def sense(self) -> Sensed:
         """Return the newest sample."""
-        return Sensed(self.drives.position.copy(), self.drives.velocity.copy(), 0.0, 0.0, self.tick)
+        drives = self.drives
+        return Sensed(drives.position - drives.zero, drives.velocity.copy(), 0.0, 0.0, self.tick)
+
+    def enable(self) -> None:
+        """Ask the drives for torque."""
+        self.drives.enable()
+
+    def disable(self) -> None:
+        """Ask the drives to give none."""
+        self.drives.leave(DriveState.DISABLED)
+
+    def reset(self) -> None:
+        """Ask the drives to leave their fault."""
+        self.drives.leave(DriveState.DISABLED)
+
+    def weaken(self, most: Array | None) -> None:
+        """Let a drive find out that its motor gives nothing, as an injected fault has it."""
+        if most is not None and not most.all():
+            self.drives.leave(DriveState.FAULT, f"drive {most.argmin() + 1}: motor phase open")
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Pass torques on; brake on one that no drive may be given."""
@@ -51,6 +69,8 @@ class HardwareArm(Arm):
         self.drives.pass_ticks(ticks)
         self.tick += ticks
         self.waited += ticks
+        self.state = self.drives.state
+        self.fault = self.drives.fault
         if self.drives.braked and not self.braked:
             self.brake()
 
@@ -64,3 +84,6 @@ class HardwareArm(Arm):
         super().restore(state)
         saved = state.state[: 2 * len(self.torque)].reshape(2, -1)
         self.drives.position[:], self.drives.velocity[:] = saved
+        self.drives.state = self.state
+        if self.state is DriveState.ENABLED:
+            self.drives.zero[:] = 0.0
