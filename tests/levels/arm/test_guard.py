@@ -234,6 +234,49 @@ def test_encoders_too_coarse_to_tell_a_limit_are_refused(tmp_path: Path) -> None
     )
 
 
+class LyingArm(IdealArm):
+    """From tick 150 on its samples are not the truth, or no news."""
+
+    lie = ""
+
+    def sense(self) -> Sensed:
+        sample = super().sense()
+        since = self.tick - 150
+        if since < 0:
+            self._before = sample
+        lies = {
+            "sticks": self._before._replace(tick=self.tick),
+            "stalls": self._before,
+            "jumps": sample._replace(position=sample.position - 0.3),
+            "drifts": sample._replace(position=sample.position - 2e-3 * since),
+            "claims": sample._replace(velocity=-sample.velocity),
+        }
+        return sample if since < 0 else lies[self.lie]
+
+
+@pytest.mark.parametrize("lie", ["sticks", "stalls", "jumps", "drifts", "claims"])
+def test_an_arm_whose_samples_lie_in_full_motion_is_braked_within_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lie: str
+) -> None:
+    monkeypatch.setattr(LyingArm, "lie", lie)
+    # At the end of the course there is a hand's breadth to the end of the range.
+    robot = pendulum(tmp_path, position=((-0.1, 0.7), (-0.5, 0.6)))
+    servo = ServoRig(robot, SceneConfig(), arm=f"{__name__}:LyingArm")
+    course = Course(START, GOAL, 0.8)
+    arm = servo.servo.arm
+    assert isinstance(arm, LyingArm)
+    worst, braked_at = -np.inf, 0
+    for tick in range(400):
+        servo.run(1, course.at)
+        worst = max(worst, *excess(arm.cell, (arm._q[None], arm._qd[None])))
+        if arm.braked and tick > 150 and not braked_at:
+            braked_at = tick
+    assert worst <= 0.0
+    assert 150 < braked_at < 170
+    found = {alarm.name for alarm in servo.alarms()}
+    assert found & {"SENSOR_STUCK", "SENSOR_SILENT", "SENSOR_MODEL"}
+
+
 def rig(folder: Path, jumps: dict[int, tuple[float, float]]) -> ServoRig:
     FarArm.jumps = jumps
     return ServoRig(pendulum(folder), SceneConfig(), arm="tests.levels.arm.test_guard:FarArm")
