@@ -202,6 +202,9 @@ class ArmDriver(Executor):
         """Sense more than the joints, before it is decided whether the arm stops. Default:
         nothing."""
 
+    def adopted(self) -> None:
+        """React to an arm that has been enabled, wherever it is. Default: nothing."""
+
     def started(self) -> None:
         """React to the start of a board whose arm was restored from its last state. Default:
         nothing."""
@@ -262,6 +265,8 @@ class ArmDriver(Executor):
             return True
         is_adopted = self.sensors.adopt(sensed, tick)
         self._adopted = is_adopted and is_enabled
+        if self._adopted:
+            self.adopted()
         return is_adopted or is_enabled
 
     def _decide(self, tick: int) -> Reaction:

@@ -51,9 +51,10 @@ class Enabling:
         elif command.what == Operation.DISABLE:
             self._goal = (DriveState.DISABLED, DriveState.FAULT)
             arm.disable()
-        elif command.what == Operation.RESET and not self._restarted:
+        elif command.what == Operation.RESET and arm.state is DriveState.FAULT:
+            if not self._restarted:
+                arm.reset()
             self._goal = set(DriveState) - {DriveState.FAULT}
-            arm.reset()
         return ""
 
     def arrived(self, serial: int) -> bool:

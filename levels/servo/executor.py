@@ -108,6 +108,10 @@ class ServoExecutor(ArmDriver):
         self.reference.part = self.part
         return why
 
+    def adopted(self) -> None:
+        """Forget the operator's way: the arm may have been moved away from it."""
+        self.operator.forget()
+
     def started(self) -> None:
         """Keep the grip on a part."""
         if self._grip is not None:

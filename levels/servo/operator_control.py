@@ -61,6 +61,10 @@ class OperatorControl:
             self.orders.under_way()
         self.stands = self.orders.standing is not Operation.NONE or bool(self._way)
 
+    def forget(self) -> None:
+        """Forget the way back: the level above continues from where the arm is."""
+        self._way.clear()
+
     @property
     def reason(self) -> str:
         """Why the arm does not follow the level above; empty: it does."""

@@ -156,6 +156,8 @@ class Stopping:
         """Return the reaction of this cycle."""
         passed = tick - self._tick if self._tick is not None else self._every
         self._tick = tick
+        if self.is_disabled:
+            self.cause = Error.NONE
         if self.error:
             return Reaction.BRAKE
         sound = self.refused is None and self._retry_at is None and self._struck_until is None

@@ -10,6 +10,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
+from rack.backplane.words import Demand
 from rack.boards.config import load
 from rack.levels.arm import DriveState, Sensed, SimulatedArm
 from rack.levels.messages import Error
@@ -168,6 +169,48 @@ def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_rest
     servo.run(400)
     fastest = np.abs(np.diff(servo.positions, axis=0)).max(axis=0) / 2.5e-3
     assert (0.1 * limits < fastest).any()
+
+
+def test_an_arm_enabled_under_a_demand_is_enabled_and_waits_for_its_end(tmp_path: Path) -> None:
+    servo = rig(tmp_path)
+    servo.rack.demand = Demand.BRAKE
+    Operator(servo.rack).say("servo", Operation.ENABLE)
+    servo.run(50)
+    assert servo.status.reason.startswith("demand 'brake' on the arm")
+    assert (servo.status.error, servo.state.error, servo.status.braked) == (0, 0, 1)
+    servo.rack.demand = Demand.NONE
+    servo.run(5)
+    assert not servo.status.braked
+
+
+def test_a_reset_without_a_fault_leaves_the_arm_enabled(tmp_path: Path) -> None:
+    servo = rig(tmp_path)
+    operator = Operator(servo.rack)
+    for what in (Operation.ENABLE, Operation.RESET, Operation.ENABLE):
+        operator.say("servo", what)
+        servo.run(20)
+        assert (servo.status.answer, servo.status.braked) == (Answer.DONE, 0)
+
+
+def test_an_operators_way_back_ends_where_the_arm_was_enabled_again(tmp_path: Path) -> None:
+    servo = rig(tmp_path, "IdealArm", enable="at-start")
+    operator = Operator(servo.rack)
+    operator.say("servo", Operation.SETPOINT, joints=(0.4, 0.2))
+    servo.run(300)
+    operator.say("servo", Operation.HOLD)
+    servo.run(20)
+    operator.say("servo", Operation.DISABLE)
+    servo.run(20)
+    arm = servo.servo.arm
+    assert isinstance(arm, IdealArm)
+    arm._q += 0.3  # by hand
+    operator.say("servo", Operation.ENABLE)
+    servo.run(20)
+    before = servo.status.position.copy()
+    operator.say("servo", Operation.RESUME)
+    servo.run(300)
+    assert servo.status.answer == Answer.DONE
+    assert np.abs(servo.status.position - before).max() < 1e-3
 
 
 @pytest.mark.parametrize("latency_ticks", [0, 2])
