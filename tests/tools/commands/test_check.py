@@ -258,3 +258,19 @@ def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
         4,
         10.372,
     )
+
+
+@pytest.mark.slow
+def test_verbose_shows_what_the_monitors_stand_for_an_arm_of_ones_own_more() -> None:
+    hardware = "configs/examples/own-hardware/hardware.toml"
+    (own,) = json.loads(check(hardware, "--json").stdout)["monitors"]
+    assert own == {
+        "board": "servo",
+        "position_mrad": [0.375] * 7,
+        "velocity_mrad_s": [3.5] * 7,
+        "jitter_ms": 0.125,
+    }
+    (simulated,) = json.loads(check("k1607", "--json").stdout)["monitors"]
+    assert (simulated["position_mrad"], simulated["jitter_ms"]) == ([0.025] * 7, 0.008)
+    lines = rack("check", hardware, "--verbose").stdout.splitlines()
+    assert sum(line.startswith("monitors: 'servo' takes samples for good") for line in lines) == 1
