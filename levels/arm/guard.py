@@ -27,6 +27,29 @@ class Exceeded(NamedTuple):
     text: str
 
 
+def kept_bounds(cell: Cell, joints: Sequence[str], part: float) -> Bounds:
+    """Return the bounds of a cell, velocities by `part`, less what samples may be off by. Raises
+    `RobotError` for encoders too coarse to tell a limit of one of `joints`."""
+    velocity = part * cell.bounds.velocity
+    off = cell.encoders.off
+    speed_off = cell.encoders.speed_off
+    kept = Bounds(
+        position=cell.bounds.position + np.stack((off, -off), axis=1),
+        velocity=velocity - speed_off,
+        torque=cell.bounds.torque,
+    )
+    coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
+    if coarse.any():
+        joint = int(coarse.argmax())
+        name = "latency_ticks" if cell.encoders.latency_ticks else "sensors"
+        raise RobotError(
+            f"robot.{name}: '{joints[joint]}' may be off by {off[joint]:g} rad,"
+            f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
+            f" {velocity[joint]:g} rad/s; permitted: less than half of that"
+        )
+    return kept
+
+
 class GuardedArm:
     """Implements `Link` around an arm, by its samples alone.
 
@@ -64,28 +87,11 @@ class GuardedArm:
     def permit(self, part: float) -> None:
         """Keep velocities within `part` of their limits. Raises `RobotError`."""
         cell = self._cell
-        joints = self._joints
-        position = cell.bounds.position
-        velocity = part * cell.bounds.velocity
+        kept = kept_bounds(cell, self._joints, part)
         off = cell.encoders.off
-        speed_off = cell.encoders.speed_off
-        self._low = position[:, 0] - off
-        self._high = position[:, 1] + off
-        self._fastest = velocity + speed_off
-        kept = Bounds(
-            position=position + np.stack((off, -off), axis=1),
-            velocity=velocity - speed_off,
-            torque=cell.bounds.torque,
-        )
-        coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
-        if coarse.any():
-            joint = int(coarse.argmax())
-            name = "latency_ticks" if cell.encoders.latency_ticks else "sensors"
-            raise RobotError(
-                f"robot.{name}: '{joints[joint]}' may be off by {off[joint]:g} rad,"
-                f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
-                f" {velocity[joint]:g} rad/s; permitted: less than half of that"
-            )
+        self._low = cell.bounds.position[:, 0] - off
+        self._high = cell.bounds.position[:, 1] + off
+        self._fastest = part * cell.bounds.velocity + cell.encoders.speed_off
         self._gate = LimitGate(kept, cell.limits.acceleration, self._span_s, self._dynamics)
 
     def sense(self) -> Sensed:

@@ -25,7 +25,9 @@ from rack.levels.arm import (
     preload,
 )
 from rack.levels.arm.faulty import STEPS
+from rack.levels.arm.guard import kept_bounds
 from rack.levels.compiled import compiled
+from rack.levels.errors import RobotError
 from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
 from rack.levels.messages import SCENE, Error
 from rack.levels.operator import Operation, Orders
@@ -136,8 +138,18 @@ class ArmDriver(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Iterable[tuple[str, Any, str]]:
-        """Yield a hand, whose tendons have a board of another kind."""
-        if context.robot.hand is not None:
+        """Yield a hand, whose tendons have a board of another kind, and an arm whose samples are
+        too coarse to guard it."""
+        robot = context.robot
+        given = context.params.get("arm")
+        if given is not None and not find_arm(given).keeps_limits:
+            cell = build_cell(robot, context.scene, context.clock_ns)
+            try:
+                own = sensed_by(cell, robot, find_arm(given).sensors)
+                kept_bounds(own, robot.joints, robot.bring_up or 1.0)
+            except RobotError as error:
+                yield "params.arm", given, str(error)
+        if robot.hand is not None:
             yield (
                 "executor",
                 cls.__name__,

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.config import load
+from rack.boards.config import load, wire
 from rack.boards.config.cell import built_cell
+from rack.boards.errors import ConfigError
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, GuardedArm, Sensed, SimulatedArm
 from rack.levels.errors import RobotError
@@ -331,3 +332,18 @@ def test_an_arm_that_keeps_its_limits_itself_is_driven_directly(tmp_path: Path) 
     assert simulated.servo._link is simulated.servo.arm
     own = rig(tmp_path, {})
     assert isinstance(own.servo._link, GuardedArm)
+
+
+def test_a_config_whose_arm_cannot_be_guarded_is_refused_before_the_launch() -> None:
+    config = load(EXAMPLE / "hardware.toml", ["robot.bring_up=0.001"])
+    with pytest.raises(ConfigError) as refused:
+        wire(config)
+    (mistake,) = refused.value.mistakes
+    assert (mistake.place, mistake.value) == (
+        "board.servo.params.arm",
+        "hardware_arm:HardwareArm",
+    )
+    assert mistake.why == (
+        "robot.sensors: 'kj1' may be off by 0.00035 rad, 0.0035 rad/s: too coarse to keep it below"
+        " 0.001 rad/s; permitted: less than half of that"
+    )
