@@ -33,7 +33,13 @@ def ran(seconds: float, *settings: str) -> tuple[Outcome, list[Event], Message]:
 
 @pytest.mark.slow
 def test_hardware_is_enabled_homed_faulted_reset_and_killed_and_goes_on() -> None:
-    commands = given("enable", 0.2), given("reset", 6.5), given("enable", 6.6)
+    commands = (
+        given("enable", 0.2),
+        given("disable", 3.0),
+        given("enable", 3.2),
+        given("reset", 6.5),
+        given("enable", 6.6),
+    )
     faults = (
         '{ kind = "actuator-off", board = "servo", joint = 2, at = 6.0, for = "200ms" }',
         '{ kind = "kill", board = "servo", at = 8.0 }',
@@ -47,8 +53,9 @@ def test_hardware_is_enabled_homed_faulted_reset_and_killed_and_goes_on() -> Non
     closed = [(e.tick, e.text) for e in events if e.code == "brakes_closed"]
     opened = [e.tick for e in events if e.code == "brakes_opened"]
     # The drives take 500 ticks to find their reference and be ready, 100 when they know it.
-    assert opened[:2] == [80 + 501, 2640 + 101]
-    (faulted, by_drives), (killed, by_kill) = closed
+    assert opened[:3] == [80 + 501, 1280 + 101, 2640 + 101]
+    (disabled, by_operator), (faulted, by_drives), (killed, by_kill) = closed
+    assert (disabled, by_operator) == (1201, "brakes engaged: disabled")
     assert 2400 <= faulted <= 2402
     assert by_drives == "brakes engaged: drives"
     assert 3200 < killed <= 3400  # found by the board that follows

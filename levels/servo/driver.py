@@ -272,7 +272,7 @@ class ArmDriver(Executor):
     def _is_judged(self, sensed: Sensed, tick: int) -> bool:
         """Return whether this sample can be judged: until the arm is enabled, it only says where
         the arm is, and may be missing."""
-        is_enabled = self.arm.state is DriveState.ENABLED
+        is_enabled = self.enabling.is_enabled
         if self._adopted and is_enabled:
             return True
         is_adopted = self.sensors.adopt(sensed, tick)
@@ -283,10 +283,9 @@ class ArmDriver(Executor):
 
     def _decide(self, tick: int) -> Reaction:
         """Return the reaction of this cycle; an arm that is not enabled is braked, and waits."""
-        state = self.arm.state
-        if state is DriveState.ENABLED:
+        if self.enabling.is_enabled:
             return self.stopping.decide(self.demand, self.sensors, tick)
-        error = Error.DRIVES if state is DriveState.FAULT else Error.DISABLED
+        error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
         return self.stopping.wait(error, self.enabling.reason, tick)
 
     def _start(self, before: Message | None, tick: int) -> None:
@@ -296,7 +295,7 @@ class ArmDriver(Executor):
             self.sensors.recall(before)
             self.stopping.recall(before)
             self.started()
-            self._adopted = self.arm.state is DriveState.ENABLED
+            self._adopted = self.enabling.is_enabled
         if self.arm.braked:
             self._brakes.start(self.arm.tick, AT_START if before is None else NO_TORQUE)
         self.arm.step(tick - self.arm.tick)

@@ -28,6 +28,8 @@ class Enabling:
         self._guessed = "" if arm.keeps_limits else ", ".join(robot.guessed)
         self._restarted = False  # in the first cycle, in which old commands are read again
         self._serial = 0  # of the newest command, while drives are on their way; 0: they are not
+        self._disables = False  # of the commands of a cycle, old ones too, the last one that counts
+        self._leaves = False  # its operator has disabled it, as its drives will show
         self._goal: Collection[DriveState] = ()  # states in which it is done
 
     def start(self, restarted: bool) -> None:
@@ -41,16 +43,18 @@ class Enabling:
         arm = self._arm
         self._serial = command.id
         self._goal = list(DriveState)
-        if command.what == Operation.ENABLE and arm.state is not DriveState.ENABLED:
+        if command.what in (Operation.ENABLE, Operation.DISABLE):
+            self._disables = command.what == Operation.DISABLE
+        if command.what == Operation.ENABLE and not self.is_enabled:
             if self._restarted:
                 return "its board was restarted since; if it still stands, command it again"
             if self._guessed or arm.state is DriveState.FAULT:
                 return self.reason
             self._goal = (DriveState.ENABLED,)
+            self._leaves = False
             arm.enable()
         elif command.what == Operation.DISABLE:
             self._goal = (DriveState.DISABLED, DriveState.FAULT)
-            arm.disable()
         elif command.what == Operation.RESET and arm.state is DriveState.FAULT:
             if not self._restarted:
                 arm.reset()
@@ -60,6 +64,10 @@ class Enabling:
     def arrived(self, serial: int) -> bool:
         """Return whether the drives are where the newest command, `serial`, wants them: once."""
         self._restarted = False
+        if self._disables:
+            self._disables = False
+            self._leaves = True
+            self._arm.disable()
         if not self._serial or self._arm.state not in self._goal:
             return False
         is_newest = self._serial == serial
@@ -67,11 +75,14 @@ class Enabling:
         return is_newest
 
     @property
+    def is_enabled(self) -> bool:
+        """Whether the arm may be driven."""
+        return self._arm.state is DriveState.ENABLED and not self._leaves
+
+    @property
     def reason(self) -> str:
-        """Why the arm is not enabled, and what enables it; empty: it is."""
+        """Why the arm is not enabled, and what enables it."""
         state = self._arm.state
-        if state is DriveState.ENABLED:
-            return ""
         if state is DriveState.FAULT:
             return f"drives: {self._arm.fault}; to go on: `reset`, then `enable`"
         if state is DriveState.ENABLING:

@@ -146,7 +146,6 @@ class SensorMonitor:
         q, qd, _, _, sampled = sensed
         if sampled != tick or not (np.isfinite(q).all() and np.isfinite(qd).all()):
             return False
-        self._table[2:6] = 0.0
         for row, before in enumerate((q - self._every * self._tick_s * qd, qd)):
             self._table[2 + row] = self._table[4 + row] = before
         self.doubt[:] = 0.0

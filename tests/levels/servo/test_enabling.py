@@ -53,6 +53,20 @@ class StatefulArm(IdealArm):
             self.state = DriveState.ENABLED
 
 
+class SlowArm(StatefulArm):
+    """Its drives take some ticks to be disabled, too."""
+
+    left_at = -1
+
+    def disable(self) -> None:
+        self.left_at = self.tick + self.ticks
+
+    def step(self, ticks: int) -> None:
+        super().step(ticks)
+        if self.tick == self.left_at:
+            self.state = DriveState.DISABLED
+
+
 class OffArm(IdealArm):
     """Its drives count from elsewhere."""
 
@@ -131,7 +145,13 @@ def test_a_disabled_arm_is_disabled_after_a_restart_and_an_enabled_one_goes_on(
     operator.say("servo", Operation.ENABLE)
     servo.run(50)
     assert not servo.status.braked
+    # Old commands are read again: of them, the last one counts.
+    for what in (Operation.DISABLE, Operation.ENABLE):
+        operator.say("servo", what)
+        servo.run(20)
     servo.restart()
+    servo.run(1)
+    assert servo.servo.arm.state is DriveState.ENABLED
     servo.run(20)
     assert not servo.status.braked
     operator.say("servo", Operation.DISABLE)
@@ -181,6 +201,23 @@ def test_an_arm_enabled_under_a_demand_is_enabled_and_waits_for_its_end(tmp_path
     servo.rack.demand = Demand.NONE
     servo.run(5)
     assert not servo.status.braked
+
+
+def test_an_arm_is_braked_at_once_when_its_operator_disables_it_however_long_its_drives_take(
+    tmp_path: Path,
+) -> None:
+    servo = rig(tmp_path, "SlowArm")
+    operator = Operator(servo.rack)
+    for _ in range(2):
+        operator.say("servo", Operation.ENABLE)
+        servo.run(50)
+        assert (servo.status.braked, servo.status.answer) == (0, Answer.DONE)
+        operator.say("servo", Operation.DISABLE)
+        servo.run(3)
+        assert servo.servo.arm.state is DriveState.ENABLED
+        assert (servo.status.braked, servo.status.error) == (1, Error.DISABLED)
+        servo.run(10)
+        assert servo.servo.arm.state is DriveState.DISABLED
 
 
 def test_a_reset_without_a_fault_leaves_the_arm_enabled(tmp_path: Path) -> None:
