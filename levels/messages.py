@@ -217,8 +217,8 @@ SEGMENT = MessageType(
         ),
         Field("blend", "f8", "rad", "length over which corner k is rounded", (WAYPOINTS,)),
         Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
-        Field("opening", "f8", "m", "gripper joint position to go to, for GRIPPER"),
-        Field("force", "f8", "N", "largest gripper force on the way and afterwards"),
+        Field("opening", "f8", "m or rad", "gripper joint position to go to, for GRIPPER"),
+        Field("force", "f8", "N or N m", "largest gripper force on the way and afterwards"),
     ),
 )
 
@@ -242,7 +242,7 @@ PRIMITIVE_STATUS = status(
     Field("resting", "u1", "1", "1: commanded velocity is zero"),
     OPERATED,
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
-    Field("opening", "f8", "m", "gripper joint position, measured"),
+    Field("opening", "f8", "m or rad", "gripper joint position, measured"),
     Field("position", "f8", "rad", "joint positions commanded last", JOINTS),
     Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
     Field(
@@ -293,8 +293,8 @@ JOINT_SET_POINT = command(
     # For a servo level that feeds acceleration forward; the default one derives it from positions
     # and velocities.
     Field("acceleration", "f8", "rad/s2", "joint accelerations", JOINTS),
-    Field("opening", "f8", "m", "gripper joint position to go to"),
-    Field("force", "f8", "N", "largest gripper force"),
+    Field("opening", "f8", "m or rad", "gripper joint position to go to"),
+    Field("force", "f8", "N or N m", "largest gripper force"),
     Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
 )
 
@@ -333,9 +333,9 @@ DRIVEN_ARM = (
     ),
     Field("target", "f8", "rad", "where the joints are wanted in this cycle", JOINTS),
     Field("target_velocity", "f8", "rad/s", "likewise", JOINTS),
-    Field("opening", "f8", "m", "gripper joint position, measured"),
-    Field("opening_velocity", "f8", "m/s", "gripper joint velocity, measured"),
-    Field("grip_force", "f8", "N", "force given to the gripper"),
+    Field("opening", "f8", "m or rad", "gripper joint position, measured"),
+    Field("opening_velocity", "f8", "m/s or rad/s", "gripper joint velocity, measured"),
+    Field("grip_force", "f8", "N or N m", "force given to the gripper"),
     Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
     Field(
         "stopped",

@@ -127,6 +127,23 @@ class CalibrationConfig(Table):
     )
 
 
+DAMPING_S = 0.03
+"""Damping of a gripper's loop per stiffness, where none is given."""
+STILL_PARTS = 20
+"""The opening may be a length or an angle: what counts as no motion is a part of the whole."""
+
+
+class FollowConfig(Table):
+    """`[[robot.gripper.follow]]`: a joint that the gripper moves, though the model couples it to
+    nothing. Its own actuator is removed."""
+
+    joint: str = Field(description="MJCF joint that follows the driven one")
+    ratio: Finite = Field(
+        1.0,
+        description="its motion per motion of the driven joint, from the model's reference pose",
+    )
+
+
 class GripperConfig(Table):
     """A gripper driven by one actuator along one joint."""
 
@@ -135,8 +152,49 @@ class GripperConfig(Table):
     open: Finite = Field(description="joint position when open, m or rad")
     closed: Finite = Field(description="joint position when closed on nothing, m or rad")
     force: Positive = Field(description="largest force or torque of the actuator, N or N m")
-    stiffness: Positive = Field(2000.0, description="position loop, N/m")
-    damping: Positive = Field(60.0, description="position loop, N s/m")
+    stiffness: Positive | None = Field(
+        None,
+        description=(
+            "position loop, N/m or N m/rad; default: all of the force at half of the way to closed"
+        ),
+    )
+    damping: Positive | None = Field(
+        None,
+        description="position loop, N s/m or N m s/rad; default: 30 ms times the stiffness",
+    )
+    follow: tuple[FollowConfig, ...] = Field(
+        (), description="joints that follow the driven one, where the model does not say so"
+    )
+    residual: Positive = Field(
+        0.012,
+        description=(
+            "how far fingers may settle from where planning poses them, because soft couplings"
+            " yield, or a loop may stay open, m; by default less than the 15 mm that planned motion"
+            " keeps from everything"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _opens(self) -> GripperConfig:
+        if self.open == self.closed:
+            raise ValueError(f"open and closed are both {self.open:g}: the gripper does not move")
+        return self
+
+    @property
+    def travel(self) -> float:
+        """The way of the driven joint from open to closed, m or rad."""
+        return abs(self.open - self.closed)
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Stiffness and damping of the position loop, N/m and N s/m, or N m/rad and N m s/rad."""
+        stiffness = self.stiffness or 2.0 * self.force / self.travel
+        return stiffness, self.damping or DAMPING_S * stiffness
+
+    @property
+    def still(self) -> float:
+        """Part of that way, m or rad, that counts as none; and in a second, as rest."""
+        return self.travel / STILL_PARTS
 
 
 class WristConfig(Table):

@@ -27,7 +27,7 @@ from rack.levels.operator import (
     Operation,
     Orders,
 )
-from rack.levels.tables import read_params
+from rack.levels.tables import GripperConfig, read_params
 
 
 class ElementalMoveExecutor(Executor):
@@ -132,8 +132,7 @@ class ElementalMoveExecutor(Executor):
             gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
             if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
                 self._fail(
-                    Error.GRASP_MISSED,
-                    f"the gripper has closed to {status.opening * 1e3:.1f} mm: it holds nothing",
+                    Error.GRASP_MISSED, f"{closed_so_far(gripper, status)}: it holds nothing"
                 )
 
     def _check_below(self, status: Message, segments: SegmentWindow) -> None:
@@ -141,11 +140,9 @@ class ElementalMoveExecutor(Executor):
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
-        if moving and status.held >= 0 and self._is_shut(status):
-            self._fail(
-                Error.OBJECT_LOST,
-                f"the gripper has closed to {status.opening * 1e3:.1f} mm: the object is lost",
-            )
+        gripper = self._gripper
+        if gripper is not None and moving and status.held >= 0 and self._is_shut(status):
+            self._fail(Error.OBJECT_LOST, f"{closed_so_far(gripper, status)}: the object is lost")
 
     def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
         """Request another path where the arm rests in front of an obstacle; cancel the request when
@@ -240,7 +237,11 @@ class ElementalMoveExecutor(Executor):
 
     def _is_shut(self, status: Message) -> bool:
         gripper = self._gripper
-        return gripper is not None and abs(status.opening - gripper.closed) < self._params.grasp_gap
+        if gripper is None:
+            return False
+        return bool(
+            abs(status.opening - gripper.closed) < (self._params.grasp_gap or gripper.still)
+        )
 
     def _fail(self, error: Error, reason: str) -> None:
         if not self._error:
@@ -332,3 +333,10 @@ class ElementalMoveExecutor(Executor):
         if not command.id:
             return State.IDLE
         return State.DONE if self._done >= command.id else State.EXECUTING
+
+
+def closed_so_far(gripper: GripperConfig, status: Message) -> str:
+    """Say how far the gripper is from closed, as a part of its way: that is a length or an
+    angle."""
+    part = (status.opening - gripper.closed) / (gripper.open - gripper.closed)
+    return f"the gripper has closed to {part:.1%} of its way"

@@ -37,8 +37,12 @@ class ElementalMoveParams(Table):
         le=1000,
         description="other paths that one move may take before a blocked way is an error",
     )
-    grasp_gap: Positive = Field(
-        0.002, description="a gripper closer to closed than this holds nothing, m or rad"
+    grasp_gap: Positive | None = Field(
+        None,
+        description=(
+            "a gripper closer to closed than this holds nothing, m or rad; default: a twentieth of"
+            " its way"
+        ),
     )
     answer: Positive = Field(
         0.3, description="time that settling and the report from below may take, s"

@@ -45,7 +45,13 @@ class PrimitiveParams(Table):
     settled: Positive = Field(
         0.003, description="largest distance of a settled joint from its goal, rad"
     )
-    settled_opening: Positive = Field(0.002, description="largest speed of a settled gripper, m/s")
+    settled_opening: Positive | None = Field(
+        None,
+        description=(
+            "largest speed of a settled gripper, m/s or rad/s; default: a twentieth of its way in"
+            " a second"
+        ),
+    )
     settled_cycles: int = Field(
         3, ge=1, le=100, description="consecutive cycles that a settled arm stays so"
     )
@@ -264,6 +270,7 @@ class GripperWork:
 
     def __init__(self, segment: MotionSegment, gripper: GripperConfig, rules: WorkRules) -> None:
         self.segment = segment
+        self._gripper = gripper
         self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
         self.fault: SegmentFault | None = None  # why it cannot be done
         self._rules = rules
@@ -288,9 +295,12 @@ class GripperWork:
         if self._cycles <= HANDOVER_CYCLES:
             return False
         speed = abs(status.opening_velocity)
-        permitted = self._rules.params.settled_opening
+        permitted = self._rules.params.settled_opening or self._gripper.still
         settled = self._quiet.settled(speed < permitted)
         if self._quiet.overdue and not settled:
-            reason = f"gripper still moves at {speed:.4f} m/s; it must come below {permitted} m/s"
+            reason = (
+                f"gripper still moves {speed / self._gripper.travel:.1%} of its way in a second; it"
+                f" must come below {permitted / self._gripper.travel:.1%}"
+            )
             self.fault = SegmentFault(Error.FOLLOWING, reason)
         return settled

@@ -27,6 +27,10 @@ from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load
 from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, SensorConfig
 
+TOUCHING_M = 5e-5
+"""Geoms closer than this at home touch: rounding decides."""
+SETTLING_S = 1.0
+"""Time in which the fingers of a gripper come to rest."""
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 """Everything the next step depends on: a simulation restored from it continues bit for bit."""
 
@@ -104,9 +108,13 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
         motors, torque = fit_tendons(spec, robot, robot.hand, clock_ns * 1e-9 / robot.substeps)
     prepare(spec, robot, clock_ns)
     cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
+    if robot.gripper is not None and ease_gripper(cell, spec, robot.gripper, clock_ns * 1e-9):
+        cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
     for key, position in (("home", cell.home), ("start", cell.begin)):
         cell.model.key_qpos[0] = start_qpos(cell, position)
         check_start(cell, robot, key, position)
+    if robot.gripper is not None and cell.gripper is not None and cell.gripper.linkage.yields:
+        check_fingers(cell, cell.gripper, robot.gripper)
     return cell
 
 
@@ -167,7 +175,7 @@ def index(
         begin=np.array(robot.start or robot.home),
         homing=robot.calibration.homing,
         tool=tool,
-        gripper=_gripper(model, robot.gripper, joint, linked),
+        gripper=_gripper(model, robot.gripper, joint, linked, joints),
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
@@ -220,11 +228,14 @@ def pressed_pairs(
     return pressed
 
 
-def unintended_contacts(data: mujoco.MjData, touch: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return the pairs of geoms, (n, 2), in unintended contact; `touch` is that of `Cell`."""
+def unintended_contacts(
+    data: mujoco.MjData, touch: NDArray[np.bool_], within: float = 0.0
+) -> NDArray[np.int32]:
+    """Return the pairs of geoms, (n, 2), in unintended contact, or `within` a distance, m; `touch`
+    is that of `Cell`."""
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
-    return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < 0.0)])
+    return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < within)])
 
 
 def _gripper(
@@ -232,6 +243,7 @@ def _gripper(
     config: GripperConfig | None,
     joint: int | None,
     linked: NDArray[np.bool_],
+    arm: NDArray[np.int_],
 ) -> Gripper | None:
     if config is None or joint is None:
         return None
@@ -240,9 +252,48 @@ def _gripper(
         actuator=int(model.actuator(config.actuator).id),
         open=config.open,
         closed=config.closed,
-        stiffness=config.stiffness,
-        linkage=solve_linkage(model, joint, linked, (config.open, config.closed)),
+        stiffness=config.gains[0],
+        linkage=solve_linkage(model, config, linked, arm),
     )
+
+
+def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float) -> bool:
+    """Change in `spec` what would keep the gripper from moving; return whether something did.
+
+    Its overlapping links do not touch. A drive lighter than what the damping of its loop stops
+    within one tick would swing: it gets that inertia, as `min_armature` does for the arm's joints.
+    """
+    pairs = overlapping_links(cell)
+    for first, second in pairs:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+    assert cell.gripper is not None, "the config has one"
+    lacks = config.gains[1] * tick_s - float(cell.model.dof_M0[cell.gripper.dof])
+    if lacks > 0.0:
+        spec.joint(config.joint).armature += lacks
+    return bool(pairs) or lacks > 0.0
+
+
+def overlapping_links(cell: Cell) -> list[tuple[str, str]]:
+    """Return pairs of bodies of the gripper that overlap before its fingers meet, open or half
+    open.
+
+    Links meet at their pins, and meshes are simulated by their hulls: in contact they would hold
+    the gripper.
+    """
+    gripper = cell.gripper
+    if gripper is None:
+        return []
+    model = cell.model
+    data = mujoco.MjData(model)
+    found = set()
+    for opening in (gripper.open, half_open(gripper)):
+        gripper.linkage.set(data.qpos, opening)
+        mujoco.mj_fwdPosition(model, data)
+        contact = data.contact
+        ours = np.isin(contact.geom, cell.gripper_geoms).all(axis=1) & (contact.dist < 0.0)
+        found |= {tuple(sorted(pair)) for pair in model.geom_bodyid[contact.geom[ours]].tolist()}
+    named = [(model.body(one).name, model.body(other).name) for one, other in sorted(found)]
+    return [(one, other) for one, other in named if one and other]
 
 
 def start_qpos(cell: Cell, position: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -276,9 +327,50 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: NDArray[np.f
                 f"robot.{key}: joint '{name}' carries {needed:.4g} N m there; its torque limit is"
                 f" {limit:g}"
             )
-    for pair in unintended_contacts(data, cell.touch):
+    # Surfaces that meet at 0.0 mm do not touch yet, but in the first motion.
+    near = copy(cell.model)
+    near.geom_margin[:] += TOUCHING_M
+    data = replace(cell, model=near).start()
+    for pair in unintended_contacts(data, cell.touch, TOUCHING_M):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
             f"robot.{key}: '{first}' touches '{second}'; move {key} or the object, name a support,"
             " or exclude the pair"
         )
+
+
+def check_fingers(cell: Cell, gripper: Gripper, config: GripperConfig) -> None:
+    """Raise `RobotError` when couplings yield so far that open or closing fingers settle beyond
+    `config.residual` of where planning poses them, or the gripper does not close."""
+    model = cell.model
+    stiffness, damping = config.gains
+    for wanted, start in ((config.open, config.open), (config.closed, half_open(config))):
+        data = cell.start()
+        gripper.linkage.set(data.qpos, start)
+        for _ in range(round(SETTLING_S / model.opt.timestep)):
+            data.qpos[cell.qpos] = cell.home
+            data.qvel[cell.dof] = 0.0
+            opening = float(data.qpos[gripper.linkage.driven])
+            pull = stiffness * (wanted - opening) - damping * data.qvel[gripper.dof]
+            data.ctrl[gripper.actuator] = np.clip(pull, -config.force, config.force)
+            mujoco.mj_step(model, data)
+        if not abs(opening - wanted) <= abs(start - wanted) + config.still:
+            raise RobotError(
+                f"robot.gripper.force: {config.force:g} does not bring the gripper from"
+                f" {start:.4g} to {wanted:.4g}: it settles at {opening:.4g}"
+            )
+        settled = data.geom_xpos[cell.gripper_geoms].copy()
+        gripper.linkage.set(data.qpos, float(data.qpos[gripper.linkage.driven]))
+        mujoco.mj_kinematics(model, data)
+        away = float(np.max(np.linalg.norm(data.geom_xpos[cell.gripper_geoms] - settled, axis=1)))
+        if not away <= config.residual:
+            raise RobotError(
+                f"robot.gripper: its couplings yield: at {opening:.4g} a finger settles"
+                f" {away * 1e3:.1f} mm from where planning poses it; robot.gripper.residual permits"
+                f" {config.residual * 1e3:.1f} mm"
+            )
+
+
+def half_open(gripper: GripperConfig | Gripper) -> float:
+    """Return the opening halfway between open and closed, m or rad."""
+    return 0.5 * (gripper.open + gripper.closed)

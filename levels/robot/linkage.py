@@ -3,9 +3,11 @@ model's equalities.
 
 MuJoCo writes every equality (a gear, a loop closed by `connect` or `weld`, a coupled tendon), and
 every joint stop that is exceeded, as rows of residual and Jacobian. Gauss-Newton over them, with
-the joints' springs as weak rows, finds where the linkage settles. It is solved once for a number of
-openings; a pose in between is interpolated, which costs a cycle some microseconds. MuJoCo's own
-kernels add up in a fixed order: equal models give equal poses.
+springs of joints and tendons as weak rows, finds where the linkage settles. Where equalities
+contradict each other or a stop, as soft couplings of tendons do, it settles between them, by their
+stiffness in the simulation. It is solved once for a number of openings; a pose in between is
+interpolated, which costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order:
+equal models give equal poses.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
+from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS
+from rack.levels.tables import GripperConfig
 
 OPENINGS = 33
 """Openings at which the linkage is solved, evenly from one end to the other."""
@@ -34,9 +38,12 @@ DAMPING = 1e-9
 FREE_PART = 0.01
 """Share of `DAMPING` in all that holds a joint, above which the joint counts as free."""
 RESIDUAL = 1e-3
-"""An equality that stays open by more than this, in m or rad, is not solved."""
+"""An equality that stays open by more than this, in m or rad, yields: stiffness decides."""
 NOT_POSED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
-SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+STIFFNESS = 0
+IMPEDANCE = 2
+"""Columns of MuJoCo's `efc_KBIP`."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,7 @@ class Linkage:
     openings: Array  # (k,), rising, m or rad
     joints: NDArray[np.int_]  # (n,), addresses in qpos of the joints that follow
     positions: Array  # (n, k), m or rad
+    yields: bool  # couplings contradict each other or a stop: where it settles is approximate
 
     def set(self, qpos: Array, opening: float) -> None:
         """Set the driven joint in `qpos` to `opening`, m or rad, and all that follow it."""
@@ -56,16 +64,21 @@ class Linkage:
 
 
 def solve_linkage(
-    model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_], ends: tuple[float, float]
+    model: mujoco.MjModel,
+    config: GripperConfig,
+    hand: NDArray[np.bool_],
+    arm: NDArray[np.int_],
 ) -> Linkage:
-    """Return the linkage driven by `joint` in the bodies `hand` (nbody,), between the openings
-    `ends`.
+    """Return the linkage of a gripper in the bodies `hand` (nbody,), between open and closed; `arm`
+    are the arm's own joints.
 
-    Joints with their own motor do not follow. Raises `RobotError` with the equality that cannot be
-    kept, or the joint that nothing determines.
+    Raises `RobotError` with the equality that cannot be kept, the joint that nothing determines, or
+    the motor that nothing commands.
     """
-    solver = _Solver(model, joint, hand)
-    openings = np.linspace(min(ends), max(ends), OPENINGS)
+    solver = _Solver(model, config, hand, arm)
+    openings = np.linspace(
+        min(config.open, config.closed), max(config.open, config.closed), OPENINGS
+    )
     rest = float(model.qpos0[solver.driven])
     first = int(np.argmin(np.abs(openings - rest)))
     positions = np.zeros((len(solver.joints), OPENINGS))
@@ -79,75 +92,117 @@ def solve_linkage(
             positions[:, k] = qpos[solver.joints]
     solver.check_all_follow()
     follows = np.any(positions != model.qpos0[solver.joints][:, None], axis=1)
-    return Linkage(solver.driven, openings, solver.joints[follows], positions[follows])
+    return Linkage(
+        solver.driven, openings, solver.joints[follows], positions[follows], solver.yields
+    )
 
 
 class _Solver:
     """Finds the joints of one linkage at one opening."""
 
-    def __init__(self, model: mujoco.MjModel, joint: int, hand: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        config: GripperConfig,
+        hand: NDArray[np.bool_],
+        arm: NDArray[np.int_],
+    ) -> None:
+        self._config = config
         self._model = copy.copy(model)
         self._model.opt.disableflags |= int(NOT_POSED)
         self._data = mujoco.MjData(self._model)
-        motors = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
+        joint = int(model.joint(config.joint).id)
         carried = hand[model.jnt_bodyid]
-        # The body that carries the linkage may be moved by a joint of the arm itself: that has a
-        # motor.
-        carried[motors] = carried[joint] = False
+        # The body that carries the linkage may be moved by a joint of the arm itself.
+        carried[arm] = carried[joint] = False
+        check_commanded(model, config, carried)
         self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
         follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
         self._follow = follow
         self._loose = np.ones(len(follow), dtype=bool)
+        self.yields = False
         self.driven = int(model.jnt_qposadr[joint])
         self.joints = model.jnt_qposadr[follow].astype(int)
         self._dof = model.jnt_dofadr[follow]
         self._driven_dof = int(model.jnt_dofadr[joint])
         stiffness = model.jnt_stiffness[follow]
-        self._springs = SPRING_PART * stiffness / max(float(np.max(stiffness, initial=0.0)), 1e-12)
+        self._stiffness = stiffness
+        self._tendons = np.flatnonzero(model.tendon_stiffness > 0.0)
+        # Against an equality, the stiffest spring weighs `SPRING_PART`.
+        springs = (*stiffness, *model.tendon_stiffness)
+        self._stiffest = max(float(np.max(springs, initial=0.0)), 1e-12) / SPRING_PART
         self._relaxed = model.qpos_spring[self.joints]
-        self._weights = np.diag(self._springs + DAMPING)
 
     def settle(self, start: Array, opening: float) -> Array:
         """Return qpos with the linkage settled at `opening`, searched from `start`."""
         data = self._data
-        count = len(self.joints)
         data.qpos[:] = start
         data.qpos[self.driven] = opening
+        matrix = self._descend(yielding=False)
+        if self.farthest()[0] > RESIDUAL:
+            matrix = self._descend(yielding=True)
+        step = np.zeros(len(self.joints))
+        for k in np.flatnonzero(self._loose):
+            # If a joint is free to move, only staying in place resists.
+            mujoco.mju_cholSolve(step, matrix, DAMPING * np.eye(len(step))[k])
+            self._loose[k] = step[k] > FREE_PART
+        return np.array(data.qpos)
+
+    def _descend(self, yielding: bool) -> Array:
+        """Move the joints to where the rows' squares are least; return the factored matrix there.
+
+        With `yielding` every row counts by its stiffness in the simulation.
+        """
+        data = self._data
+        count = len(self.joints)
         matrix = np.zeros((count, count))
         slope = np.zeros(count)
         step = np.zeros(count)
         for _ in range(ITERATIONS if count else 0):
-            residual, jacobian = self._rows()
+            residual, jacobian, stiffness = self._rows()
+            most = self._stiffest
+            if yielding:
+                most = float(np.max(stiffness, initial=1e-12))
+                parts = np.sqrt(stiffness / most)
+                residual *= parts
+                jacobian *= parts[:, None]
+            springs = self._stiffness / most
+            if self._tendons.size:
+                stretched, pulls = self._stretched(most)
+                residual = np.concatenate((residual, stretched))
+                jacobian = np.concatenate((jacobian, pulls))
             mujoco.mju_mulMatTMat(matrix, jacobian, jacobian)
             mujoco.mju_mulMatTVec(slope, jacobian, residual)
-            matrix += self._weights
-            slope += self._springs * (data.qpos[self.joints] - self._relaxed)
+            matrix += np.diag(springs + DAMPING)
+            slope += springs * (data.qpos[self.joints] - self._relaxed)
             mujoco.mju_cholFactor(matrix, 0.0)
             mujoco.mju_cholSolve(step, matrix, slope)
             data.qpos[self.joints] -= step
             if float(np.max(np.abs(step))) < STEP_TOLERANCE:
                 break
-        for k in np.flatnonzero(self._loose):
-            # If a joint is free to move, only staying in place resists.
-            mujoco.mju_cholSolve(step, matrix, DAMPING * np.eye(count)[k])
-            self._loose[k] = step[k] > FREE_PART
-        return np.array(data.qpos)
+        return matrix
 
-    def check(self, opening: float) -> None:
-        """Raise `RobotError` where the last pose leaves an equality open."""
+    def farthest(self) -> tuple[float, int]:
+        """Return by how much the last pose leaves an equality open at most, m or rad, and its
+        id."""
         data = self._data
         jacobian = self._jacobian()
         ours = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
         ours &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         if not ours.any():
-            return
+            return 0.0, -1
         worst = int(np.argmax(np.where(ours, np.abs(data.efc_pos), 0.0)))
-        away = abs(float(data.efc_pos[worst]))
-        if away > RESIDUAL:
-            name = _equality_name(self._model, int(data.efc_id[worst]))
+        return abs(float(data.efc_pos[worst])), int(data.efc_id[worst])
+
+    def check(self, opening: float) -> None:
+        """Note where the last pose leaves an equality open. Raises `RobotError` for a loop."""
+        away, equality = self.farthest()
+        self.yields |= away > RESIDUAL
+        if away > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
             raise RobotError(
-                f"robot.gripper: equality {name} is {away:.4f} m or rad off with the gripper at"
-                f" {opening:g}; at most {RESIDUAL:g} can be planned with"
+                f"robot.gripper: equality {_equality_name(self._model, equality)} is {away:.4f} m"
+                f" or rad off with the gripper at {opening:g}; robot.gripper.residual permits"
+                f" {self._config.residual:g}"
             )
 
     def check_all_follow(self) -> None:
@@ -158,23 +213,56 @@ class _Solver:
                 or f"of body {self._model.body(self._model.jnt_bodyid[joint]).name}"
             )
             raise RobotError(
-                f"robot.gripper: joint '{name}' follows nothing; give it an equality with the"
-                " driven joint, or a spring"
+                f"robot.gripper: joint '{name}' follows nothing; name it in"
+                " [[robot.gripper.follow]], or give it an equality with the driven joint, or a"
+                " spring"
             )
 
-    def _rows(self) -> tuple[Array, Array]:
-        """Return residuals (rows,) and their Jacobian (rows, joints): equalities, and joint stops
-        that are exceeded."""
+    def _rows(self) -> tuple[Array, Array, Array]:
+        """Return residuals (rows,), their Jacobian (rows, joints), and the force per residual
+        (rows,) in the simulation: of equalities, and of joint stops that are exceeded."""
         data = self._data
         jacobian = self._jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)
         rows = np.flatnonzero(counts & np.any(jacobian != 0.0, axis=1))
-        return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows])
+        law = data.efc_KBIP.reshape(-1, 4)[rows]
+        stiffness = data.efc_D[rows] * law[:, STIFFNESS] * law[:, IMPEDANCE]
+        return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows]), stiffness
+
+    def _stretched(self, most: float) -> tuple[Array, Array]:
+        """Return the rows of tendons that are springs, (tendons,) and (tendons, joints), their
+        stiffness a part of `most`."""
+        model = self._model
+        jacobian = np.zeros((len(self._tendons), model.nv))
+        for row, tendon in zip(jacobian, self._tendons, strict=True):
+            begin = model.ten_J_rowadr[tendon]
+            span = slice(begin, begin + model.ten_J_rownnz[tendon])
+            row[model.ten_J_colind[span]] = self._data.ten_J[span]
+        parts = np.sqrt(model.tendon_stiffness[self._tendons] / most)
+        length = self._data.ten_length[self._tendons]
+        slack = np.clip(length, *model.tendon_lengthspring[self._tendons].T)
+        return parts * (length - slack), parts[:, None] * jacobian[:, self._dof]
 
     def _jacobian(self) -> Array:
         """Return the Jacobian (rows, nv) of all constraints at the present pose."""
         mujoco.mj_fwdPosition(self._model, self._data)
         return np.asarray(self._data.efc_J).reshape(-1, self._model.nv)
+
+
+def check_commanded(
+    model: mujoco.MjModel, config: GripperConfig, carried: NDArray[np.bool_]
+) -> None:
+    """Raise `RobotError` for an actuator, not the gripper's own, of a joint of those `carried`
+    (njnt,) by the hand."""
+    for k in range(model.nu):
+        name = model.actuator(k).name
+        joint = int(model.actuator_trnid[k, 0])
+        drive = mujoco.mjtTrn(int(model.actuator_trntype[k])) in JOINT_DRIVES
+        if drive and carried[joint] and name != config.actuator:
+            raise RobotError(
+                f"robot.gripper: joint '{model.joint(joint).name}' has an actuator of its own,"
+                f" '{name}', that nothing commands; name the joint in [[robot.gripper.follow]]"
+            )
 
 
 def _equality_name(model: mujoco.MjModel, equality: int) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
-from rack.levels.tables import GripperConfig, RobotConfig
+from rack.levels.tables import FollowConfig, GripperConfig, RobotConfig
 
 GRID_CELLS = 4_000_000
 """Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
@@ -155,6 +155,33 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
         )
     remove(spec, [old])
     add_motor(spec, gripper.actuator, kind, target, gripper.force)
+    for follower in gripper.follow:
+        couple(spec, gripper, follower)
+
+
+def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) -> None:
+    """Make a joint follow the gripper's driven one, in place of its own actuators. Raises
+    `RobotError`."""
+    for name in (follower.joint, gripper.joint):
+        if spec.joint(name) is None:
+            have = listed([j.name for j in spec.joints])
+            raise RobotError(f"robot.gripper: no joint '{name}' in the model; it has: {have}")
+    if follower.joint == gripper.joint:
+        raise RobotError(f"robot.gripper.follow: '{follower.joint}' is the driven joint itself")
+    own = [a for a in spec.actuators if a.trntype in JOINT_DRIVES and a.target == follower.joint]
+    if any(a.name == gripper.actuator for a in own):
+        raise RobotError(
+            f"robot.gripper.follow: '{follower.joint}' is driven by the gripper's own actuator"
+        )
+    remove(spec, own)
+    equality = spec.add_equality(name=f"{follower.joint} follows {gripper.joint}")
+    equality.type = mujoco.mjtEq.mjEQ_JOINT
+    equality.name1 = follower.joint
+    equality.name2 = gripper.joint
+    equality.data[:2] = [0.0, follower.ratio]
+    # As stiff as a gear: with the defaults a finger lags by millimetres.
+    equality.solref = [0.002, 1.0]
+    equality.solimp[:3] = [0.99, 0.999, 0.001]
 
 
 def drives_arm(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotConfig) -> bool:

@@ -157,15 +157,14 @@ def set_torque(
 
 
 class Grip:
-    """The gripper's force, N: a spring and damper to the commanded opening, limited to the
+    """The gripper's force, N or N m: a spring and damper to the commanded opening, limited to the
     commanded force.
 
     Before the first set point the gripper opens or, after `keep`, keeps its force.
     """
 
     def __init__(self, config: GripperConfig) -> None:
-        self._stiffness = config.stiffness
-        self._damping = config.damping
+        self._stiffness, self._damping = config.gains
         self._most_force = config.force
         self._least, self._most = sorted((config.open, config.closed))
         self._opening = config.open
@@ -173,8 +172,8 @@ class Grip:
         self._kept: float | None = None
 
     def keep(self, force: float) -> None:
-        """Keep `force`, N, until the first set point: the grip on an object must survive a restart
-        of the board."""
+        """Keep `force`, N or N m, until the first set point: the grip on an object must survive
+        a restart of the board."""
         self._kept = force
 
     def take(self, command: Message) -> None:
@@ -185,7 +184,7 @@ class Grip:
             self._kept = None
 
     def force(self, opening: float, velocity: float) -> float:
-        """Return the force, N, at `opening`, m, and its `velocity`, m/s."""
+        """Return the force, N or N m, at `opening`, m or rad, and its `velocity`, in a second."""
         if self._kept is not None:
             return self._kept
         force = self._stiffness * (self._opening - opening) - self._damping * velocity

@@ -1,0 +1,154 @@
+"""Grippers as people's models have them: fingers that nothing couples, soft couplings, links that
+overlap, light drives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from rack.backplane.message import State
+from rack.levels.errors import RobotError
+from rack.levels.robot.cell import TOUCHING_M, Cell, build_cell
+from rack.levels.servo.control import Grip
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
+from tests.levels.arms import CLOCK_NS, cell, config, four_bar, pendulum
+from tests.levels.robot import grippers
+from tests.levels.whole_rack import WholeRack
+
+FOLLOW: dict[str, Any] = {"follow": [{"joint": "finger_right", "ratio": 1.0}]}
+TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
+
+
+def built(arm: tuple[RobotConfig, SceneConfig]) -> Cell:
+    return build_cell(*arm, CLOCK_NS)
+
+
+def closing(arm: tuple[RobotConfig, SceneConfig], seconds: float) -> tuple[Cell, mujoco.MjData]:
+    """Return the cell and its data after closing for some time, its loop at the clock's rate."""
+    made = built(arm)
+    table = arm[0].gripper
+    assert made.gripper is not None
+    assert table is not None
+    data = made.start()
+    grip = Grip(table)
+    grip._opening = table.closed
+    for _ in range(round(seconds / (CLOCK_NS * 1e-9))):
+        data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
+        opening = data.qpos[made.gripper.linkage.driven]
+        data.ctrl[made.gripper.actuator] = grip.force(opening, data.qvel[made.gripper.dof])
+        mujoco.mj_step(made.model, data, arm[0].substeps)
+    return made, data
+
+
+def test_a_finger_with_a_motor_that_nothing_commands_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="joint 'finger_right' has an actuator of its own, 'grip_"):
+        built(grippers.independent(tmp_path))
+
+
+def test_a_finger_that_follows_by_the_config_moves_with_the_driven_one(tmp_path: Path) -> None:
+    made, data = closing(grippers.independent(tmp_path, **FOLLOW), 0.5)
+    assert [made.model.actuator(k).name for k in range(made.model.nu)][-1] == "grip"
+    left, right = (data.joint(f"finger_{side}").qpos[0] for side in ("left", "right"))
+    assert left < 0.02
+    assert right == pytest.approx(left, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("joint", "words"),
+    [
+        ("thumb", "no joint 'thumb' in the model; it has: j1"),
+        ("finger_left", "'finger_left' is the driven joint itself"),
+    ],
+)
+def test_a_follower_that_cannot_follow_is_refused(tmp_path: Path, joint: str, words: str) -> None:
+    with pytest.raises(RobotError, match=words):
+        built(grippers.independent(tmp_path, follow=[{"joint": joint}]))
+
+
+def test_a_gripper_whose_open_and_closed_are_equal_is_refused() -> None:
+    with pytest.raises(ValidationError, match=r"both 0\.1: the gripper does not move"):
+        GripperConfig(actuator="grip", joint="elbow", open=0.1, closed=0.1, force=1.0)
+
+
+def test_soft_couplings_are_posed_where_the_simulation_settles(tmp_path: Path) -> None:
+    made, data = closing(grippers.soft(tmp_path), 1.0)
+    assert made.gripper is not None
+    assert made.gripper.linkage.yields
+    posed = np.array(data.qpos)
+    made.gripper.linkage.set(posed, float(data.qpos[made.gripper.linkage.driven]))
+    tips = [int(made.model.joint(f"tip_{side}").qposadr[0]) for side in ("left", "right")]
+    assert posed[tips] == pytest.approx(data.qpos[tips], abs=0.02)
+
+
+def test_fingers_that_settle_elsewhere_than_they_are_posed_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"a finger settles .* mm from .*residual permits 0\.0 mm"):
+        built(grippers.soft(tmp_path, residual=1e-9))
+
+
+def test_a_force_too_small_for_the_springs_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"robot\.gripper\.force: 1e-06 does not bring"):
+        built(grippers.soft(tmp_path, force=1e-6, stiffness=20.0, damping=0.1))
+
+
+def test_links_that_overlap_do_not_hold_the_gripper(tmp_path: Path) -> None:
+    arm = grippers.rotary(tmp_path)
+    model = tmp_path / "puma560.xml"
+    knuckle = '<geom name="knuckle" type="box" size=".01 .02 .02" pos="0 0 .01"/>{}'
+    pad = '<geom class="pad" name="pad_left"'
+    model.write_text(model.read_text().replace(pad, knuckle.format(pad)))
+    made, data = closing(arm, 1.0)
+    assert made.gripper is not None
+    assert data.qpos[made.gripper.linkage.driven] < 0.0
+
+
+def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> None:
+    made, data = closing(grippers.rotary(tmp_path, armature=""), 1.0)
+    assert made.gripper is not None
+    assert made.model.dof_armature[made.gripper.dof] > 0.0
+    assert abs(data.qvel[made.gripper.dof]) < 0.01
+
+
+def test_nothing_is_added_to_the_gripper_of_the_puma() -> None:
+    made = cell("puma560")
+    assert made.gripper is not None
+    assert made.model.dof_armature[made.gripper.dof] == 0.1
+    table = config("puma560")[0].gripper
+    assert table is not None
+    assert table.gains == (2000.0, 60.0)
+    assert table.still == 0.002
+
+
+@pytest.mark.parametrize("apart", [2e-5, 2e-4])
+def test_surfaces_that_meet_at_home_touch(tmp_path: Path, apart: float) -> None:
+    z = 0.7 + 0.03 + 0.01 + apart
+    near = f'<geom name="near" type="box" size=".01 .01 .01" pos=".2 0 {z:.9f}"/>'
+    robot = pendulum(tmp_path, first=near)
+    if apart < TOUCHING_M:
+        with pytest.raises(RobotError, match="'upper' touches 'near'"):
+            build_cell(robot, SceneConfig(), CLOCK_NS)
+    else:
+        assert build_cell(robot, SceneConfig(), CLOCK_NS).gripper is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(lambda folder: grippers.independent(folder, **FOLLOW), id="independent"),
+        pytest.param(grippers.rotary, id="rotary"),
+        pytest.param(grippers.soft, id="soft"),
+        pytest.param(grippers.one_finger, id="one finger", marks=pytest.mark.thorough),
+        pytest.param(four_bar, id="four-bar", marks=pytest.mark.thorough),
+    ],
+)
+def test_a_transfer_is_done_with_every_kind_of_gripper(tmp_path: Path, kind: Any) -> None:
+    rack = WholeRack(arm=kind(tmp_path), actions=[TRANSFER])
+    status = rack.run_to_end(25.0)
+    assert status.state == State.DONE, status.reason
+    assert rack.read("servo.status").touches == 0
+    assert rack.read("world.model").position[0] == pytest.approx(TRANSFER["to"], abs=0.01)
