@@ -52,12 +52,13 @@ class CollisionChecker:
     """Decides whether a configuration of the arm is free, on its own copy of the cell.
 
     The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links
-    may be close to each other and to the body that carries the arm, but must not touch. One
-    instance serves one task; a check takes some microseconds.
+    may be close to each other and to the body that carries the arm, but keep `margin`, m, as the
+    gripper does from supports. One instance serves one task; a check takes some microseconds.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig) -> None:
+    def __init__(self, cell: Cell, scene: SceneConfig, margin: float = 0.0) -> None:
         self.cell = cell
+        self._margin = margin
         self.clearance = scene.clearance  # m
         self.held: int | None = None  # row of the object that is carried
         self._touched: int | None = None
@@ -69,8 +70,12 @@ class CollisionChecker:
             for b in cell.bodies
         ]
         self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
+        # Fingers that swing may reach farther than open as they close: a load is planned with them
+        # so.
+        self.longest = self._longest() if margin > 0.0 else None
         self._contype = self._filter_to_arm()
         self._base = self._required_distances()
+        self._ease_at_home()
         self._required = self._base.copy()
         # The last configuration checked, and its clearance.
         self._q = np.zeros(len(cell.qpos))
@@ -104,6 +109,8 @@ class CollisionChecker:
     ) -> None:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
         self.held = row
+        if self.longest is not None and (gripper := self.cell.gripper) is not None:
+            self.open_gripper(gripper.open if row is None else self.longest)
         self._offset[:3] = position
         self._offset[3:] = quaternion
         self._model.geom_contype[:] = self._contype
@@ -133,9 +140,12 @@ class CollisionChecker:
         short = self._shortfalls()
         pairs = self._data.contact.geom
         required = self._required[pairs[:, 0], pairs[:, 1]]
-        if np.any((short > 0) & (required <= 0)):
+        close = short > 0
+        if np.any(close & (required <= 0)):
             return -1.0
-        return self.clearance - max(0.0, float(np.max(short, initial=0.0)))
+        # Where less than the clearance is required, more of it is missing.
+        lacking = short[close] + (self.clearance - required[close])
+        return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
 
     def why(self, q: Array, clearance: float | None = None) -> str:
         """Name the pair of geoms that violates its distance most at `q`, and both distances; empty:
@@ -173,16 +183,16 @@ class CollisionChecker:
         arm[self.cell.arm_geoms] = True
         m.geom_contype[:] = arm & solid
         m.geom_conaffinity[:] = solid
-        # MuJoCo adds the margins of the two geoms: the arm's are zero, so that self-collision has
-        # none.
-        m.geom_margin[:] = np.where(arm, 0.0, self.clearance)
+        # MuJoCo adds the margins of the two geoms: two links find each other within twice the
+        # margin.
+        m.geom_margin[:] = np.where(arm, self._margin, self.clearance)
         m.geom_gap[:] = 0.0
         m.pair_margin[:] = self.clearance
         return np.array(m.geom_contype)
 
     def _required_distances(self) -> Array:
-        """Return (geoms, geoms), in m: the clearance between arm and cell, 0 between links that may
-        collide."""
+        """Return (geoms, geoms), in m: the clearance between arm and cell, the margin between links
+        that may collide."""
         m = self.cell.model
         arm = self.cell.arm_geoms
         typ = m.geom_contype
@@ -194,11 +204,40 @@ class CollisionChecker:
         own = np.union1d(arm, self._carriers())
         for some, others in ((arm, own), (own, arm)):
             required[np.ix_(some, others)] = np.where(
-                collide[np.ix_(some, others)], 0.0, ANY_DISTANCE
+                collide[np.ix_(some, others)], self._margin, ANY_DISTANCE
             )
         # Links of a gripper meet at their pins, and its motion is not planned.
         required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = ANY_DISTANCE
         return required
+
+    def _ease_at_home(self) -> None:
+        """Require of links that are closer than twice the margin at home only half their distance
+        there: some always are."""
+        mujoco.mj_fwdPosition(self._model, self._data)
+        contact = self._data.contact
+        own = np.union1d(self.cell.arm_geoms, self._carriers())
+        for pair, distance in zip(contact.geom, contact.dist, strict=True):
+            if np.isin(pair, own).all():
+                one, other = pair
+                eased = min(self._base[one, other], max(0.5 * distance, 0.0))
+                self._base[one, other] = self._base[other, one] = eased
+
+    def _longest(self) -> float | None:
+        """Return the opening at which the gripper reaches farthest along the tool; None: when
+        open."""
+        gripper = self.cell.gripper
+        if gripper is None:
+            return None
+        data = self._data
+        found = []
+        for opening in (gripper.open, *gripper.linkage.openings):
+            self.open_gripper(opening)
+            mujoco.mj_kinematics(self._model, data)
+            axis = data.site_xmat[self.cell.tool].reshape(3, 3)[:, 2]
+            found.append((farthest(self._model, data, self.cell.gripper_geoms, axis), opening))
+        self.open_gripper(gripper.open)
+        reached, opening = max(found)
+        return float(opening) if reached > found[0][0] + self._margin else None
 
     def _carriers(self) -> NDArray[np.int_]:
         """Return the geoms of the fixed bodies that carry the arm: some links are always near
@@ -228,11 +267,28 @@ class CollisionChecker:
             is_held = self._touched == self.held
             self._require(touched, gripper, ANY_DISTANCE if is_held else -MAX_TOUCH_DEPTH_M)
             self._require(touched, supports, -MAX_HELD_DEPTH_M if is_held else -MAX_TOUCH_DEPTH_M)
-            self._require(gripper, supports, 0.0)
+            self._require(gripper, supports, self._margin)
 
     def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:
         self._required[np.ix_(some, others)] = distance
         self._required[np.ix_(others, some)] = distance
+
+
+def farthest(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int_], axis: ArrayLike
+) -> float:
+    """Return how far bounding boxes of geoms reach along `axis` (3,), a unit vector, from the
+    origin, m."""
+    # A box's extent along an axis: its half sizes times the axis in its own frame.
+    along = np.sum(data.geom_xmat[geoms].reshape(-1, 3, 3) * np.reshape(axis, (3, 1)), axis=1)
+    centre = model.geom_aabb[geoms, :3]
+    half = model.geom_aabb[geoms, 3:]
+    reached = (
+        np.sum(data.geom_xpos[geoms] * axis, axis=1)
+        + np.sum(along * centre, axis=1)
+        + np.sum(np.abs(along) * half, axis=1)
+    )
+    return float(np.max(reached))
 
 
 @compiled

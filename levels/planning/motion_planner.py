@@ -50,7 +50,7 @@ class MotionPlanner:
         self.cell = cell
         self.clearance = scene.clearance  # m
         self.ik = InverseKinematics(cell, seed)
-        self.checker = CollisionChecker(cell, scene)
+        self.checker = CollisionChecker(cell, scene, MAX_STRAY_M)
         self.paths = PathPlanner(cell, scene.clearance, seed)
         self.payloads = Payloads(cell, scene.objects)
 
