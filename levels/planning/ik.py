@@ -65,13 +65,14 @@ class InverseKinematics:
         mujoco.mj_kinematics(self._cell.model, self._data)
         return pose(*site_pose(self._data, self._cell.tool))
 
-    def reach(self, target: Pose, start: Array) -> Array | None:
+    def reach(self, target: Pose, start: Array, turned: bool = True) -> Array | None:
         """Return the configuration (joints,) at `target` found by one descent from `start`, or
-        None."""
+        None; without `turned` in any orientation."""
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
             error = self._error(target, q)
+            error[3:] *= turned
             if (
                 max(abs(error[:3])) < POSITION_TOLERANCE_M
                 and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD
@@ -83,7 +84,7 @@ class InverseKinematics:
                 and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]
             ):
                 return None
-            step = self._step(error, q)
+            step = self._step(error, q, turned)
             if step is None:
                 return None
             q = q + step
@@ -109,13 +110,14 @@ class InverseKinematics:
         """
         return [q for q in self.reachable(target, reference) if free(q)]
 
-    def reachable(self, target: Pose, reference: Array) -> list[Array]:
-        """Return distinct configurations at `target`, free or not, the quickest to reach first."""
+    def reachable(self, target: Pose, reference: Array, turned: bool = True) -> list[Array]:
+        """Return distinct configurations at `target`, free or not, the quickest to reach first;
+        without `turned` in any orientation."""
         rng = np.random.default_rng(self._seed)
         found: list[Array] = []
         idle = 0
         for start in self._starts(reference, rng):
-            q = self.reach(target, start)
+            q = self.reach(target, start, turned)
             known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in found)
             idle = idle + 1 if known else 0
             if q is not None and not known:
@@ -145,7 +147,7 @@ class InverseKinematics:
         mujoco.mju_rotVecQuat(error[3:], turn, tool.quaternion)
         return error
 
-    def _step(self, error: Array, q: Array) -> Array | None:
+    def _step(self, error: Array, q: Array, turned: bool) -> Array | None:
         """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there
         is none."""
         m = self._cell.model
@@ -153,6 +155,7 @@ class InverseKinematics:
         mujoco.mj_comPos(m, d)
         mujoco.mj_jacSite(m, d, self._jacobian[:3], self._jacobian[3:], self._cell.tool)
         jacobian = np.take(self._jacobian, self._cell.dof, axis=1)
+        jacobian[3:] *= turned
         hessian = gram(jacobian)
         step = np.zeros(len(q))
         hessian.flat[:: len(q) + 1] += DAMPING * (1.0 + norm(error) ** 2)

@@ -11,7 +11,7 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
-from rack.levels.planning.motion_planner import MotionPlanner, in_metres
+from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner, in_metres
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import SceneConfig
@@ -73,13 +73,17 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     if action.joints is not None:
         return rehearsal.then(k, Verb.MOVE_JOINTS, joints=np.array(action.joints))
     assert action.position is not None, "a goto has joints or a position"
-    if action.quaternion is not None:
+    motion = rehearsal.motion
+    rehearsal.situation.lay_out(motion.checker, None)
+    if action.direction == "any":
+        place = pose(action.position, pointing(DOWN))
+        anyhow = motion.ik.reachable(place, rehearsal.q, turned=False)
+        tools = [motion.ik.tool_at(q) for q in anyhow] or [place]
+    elif action.quaternion is not None:
         tools = [pose(action.position, action.quaternion)]
     else:
         turns = np.arange(TURNS) * 2.0 * np.pi / TURNS
         tools = [pose(action.position, pointing(action.direction or DOWN, turn)) for turn in turns]
-    motion = rehearsal.motion
-    rehearsal.situation.lay_out(motion.checker, None)
     ends = [
         (tool, q)
         for tool in tools
@@ -104,7 +108,7 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
         row = handling.row
         standing_goals = [
             standing(rehearsal.motion.cell, situation, row, goal)
-            for goal in goals(action, situation.object_pose(row))
+            for goal in goals(action, situation.object_pose(row), rehearsal.motion.cell)
         ]
     with _naming(k, pick):
         takes = handling.takes()
@@ -134,12 +138,12 @@ class Handling(NamedTuple):
         start = self.start
         refusal: Refused | None = None
         for tools in grasps(start.motion.cell, start.situation, self.row):
-            takes = [spot for tool in tools for spot in self._spots(tool, start.situation)]
+            takes = [
+                spot for tool in tools for spot in self._spots(tool, start.situation, grasps=True)
+            ]
             if takes:
                 return self._held(takes)
             refusal = refusal or self._nothing_at(tools)
-            if refusal.code == Error.UNREACHABLE:
-                break
         assert refusal is not None, "there is at least one height"
         raise refusal
 
@@ -177,14 +181,20 @@ class Handling(NamedTuple):
         rehearsal = rehearsal.then(k, verb, tool=spot.tool, row=row)
         return rehearsal.then(k, Verb.DEPART, tool=above, row=row)
 
-    def _spots(self, tool: Pose, situation: Situation) -> list[Spot]:
-        """Return the free configurations above `tool` from which the arm can come down to it."""
+    def _spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
+        """Return the free configurations above `tool` from which the arm can come down to it and,
+        if it `grasps` there, close the gripper."""
         motion = self.start.motion
         situation.lay_out(motion.checker, None)
         above = motion.ik.solutions(tool.raised(self.lift), self.start.q, motion.checker.free)
         situation.lay_out(motion.checker, self.row)
         ends = [(q, motion.ik.reach(tool, q)) for q in above]
-        return [Spot(tool, q) for q, end in ends if end is not None and motion.checker.free(end)]
+        free = [(q, end) for q, end in ends if end is not None and motion.checker.free(end)]
+        if grasps and motion.checker.longest is not None:
+            closed = situation.holding(self.row, tool.inverse() @ situation.object_pose(self.row))
+            closed.lay_out(motion.checker, self.row)
+            free = [(q, end) for q, end in free if motion.checker.free(end, MAX_STRAY_M)]
+        return [Spot(tool, q) for q, _ in free]
 
     def _held(self, takes: list[Spot]) -> list[Spot]:
         """Return the spots where gripper and motors can hold the object. Raises the first `Refused`
@@ -243,6 +253,7 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
         )
         low, high = (middle, high) if reached else (low, middle)
     in_reach = begin.towards(end, low)
-    return Refused(
-        Error.UNREACHABLE, f"out of reach: {in_metres(end)}; in reach: {in_metres(in_reach)}"
-    )
+    why = f"out of reach: {in_metres(end)}; in reach: {in_metres(in_reach)}"
+    if motion.ik.reachable(end, here, turned=False):
+        why += "; or the place itself, with the tool turned otherwise"
+    return Refused(Error.UNREACHABLE, why)

@@ -10,15 +10,21 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
-from rack.levels.planning.collision import place_bodies
+from rack.levels.planning.collision import farthest, place_bodies
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geom_name, geoms_of
 from rack.levels.task.program import DOWN, Transfer
 
+UP = np.array([0.0, 0.0, 1.0])
 QUARTERS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
+TILTS = (np.pi / 4.0, np.pi / 2.0)
+"""Angles from straight down at which the tool may take an object that it cannot take so."""
+FULL_ORIENTATION = 6
+"""Joints that bring the tool to a place in every orientation; one of fewer leans away from its
+base alone."""
 HEIGHT_STEP_M = 0.01
 """Spacing of grasps above the object's origin: a tall object is taken higher, so that the palm
 stays clear."""
@@ -33,19 +39,40 @@ MAX_STANDING_GAP_M = 0.02
 
 
 def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
-    """Yield, from the lowest height up, the tool poses that take object `row` from above.
+    """Yield, from the lowest height up, the tool poses that take object `row`: straight down,
+    then leaning over each of its sides.
 
     The fingers close along the tool's y axis, across the object's x or y axis.
     """
     seen = situation.object_pose(row)
     yaws = [yaw_of(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTERS]
     height = 0.0
+    heights = []
     while height == 0.0 or seen.position[2] + height < _top(cell, situation, row):
+        heights.append(height)
         yield [Pose(seen.raised(height).position, pointing(DOWN, -yaw)) for yaw in yaws]
         height += HEIGHT_STEP_M
+    if len(cell.qpos) < FULL_ORIENTATION:
+        yaws = [bearing(cell, seen.position)]
+    for tilt in TILTS:
+        for height in heights:
+            yield [Pose(seen.raised(height).position, leaning(yaw, tilt)) for yaw in yaws]
 
 
-def goals(action: Transfer, at: Pose) -> Iterator[Pose]:
+def leaning(yaw: float, tilt: float) -> Array:
+    """Return the quaternion of a tool that points down but for `tilt`, rad, towards `yaw`; its y
+    axis is level."""
+    across = np.sin(tilt)
+    return pointing((across * np.cos(yaw), across * np.sin(yaw), -np.cos(tilt)), yaw)
+
+
+def bearing(cell: Cell, position: Array) -> float:
+    """Return the direction, rad, in which the arm's first joint sees a position."""
+    base = cell.start().xanchor[cell.model.dof_jntid[cell.dof[0]]]
+    return float(np.arctan2(position[1] - base[1], position[0] - base[0]))
+
+
+def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[Pose]:
     """Yield poses in which the object may be put down: upright as it is now, turned about the
     vertical."""
     yaw = yaw_of(at.quaternion)
@@ -54,6 +81,8 @@ def goals(action: Transfer, at: Pose) -> Iterator[Pose]:
         if action.yaw is not None
         else [quarter * np.pi / 2.0 for quarter in QUARTERS]
     )
+    if action.yaw is None and len(cell.qpos) < FULL_ORIENTATION:
+        turns.append(bearing(cell, np.array(action.to)) - bearing(cell, at.position))
     for turn in turns:
         quaternion = np.zeros(4)
         mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
@@ -117,13 +146,4 @@ def _top(cell: Cell, situation: Situation, row: int) -> float:
     model = cell.model
     data = _laid_out(cell, situation)
     parts = geoms_of(model, below(model, cell.bodies[[row]]))
-    # A box's extent along z: its half sizes times the third row of its rotation.
-    vertical = data.geom_xmat[parts].reshape(-1, 3, 3)[:, 2, :]
-    centre = model.geom_aabb[parts, :3]
-    half = model.geom_aabb[parts, 3:]
-    heights = (
-        data.geom_xpos[parts, 2]
-        + np.sum(vertical * centre, axis=1)
-        + np.sum(np.abs(vertical) * half, axis=1)
-    )
-    return float(np.max(heights))
+    return farthest(model, data, parts, UP)

@@ -50,8 +50,12 @@ class Goto(Action):
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
         None, description="of the tool, as w, x, y, z"
     )
-    direction: Vector | None = Field(
-        None, description="of the tool's z axis, any turn about it; down when not given"
+    direction: Vector | Literal["any"] | None = Field(
+        None,
+        description=(
+            "of the tool's z axis, any turn about it; down when not given; 'any': an arm of five"
+            " joints or fewer reaches most places in few orientations"
+        ),
     )
     joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
 
@@ -64,7 +68,7 @@ class Goto(Action):
         if self.joints is not None and (self.quaternion is not None or self.direction is not None):
             raise ValueError("a goto with joints has no quaternion and no direction")
         for name in ("quaternion", "direction"):
-            if getattr(self, name) is not None and not any(getattr(self, name)):
+            if getattr(self, name) not in (None, "any") and not any(getattr(self, name)):
                 raise ValueError(f"{name} is all zero; its length must not be zero")
         return self
 

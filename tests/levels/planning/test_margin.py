@@ -1,0 +1,87 @@
+"""Planning keeps a margin where the simulated arm's checks have none: between links, from supports,
+below closing fingers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner
+from rack.levels.planning.moves import Situation
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.tables import SceneConfig
+from rack.levels.task.actions import Handling
+from rack.levels.task.rehearsal import Rehearsal
+from tests.levels.arms import CLOCK_NS, config, four_bar, pendulum
+from tests.levels.robot import grippers
+
+STOP = '<geom name="post" type="box" size=".01 .01 .01" pos=".2 0 {z}"/>'
+TOP_M = 0.7 + 0.03 + 0.01  # of the upper arm at home, and half of the post
+
+
+def hinged(folder: Path, apart: float) -> tuple[Cell, SceneConfig]:
+    """Return a two-joint arm whose carrier ends `apart`, m, above its first link at home."""
+    robot = pendulum(folder)
+    text = robot.model.read_text()
+    carrier = f'<body name="base">{STOP.format(z=TOP_M + apart)}<body name="upper"'
+    text = text.replace('<body name="upper"', carrier).replace(
+        "</worldbody>", "</body></worldbody>"
+    )
+    robot.model.write_text(text)
+    return build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig()
+
+
+def test_links_keep_the_margin_in_planning_alone(tmp_path: Path) -> None:
+    made, scene = hinged(tmp_path, 0.004)
+    lifted = np.array([-0.0032 / 0.2, 0.5])  # 0.8 mm are left
+    assert CollisionChecker(made, scene).free(lifted)
+    planned = CollisionChecker(made, scene, MAX_STRAY_M)
+    assert planned.free(made.home)
+    assert not planned.free(lifted)
+    assert 0.0 < planned.room(lifted) < MAX_STRAY_M
+    assert planned.free(lifted, planned.room(lifted))
+
+
+def test_links_that_are_close_at_home_keep_half_of_that(tmp_path: Path) -> None:
+    made, scene = hinged(tmp_path, 0.0004)
+    planned = CollisionChecker(made, scene, MAX_STRAY_M)
+    assert planned.free(made.home)
+    assert not planned.free(np.array([-0.0003 / 0.2, 0.5]))
+
+
+@pytest.mark.parametrize(
+    ("arm", "farther"),
+    [(four_bar, True), (grippers.rotary, True), (lambda _: config("puma560"), False)],
+)
+def test_only_swinging_fingers_reach_farther_when_closed(
+    tmp_path: Path, arm: object, farther: bool
+) -> None:
+    assert callable(arm)
+    robot, scene = arm(tmp_path)
+    planned = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene, MAX_STRAY_M)
+    assert (planned.longest is not None) is farther
+
+
+def lowest_grasp(folder: Path, length: float) -> float:
+    """Return the height, m, above its origin at which block1 is taken with fingers of `length`,
+    m."""
+    robot, scene = grippers.rotary(folder)
+    model = folder / "puma560.xml"
+    pad = f'size=".012 .006 {length / 2}" pos="0 0 {0.01 + length / 2}"'
+    model.write_text(model.read_text().replace('size=".012 .006 .04" pos="0 0 .05"', pad))
+    made = build_cell(robot, scene, CLOCK_NS)
+    poses = made.start().qpos[made.object_qpos[:, None] + np.arange(7)]
+    situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
+    rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
+    takes = Handling(rehearsal, 0, 0.1).takes()
+    return float(takes[0].tool.position[2] - situation.positions[0, 2])
+
+
+@pytest.mark.parametrize(("length", "height"), [(0.08, 0.0), (0.098, 0.01)])
+def test_a_grasp_leaves_room_for_fingers_that_reach_farther_as_they_close(
+    tmp_path: Path, length: float, height: float
+) -> None:
+    assert lowest_grasp(tmp_path, length) == pytest.approx(height)

@@ -1,0 +1,160 @@
+"""Grasps that lean, and arms of five joints, which reach most places in few orientations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.levels.errors import Refused
+from rack.levels.planning.motion_planner import MotionPlanner
+from rack.levels.planning.moves import Situation
+from rack.levels.robot.cell import build_cell
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
+from rack.levels.task.actions import goto, rehearse
+from rack.levels.task.program import Goto, TaskConfig
+from rack.levels.task.rehearsal import Rehearsal
+from tests.levels.arms import CLOCK_NS, config
+from tests.levels.whole_rack import WholeRack
+
+FIVE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <geom name="table" type="box" size=".5 .5 .02" pos="0 0 -.02" friction="1"/>
+    {roof}
+    <body name="can" pos="{x} 0 .05"><freejoint/>
+      <geom name="can" type="cylinder" size=".014 .05" density="400" friction="1 .02 .001"
+        condim="4" solimp=".95 .99 .001" solref=".004 1"/></body>
+    <body name="turret" pos="0 0 .1">
+      <joint name="turn" axis="0 0 1" range="-3 3" damping=".1"/>
+      <geom type="cylinder" fromto="0 0 -.02 0 0 .02" size=".03"/>
+      <body name="upper" pos="0 0 .04">
+        <joint name="shoulder" axis="0 1 0" range="-2 2" damping=".1"/>
+        <geom type="capsule" fromto="0 0 .05 0 0 .2" size=".02"/>
+        <body name="fore" pos="0 0 .25">
+          <joint name="elbow" axis="0 1 0" range="-2.7 2.7" damping=".1"/>
+          <geom type="capsule" fromto="0 0 .05 0 0 .15" size=".018"/>
+          <body name="wrist" pos="0 0 .2">
+            <joint name="bend" axis="0 1 0" range="-{bend} {bend}" damping=".1"/>
+            <geom type="capsule" fromto="0 0 0 0 0 .02" size=".015"/>
+            <body name="palm" pos="0 0 .05">
+              <joint name="roll" axis="0 0 1" range="-3 3" damping=".1"/>
+              <geom name="palm" type="box" size=".012 .035 .01"/>
+              <site name="tcp" pos="0 0 .07"/>
+              <body name="left"><joint name="left" type="slide" axis="0 1 0" range="0 .025"
+                damping="5" armature=".05"/>
+                <geom name="left" type="box" size=".008 .004 .03" pos="0 .004 .06" friction="1"/>
+              </body>
+              <body name="right"><joint name="right" type="slide" axis="0 -1 0" range="0 .025"
+                damping="5" armature=".05"/>
+                <geom name="right" type="box" size=".008 .004 .03" pos="0 -.004 .06" friction="1"/>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="left" joint2="right" solref=".002 1"/></equality>
+  <contact><exclude body1="turret" body2="upper"/><exclude body1="upper" body2="fore"/>
+    <exclude body1="fore" body2="wrist"/><exclude body1="wrist" body2="palm"/>
+    <exclude body1="world" body2="turret"/><exclude body1="fore" body2="palm"/></contact>
+  <actuator><motor name="grip" joint="left" ctrlrange="-20 20"/></actuator>
+</mujoco>
+"""
+SCENE = SceneConfig(objects=("can",), supports=("table",))
+
+
+def five(folder: Path, x: float = 0.25, bend: float = 2.0, roof: str = "") -> RobotConfig:
+    """Write an arm of five joints with a can at `x`, m, on its table; return its config."""
+    model = folder / "five.xml"
+    model.write_text(FIVE.format(x=x, bend=bend, roof=roof))
+    return RobotConfig(
+        model=model,
+        joints=("turn", "shoulder", "elbow", "bend", "roll"),
+        tool="tcp",
+        home=(0.0, -0.5, 1.6, 0.8, 0.0),
+        velocity=(2.0,) * 5,
+        acceleration=(6.0,) * 5,
+        jerk=(60.0,) * 5,
+        torque=(30.0, 30.0, 20.0, 10.0, 5.0),
+        gripper=GripperConfig(actuator="grip", joint="left", open=0.025, closed=0.0, force=15.0),
+    )
+
+
+def rehearsal(robot: RobotConfig, scene: SceneConfig = SCENE) -> Rehearsal:
+    made = build_cell(robot, scene, CLOCK_NS)
+    poses = made.start().qpos[made.object_qpos[:, None] + np.arange(7)]
+    situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
+    return Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
+
+
+def transfer(to: list[float]) -> dict[str, Any]:
+    return {"do": "transfer", "object": "can", "to": to, "lift": 0.06}
+
+
+def test_a_refusal_says_when_another_orientation_would_reach(tmp_path: Path) -> None:
+    start = rehearsal(five(tmp_path))
+    with pytest.raises(Refused, match="or the place itself, with the tool turned otherwise"):
+        goto(start, 0, Goto(position=(0.45, 0.0, 0.25)))
+    with pytest.raises(Refused) as refused:
+        goto(start, 0, Goto(position=(0.9, 0.0, 0.25)))
+    assert "turned otherwise" not in str(refused.value)
+
+
+def test_a_goto_in_any_direction_brings_five_joints_to_the_place(tmp_path: Path) -> None:
+    place = (0.40, 0.1, 0.25)
+    end = goto(rehearsal(five(tmp_path)), 0, Goto(position=place, direction="any"))
+    assert end.motion.ik.tool_at(end.q).position == pytest.approx(place, abs=1e-4)
+
+
+def test_a_place_beyond_every_orientation_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(Refused, match="out of reach"):
+        goto(rehearsal(five(tmp_path)), 0, Goto(position=(0.9, 0.0, 0.2), direction="any"))
+
+
+def leaning_of(end: Rehearsal) -> float:
+    """Return how far from straight down the tool grasps, rad."""
+    tool = next(move.tool for move, _ in end.moves if move.object is not None)
+    down = np.zeros(3)
+    mujoco.mju_rotVecQuat(down, np.array([0.0, 0.0, 1.0]), tool.quaternion)
+    return float(np.arccos(np.clip(-down[2], -1.0, 1.0)))
+
+
+@pytest.mark.parametrize(("bend", "lean"), [(2.0, 0.0), (0.9, np.pi / 4)])
+def test_a_grasp_leans_where_it_cannot_be_straight_down(
+    tmp_path: Path, bend: float, lean: float
+) -> None:
+    start = rehearsal(five(tmp_path, bend=bend))
+    program = TaskConfig(action=[transfer([0.18, 0.15, 0.05])])
+    assert leaning_of(rehearse(program, SCENE, start)) == pytest.approx(lean, abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bend", [2.0, 0.9])
+def test_five_joints_transfer_a_can(tmp_path: Path, bend: float) -> None:
+    to = [0.18, 0.15, 0.05]
+    rack = WholeRack(arm=(five(tmp_path, bend=bend), SCENE), actions=[transfer(to)])
+    status = rack.run_to_end(25.0)
+    assert status.state == State.DONE, status.reason
+    assert rack.read("servo.status").touches == 0
+    assert rack.read("world.model").position[0] == pytest.approx(to, abs=0.01)
+
+
+def test_an_object_under_a_roof_is_taken_from_the_side(tmp_path: Path) -> None:
+    robot, scene = config("puma560")
+    text = (robot.model.parent / "puma560_cell.xml").read_text()
+    assert 'name="peg" pos=".50 -.30 .50"' in text
+    roof = '<geom name="roof" type="box" size=".06 .06 .005" pos=".56 -.30 .66"/>'
+    (tmp_path / "cell.xml").write_text(text.replace('<body name="peg"', roof + '<body name="peg"'))
+    (tmp_path / "puma560.xml").write_text((robot.model.parent / "puma560.xml").read_text())
+    start = rehearsal(robot.model_copy(update={"model": tmp_path / "cell.xml"}), scene)
+    program = TaskConfig(
+        action=[{"do": "transfer", "object": "peg", "to": [0.45, 0.38, 0.5], "lift": 0.05}]
+    )
+    assert leaning_of(rehearse(program, scene, start)) > 0.1
