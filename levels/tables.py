@@ -29,6 +29,8 @@ Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
+Interface = Literal["torque", "position", "velocity"]
+"""What drives take; with the last two they close loops of their own."""
 LAST_TICK = 10**15
 """Ticks are 64-bit words: this many of the shortest ones last 300 years."""
 
@@ -279,6 +281,13 @@ class RobotConfig(Table):
     )
     position: tuple[tuple[Finite, Finite], ...] | None = Field(
         None, description="position limits, rad; default: the model's joint ranges"
+    )
+    interface: Interface = Field(
+        "torque",
+        description=(
+            "what the drives take in every cycle: torques, or set points of position or velocity,"
+            " which they follow by loops of their own; the simulated arm's drives are such, too"
+        ),
     )
     gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
     sensors: SensorConfig | None = Field(

@@ -104,6 +104,8 @@ class Alarm(IntEnum):
     MOMENT_LIMIT = 54  # [-1; N m]  a contact's torque, likewise
     LIMIT_EXCEEDED = 58  # [joint; rad or rad/s]  the arm is beyond a limit, by its samples
     SENSOR_LATE = 59  # [-1; age, ticks]  samples older than the config permits
+    # [joint; rad from where it is, NaN: not finite]  rejected: a set point that no drive may have
+    SET_POINT = 66
     # Raised by the board of a hand.
     TENSION_INVALID = 55  # [joint; -]  rejected: a tension is NaN or infinite
     TENSION_LIMIT = 56  # [joint; N]  a tension beyond its limits was cut

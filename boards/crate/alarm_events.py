@@ -100,6 +100,10 @@ TEXTS: Mapping[Alarm, tuple[About, str]] = {
         "joint",
         "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
     ),
+    Alarm.SET_POINT: (
+        "joint",
+        "rejected: set point of {subject} is {value:.3g} rad from the joint",
+    ),
     Alarm.LIMIT_EXCEEDED: ("joint", "{subject} is beyond its limit, as sensed: {value:.4g}"),
     Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
     Alarm.TENSION_LIMIT: (

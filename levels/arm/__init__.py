@@ -2,7 +2,7 @@
 two."""
 
 from rack.levels.arm import drives, poses, substeps
-from rack.levels.arm.arm import Arm, DriveState, Link, Sensed, find_arm
+from rack.levels.arm.arm import Arm, DriveState, JointTarget, Link, Sensed, find_arm
 from rack.levels.arm.calibration import CalibratedLink
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm
@@ -16,6 +16,7 @@ __all__ = [
     "DriveState",
     "FaultyLink",
     "GuardedArm",
+    "JointTarget",
     "Link",
     "PresentLink",
     "Sensed",

@@ -2,8 +2,9 @@
 
 The servo level drives whatever class `[board.servo.params] arm = "package.module:Class"` names: the
 simulated arm by default, your own hardware or simulation otherwise. In every cycle it calls, in
-this order, `step` (the ticks since the last cycle), `sense`, then either `drive` or `brake` or
-neither (the last command stays in force), `save` and `look`. All calls come from the executor's
+this order, `step` (the ticks since the last cycle), `sense`, then either `drive` (`follow` for
+drives that take set points) or `brake` or neither (the last command stays in force), `save` and
+`look`. All calls come from the executor's
 process, within its cycle: none may block. An exception ends the board, which is restarted as after
 any crash; report a broken arm in `fault` instead.
 """
@@ -24,7 +25,7 @@ from rack.levels.level import Finding
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.tables import SceneConfig, SensorConfig, named_class
+from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
 
 TORQUE_MARGIN = 1.001
 """Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits
@@ -50,13 +51,22 @@ class Sensed(NamedTuple):
     tick: int  # of the sample: an older one than that of the cycle counts as no new sample
 
 
+class JointTarget(NamedTuple):
+    """Set points of the joints for the end of a cycle; arrays are (joints,)."""
+
+    position: Array  # rad
+    velocity: Array  # rad/s; for drives of velocity corrected by the error of the position
+    torque: Array  # N m: predicted for the motion, payload included
+
+
 def copied(sample: Sensed) -> Sensed:
     """Return a sample whose arrays stay valid."""
     return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
 
 
 class Link(Protocol):
-    """The path between the servo level and an arm: samples come up, torques go down."""
+    """The path between the servo level and an arm: samples come up, torques or set points go
+    down."""
 
     def sense(self) -> Sensed:
         """Return the newest sample. The arrays are valid until the next call."""
@@ -69,14 +79,17 @@ class Link(Protocol):
         returned.
         """
 
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Release the brakes, and let the drives be at `target` in one cycle; then they go on at
+        that velocity. Otherwise as `drive`."""
+
 
 class Arm(Plant, ABC):
-    """An arm with torque-driven joints that have brakes, and a force-driven gripper. Implements
-    `Link`.
+    """An arm whose joints have drives and brakes, and a force-driven gripper. Implements `Link`.
 
-    Subclasses write `sense`, `drive`, `brake` and `step`, and keep the attributes below up to date.
-    All else has a default that suits an arm without contact sensors, whose state outlives its
-    board.
+    Subclasses write `sense`, `brake`, `step` and, as their drives take torques or set points,
+    `drive` or `follow`, and keep the attributes below up to date. All else has a default that suits
+    an arm without contact sensors, whose state outlives its board.
     """
 
     keeps_limits = False
@@ -86,12 +99,17 @@ class Arm(Plant, ABC):
     """Its encoders, where `[robot.sensors]` does not say. Default: 16 bits a turn; and samples that
     are taken up to 0.1 ms early or late, which is 0.3 mrad at 3 rad/s, six times this noise."""
 
+    reports_torque = False
+    """Whether, after `follow`, `torque` is what the motors give throughout the coming cycle. Else
+    it is what was predicted, and only the following error tells that a motor has failed."""
+
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
         """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
         for random noise."""
         super().__init__(cell)
+        self.every = every  # ticks of a cycle
         # Ticks without a command after which the brakes must engage.
         self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
         self.waited = self.patience
@@ -107,10 +125,23 @@ class Arm(Plant, ABC):
     def sense(self) -> Sensed:
         """Return the newest sample, see `Link.sense`."""
 
-    @abstractmethod
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets
-        `waited` to 0."""
+        `waited` to 0. Default: refused, see `takes`."""
+        raise NotImplementedError
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Release the brakes and follow; see `Link.follow`. Sets `waited` to 0, and `torque` to
+        what is predicted or reported. Default: refused, see `takes`."""
+        raise NotImplementedError
+
+    @classmethod
+    def takes(cls, interface: Interface) -> bool:
+        """Say whether the drives have an interface: `rack check` refuses a config that names
+        another. Default: by the methods that the class has."""
+        if interface == "torque":
+            return cls.drive is not Arm.drive
+        return cls.follow is not Arm.follow
 
     @abstractmethod
     def brake(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, Sensed
+from rack.levels.arm.arm import Arm, JointTarget, Sensed
 from rack.levels.level import Finding
 
 
@@ -23,3 +23,8 @@ class CalibratedLink:
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Pass on the torque; see `Link.drive`."""
         return self._arm.drive(torque, grip_force)
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Pass on the set points, as the drives count positions; see `Link.follow`."""
+        target = target._replace(position=target.position - self._offset)
+        return self._arm.follow(target, grip_force)

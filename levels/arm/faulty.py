@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, Link, Sensed
+from rack.levels.arm.arm import Arm, JointTarget, Link, Sensed
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.cell import Cell
@@ -96,6 +96,19 @@ class FaultyLink:
         if self._commands:
             torque = self._corrupt(torque)
         found = self._next.drive(torque, grip_force)
+        self._show_motors()
+        return found
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Pass on set points with the faults applied: those of commands to the torque predicted."""
+        if self._commands:
+            target = target._replace(torque=self._corrupt(target.torque))
+        found = self._next.follow(target, grip_force)
+        self._show_motors()
+        return found
+
+    def _show_motors(self) -> None:
+        """Say which faults of motors have acted, and whether they show."""
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
             hidden = self._hidden + self._pushed()
@@ -103,7 +116,6 @@ class FaultyLink:
                 missing = (asked - part * self._limits)[active.joints]
                 if (missing > 0.0).any():
                     self._acted[active.place] = bool((missing > hidden[active.joints]).any())
-        return found
 
     def _pushed(self) -> Array | float:
         """Return how much of a motor's missing torque a push may hide, N m."""

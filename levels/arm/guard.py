@@ -10,9 +10,10 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, DriveState, Link, Sensed
+from rack.levels.arm.arm import Arm, DriveState, JointTarget, Link, Sensed
 from rack.levels.arm.drives import LimitGate
 from rack.levels.arm.present import PresentLink
+from rack.levels.arm.set_points import SetPointGate
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
@@ -77,7 +78,9 @@ class GuardedArm:
         self._below: Link = below or arm
         self._cell = cell
         self._joints = joints
+        self._tick_s = tick_s
         self._span_s = arm.patience * tick_s
+        self._last_set_point: Array = np.full((2, len(cell.dof)), np.nan)
         self._dynamics = Dynamics(cell)
         self._state: Sensed | None = None
         self.exceeded: Exceeded | None = None
@@ -93,6 +96,9 @@ class GuardedArm:
         self._high = cell.bounds.position[:, 1] + off
         self._fastest = part * cell.bounds.velocity + cell.encoders.speed_off
         self._gate = LimitGate(kept, cell.limits.acceleration, self._span_s, self._dynamics)
+        if cell.interface != "torque":
+            last = self._last_set_point
+            self._set_points = SetPointGate(self._arm, kept, self._tick_s, self._span_s, last)
 
     def sense(self) -> Sensed:
         """Return the newest sample, judged."""
@@ -121,6 +127,16 @@ class GuardedArm:
         torque, cut = self._gate.admit(torque, state.position, state.velocity)
         arm.clipped += cut
         return arm.drive(torque, grip_force)
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Pass on the set points, as the limits permit them (`SetPointGate`); see `Link.follow`."""
+        if self.exceeded is not None:
+            self._arm.brake()
+            return self.exceeded.finding
+        state = self._state
+        assert state is not None, "it is sensed before it is driven"
+        passed = self._set_points.admit(target, state.position, state.velocity)
+        return passed if isinstance(passed, Finding) else self._below.follow(passed, grip_force)
 
     def _judge(self, sample: Sensed) -> None:
         q = sample.position

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array, solve
-from rack.levels.arm.arm import Arm, Link, Sensed, copied
+from rack.levels.arm.arm import Arm, JointTarget, Link, Sensed, copied
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -78,6 +78,10 @@ class PresentLink:
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Pass on the torque; see `Link.drive`."""
         return self._arm.drive(torque, grip_force)
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Pass on the set points; see `Link.follow`."""
+        return self._below.follow(target, grip_force)
 
     def _led(self, sample: Sensed) -> Sensed:
         """Return a sample led to the present."""

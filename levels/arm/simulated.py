@@ -10,14 +10,16 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, Sensed, copied
+from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
 from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
+from rack.levels.arm.set_points import CascadedDrives, SetPointGate
 from rack.levels.arm.simulation import Simulation
 from rack.levels.arm.wrist import WristSensor
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.engine import one_view
+from rack.levels.robot.model import SET_POINT_ROWS
 from rack.levels.tables import SceneConfig, SensorConfig
 
 
@@ -27,7 +29,8 @@ class SimulatedArm(Simulation, Arm):
 
     Samples are as coarse and noisy as the cell's encoders; brakes and limit gate belong to the
     drives and see the truth. A command is for one torque cycle. It passes the limit gate in every
-    tick, even in those that the servo level missed.
+    tick, even in those that the servo level missed. Drives that follow set points
+    (`[robot] interface`) make a new torque in every tick; their state is in MuJoCo's user data.
     """
 
     keeps_limits = True
@@ -61,6 +64,14 @@ class SimulatedArm(Simulation, Arm):
         places = np.stack(
             (qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof)
         )
+        self._drives: CascadedDrives | None = None  # None: they take torques
+        if cell.interface != "torque":
+            tick_s = clock_ns * 1e-9
+            rows = d.userdata[-SET_POINT_ROWS * joints :].reshape(SET_POINT_ROWS, joints)
+            self._drives = CascadedDrives(cell, dynamics, tick_s, every, rows)
+            span_s = self.patience * tick_s
+            self._set_points = SetPointGate(self, cell.bounds, tick_s, span_s, rows[:2])
+            self.reports_torque = every == 1
         self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
         self._give_clear = give.load()
         if (
@@ -114,6 +125,22 @@ class SimulatedArm(Simulation, Arm):
         self.waited = 0
         self.braked = False
         self._command[:] = torque
+        self._give()
+        return None
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        """Release the brakes and follow, for the coming cycle; see `Link.follow`."""
+        if self._gripper is not None and math.isfinite(grip_force):
+            self._ctrl[self._gripper.actuator] = self.grip_force = grip_force
+        if (offset := self.cell.encoders.offset) is not None:  # its encoders count from elsewhere
+            target = target._replace(position=target.position + offset)
+        passed = self._set_points.admit(target, *self._state)
+        if isinstance(passed, Finding):
+            return passed
+        if self.braked and self._drives is not None:
+            self._drives.start(target.torque, *self._state)
+        self.waited = 0
+        self.braked = False
         self._give()
         return None
 
@@ -172,7 +199,8 @@ class SimulatedArm(Simulation, Arm):
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
         self.grip_force = 0.0 if self._gripper is None else self._ctrl[self._gripper.actuator]
-        self._given = True
+        # Torques stay; of a set point that came before the last tick, drives make a new one.
+        self._given = self._drives is None or self.braked or self.waited == 0
 
     def _give(self) -> None:
         """Apply the command to the motors, or the brakes' torque to the joints, through the limit
@@ -180,9 +208,13 @@ class SimulatedArm(Simulation, Arm):
         cell = self.cell
         braked = self.braked
         q, qd = self._state
-        passed, cut = self._gate.admit(
-            self._brake.torque(q, qd) if braked else self._command, q, qd
-        )
+        if braked:
+            torque = self._brake.torque(q, qd)
+        elif self._drives is None:
+            torque = self._command
+        else:
+            torque = self._drives.torque(q, qd, self.waited)
+        passed, cut = self._gate.admit(torque, q, qd)
         self.clipped += cut
         self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)

@@ -25,7 +25,7 @@ from rack.levels.robot.limits import (
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.robot.wrist import Wrist, find_wrist
-from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, SensorConfig
+from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
 TOUCHING_M = 5e-5
 """Geoms closer than this at home touch: rounding decides."""
@@ -75,6 +75,7 @@ class Cell:
     wrist: Wrist | None  # force/torque sensor; None: there is none
     hand: Hand | None  # None for an arm
     patience: MotorPatience  # of its motors, or valves
+    interface: Interface  # of its drives
 
     def start(self) -> mujoco.MjData:
         """Return data of the start: the gripper is open, objects are where the model puts them."""
@@ -190,6 +191,7 @@ def index(
         wrist=wrist,
         hand=hand,
         patience=patience_of(robot, bounds, data.energy[1]),
+        interface=robot.interface,
     )
 
 

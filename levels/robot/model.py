@@ -27,6 +27,9 @@ LONGEST_STEP_S = 0.1
 """A longer time step in an MJCF file is a mistake, such as ms for s."""
 GRIDS = (("nrow", "ncol"), ("width", "height"))
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+SET_POINT_ROWS = 3
+"""Numbers a joint that MuJoCo's state keeps of simulated drives that follow set points: position,
+velocity, and the torque of the integral."""
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -105,6 +108,8 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
         spec.body(robot.tool).add_site(name=robot.tool)
     if robot.gripper is not None:
         fit_gripper(spec, robot.gripper)
+    if robot.interface != "torque":
+        spec.nuserdata += SET_POINT_ROWS * len(robot.joints)
     for key in list(spec.keys):
         spec.delete(key)  # its controls belong to actuators that were replaced
     spec.add_key(name="start")

@@ -49,10 +49,13 @@ class ActuatorMonitor:
     case, until the difference is gone, only a motor that lacks more than `MAX_CONTACT_PART` has
     failed. For a cycle or two, a pulling load looks like a motor that lacks torque; but under load,
     a motor commanded more gives more. A motor has also failed when the arm strays from its set
-    points by more than `following`, rad.
+    points by more than `following`, rad. That alone counts where drives do not report what torque
+    they give.
     """
 
-    def __init__(self, cell: Cell, following: float, period_s: float) -> None:
+    def __init__(
+        self, cell: Cell, following: float, period_s: float, is_reported: bool = True
+    ) -> None:
         model = cell.model
         dof = cell.dof
         joints = len(cell.dof)
@@ -71,6 +74,7 @@ class ActuatorMonitor:
         uncertain[:] = 2.0 * cell.encoders.speed_off / period_s
         self._off[:] = cell.encoders.off
         self._judge = partial(left_over.load(), self._table, 0.5 / period_s, following)
+        self._reported = is_reported
         self._begun = False
         self._pushed = False  # weak motors do not explain the difference
         # For how many cycles a motor has lacked torque, and its joint.
@@ -101,7 +105,7 @@ class ActuatorMonitor:
         verdict = self._judge(wanted, state, terms.inertia, terms.bias)
         if not self._begun:
             return None
-        if verdict == EXPLAINED:
+        if verdict == EXPLAINED or (verdict == LEFT_OVER and not self._reported):
             self._cycles = 0
             self._pushed = False
             return None

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.arm import find_arm
+from rack.levels.arm import JointTarget, find_arm
 from rack.levels.compiled import compiled
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
@@ -154,6 +154,29 @@ def set_torque(
         torque[j] = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
         cut = cut or needed != torque[j]
     return cut
+
+
+class SetPointLaw:
+    """The motion wanted at the end of a cycle, for drives that close loops of their own.
+
+    To drives of velocity it adds the error of the position, which they do not know, as quickly as
+    `ComputedTorque` would.
+    """
+
+    def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:
+        self._period_s = period_s
+        is_velocity = cell.interface == "velocity"
+        self._gain = 0.5 * params.bandwidth / params.damping if is_velocity else 0.0  # 1/s
+
+    def target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
+        """Return the set points for a motion, with the arm at `position`, (joints,), rad, and
+        `torque`, (joints,), N m, predicted."""
+        gained = self._period_s * wanted.acceleration
+        return JointTarget(
+            wanted.position + self._period_s * (wanted.velocity + 0.5 * gained),
+            wanted.velocity + gained + self._gain * (wanted.position - position),
+            torque,
+        )
 
 
 class Grip:

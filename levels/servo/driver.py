@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -35,11 +35,12 @@ from rack.levels.robot.cell import build_cell, sensed_by
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
-from rack.levels.servo.control import ArmParams
+from rack.levels.servo.control import ArmParams, SetPointLaw
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.enabling import Enabling
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
+from rack.levels.tables import read_params
 
 SCENES = Output(SCENE, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
@@ -77,6 +78,11 @@ class ArmDriver(Executor):
     """
 
     faults = STEPS
+    params: ClassVar[type[ArmParams]] = ArmParams
+    gives_set_points: ClassVar[bool] = False
+    """Whether it can drive an arm by set points, too: its `torques` are then those predicted."""
+    ahead: SetPointLaw | None = None
+    """The set points of a cycle, for drives that take them; None: they take torques."""
     orders: Orders
     """The operator's."""
 
@@ -104,7 +110,8 @@ class ArmDriver(Executor):
         self._link: Link = self._sound
         self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._sound)
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
-        self.motors = ActuatorMonitor(cell, params.following, context.period_s)
+        is_reported = cell.interface == "torque" or self.arm.reports_torque
+        self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
         self.enabling = Enabling(self.arm, context)
         self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
@@ -155,6 +162,15 @@ class ArmDriver(Executor):
                 cls.__name__,
                 "it drives an arm with motors; [robot.hand] is a hand of tendons",
             )
+        interface = context.robot.interface
+        reference = read_params(cls.params, context.params).arm
+        if interface != "torque" and not cls.gives_set_points:
+            why = f'it gives torques; [robot] interface is "{interface}"'
+            yield "executor", cls.__name__, why
+        elif not find_arm(reference).takes(interface):
+            way = "drive" if interface == "torque" else "follow"
+            why = f'no `{way}` of the class takes [robot] interface "{interface}"'
+            yield "params.arm", reference, why
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
@@ -321,7 +337,12 @@ class ArmDriver(Executor):
             return self.brake()
         if reaction is Reaction.STOP and (self.abandoned or not wanted.velocity.any()):
             return self.brake()
-        refused = self._link.drive(*self.torques(wanted, sensed, terms))
+        torque, grip_force = self.torques(wanted, sensed, terms)
+        if self.ahead is None:
+            refused = self._link.drive(torque, grip_force)
+        else:
+            target = self.ahead.target(wanted, self.sensors.position, torque)
+            refused = self._link.follow(target, grip_force)
         if refused is not None:
             return self._refuse(refused, tick)
         self._wanted = wanted.table

@@ -15,7 +15,7 @@ from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_S
 from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import control, reference
-from rack.levels.servo.control import ComputedTorque, Grip, ServoParams
+from rack.levels.servo.control import ComputedTorque, Grip, ServoParams, SetPointLaw
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.modification import misfits_of, names_of
@@ -48,6 +48,7 @@ class ServoExecutor(ArmDriver):
         **dict.fromkeys(DRIVES, ()),
     }
     params: ClassVar[type[ServoParams]] = ServoParams
+    gives_set_points = True
 
     def __init__(self, context: LevelContext) -> None:
         self.given = params = read_params(self.params, context.params)
@@ -58,6 +59,8 @@ class ServoExecutor(ArmDriver):
         )  # set points, interpolated
         self.reference.part = self.part
         self._loop = ComputedTorque(cell, params, self.arm.dynamics)
+        if cell.interface != "torque":
+            self.ahead = SetPointLaw(cell, params, context.period_s)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         joints = context.robot.joints
         self.operator = OperatorControl(
@@ -78,6 +81,10 @@ class ServoExecutor(ArmDriver):
         """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
         yield from super().misfits(context, above, below)
         yield from misfits_of(context)
+        interface = context.robot.interface
+        if interface != "torque" and (names := cls.names(context.params)):
+            why = f'they modify a law of torques; [robot] interface is "{interface}"'
+            yield "params.modifications", ", ".join(names), why
 
     @classmethod
     def preload(cls) -> None:
@@ -141,7 +148,8 @@ class ServoExecutor(ArmDriver):
 
     def _torque(self, wanted: Motion, terms: Terms) -> Array:
         loop = self._loop
-        state = self.sensors.state
+        # What is predicted for set points is the torque of an arm that is there.
+        state = self.sensors.state if self.ahead is None else wanted.table
         modified = self._modified
         if not modified.exists:
             return loop.torque(wanted, state, terms)

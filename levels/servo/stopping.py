@@ -221,6 +221,9 @@ class Stopping:
             "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"
         )
         text = f"rejected: torque of '{self._joints[refused.subject]}' is {what}"
+        if refused.alarm is Alarm.SET_POINT:
+            what = f"{refused.value:.3g} rad from the joint"
+            text = f"rejected: set point of '{self._joints[refused.subject]}' is {what}"
         return Cause(Error.LIMIT, text, refused.subject, refused.value)
 
     def _about_motors(self, retry_at: int, tick: int) -> Reaction:

@@ -114,6 +114,9 @@ def robot(wiring: Wiring) -> Iterator[Mistake]:
         if isinstance(values, tuple) and len(values) != joints:
             why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
             yield Mistake(f"robot.sensors.{key}", values, why)
+    if robot.hand is not None and robot.interface != "torque":
+        why = "tendons of a hand take tensions; permitted: torque"
+        yield Mistake("robot.interface", robot.interface, why)
     yield from repeated("robot.joints", robot.joints)
 
 

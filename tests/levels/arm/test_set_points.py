@@ -1,0 +1,258 @@
+"""Arms whose drives follow set points keep their limits, whatever the set points are, and whoever
+made the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Array, solve
+from rack.levels.arm import GuardedArm, JointTarget, SimulatedArm, set_points
+from rack.levels.arm.set_points import CascadedDrives
+from rack.levels.level import Finding
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.tables import Interface, SceneConfig
+from tests.levels.arm.test_own_arm import SUBSTEPS, IdealArm
+from tests.levels.arms import CLOCK_NS, config, pendulum
+
+TICK_S = CLOCK_NS * 1e-9
+SET_POINTS: tuple[Interface, ...] = ("position", "velocity")
+KINDS = ("jumps", "swings", "ramps", "beyond")
+
+
+class ServoArm(IdealArm):
+    """An arm of one's own with position or velocity servos, which know limits of torque alone."""
+
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
+        super().__init__(cell, scene, clock_ns, every, seed)
+        self._rows = np.zeros((3, len(cell.home)))
+        steps = every * SUBSTEPS
+        self._servos = CascadedDrives(cell, self._dynamics, self._step_s, steps, self._rows)
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        self._rows[:2] = target.position, target.velocity
+        if self.braked:
+            self._servos.start(target.torque, self._q, self._qd)
+        self.torque = target.torque.copy()
+        self.waited, self.braked = 0, False
+        return None
+
+    def step(self, ticks: int) -> None:
+        for _ in range(ticks):
+            if self.waited >= self.patience:
+                self.brake()
+            for step in range(0 if self.braked else SUBSTEPS):
+                torque = self._servos.torque(self._q, self._qd, SUBSTEPS * self.waited + step)
+                inertia, bias = self._dynamics.terms(self._q, self._qd)
+                self._qd += self._step_s * solve(inertia, torque - bias)
+                self._q += self._step_s * self._qd
+            self.waited += 1
+            self.tick += 1
+
+
+def simulated(name: str, interface: Interface) -> tuple[SimulatedArm, Cell]:
+    robot, scene = config(name)
+    made = build_cell(robot.model_copy(update={"interface": interface}), scene, CLOCK_NS)
+    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    return SimulatedArm(made, scene, CLOCK_NS), made
+
+
+def own(folder: Path, interface: Interface) -> tuple[ServoArm, GuardedArm]:
+    robot = pendulum(folder, interface=interface)
+    arm = ServoArm(build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig(), CLOCK_NS)
+    return arm, GuardedArm(arm, arm.cell, robot.joints, TICK_S)
+
+
+def hostile(cell: Cell, kind: str, cycles: int, seed: int = 3) -> Iterator[JointTarget]:
+    """Yield set points that no level would give, after one where the arm starts."""
+    random = np.random.default_rng(seed)
+    low, high = np.clip(cell.bounds.position.T, -3.0, 3.0)
+    fastest = cell.bounds.velocity
+    holding = load(cell)
+    yield JointTarget(cell.home, 0.0 * fastest, holding)
+    position, velocity = cell.home.copy(), np.zeros(len(cell.home))
+    for cycle in range(cycles):
+        if kind == "jumps" and cycle % 60 == 0:
+            position = random.uniform(low, high)
+            velocity = random.uniform(-3.0, 3.0, len(low)) * fastest
+        elif kind == "swings":
+            position = np.where(cycle % 7 < 3, low, high)
+            velocity = 9.0 * fastest * (-1) ** cycle
+        elif kind == "ramps":
+            velocity = fastest * np.where(cycle // 400 % 2, 1.2, -1.2)
+            position = position + velocity * TICK_S
+        elif kind == "beyond":
+            position = np.where(cycle // 300 % 2, low - 1.0, high + 1.0)
+            velocity = np.where(cycle // 300 % 2, -5.0, 5.0) * fastest
+        yield JointTarget(position, velocity, holding)
+
+
+def load(cell: Cell) -> Array:
+    """Return the torques, N m, that hold the arm at home."""
+    data = cell.start()
+    return np.asarray(data.qfrc_bias - data.qfrc_passive)[cell.dof]
+
+
+def saved(arm: SimulatedArm) -> Message:
+    state = Message(ARM_STATE.dtype(sizes(arm.cell)))
+    arm.save(state)
+    return state
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("name", ["puma560", "k1607"])
+def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
+    name: str, interface: Interface, kind: str
+) -> None:
+    arm, made = simulated(name, interface)
+    fastest = 0.0
+    for target in hostile(made, kind, 400):
+        assert arm.follow(target, 0.0) is None
+        arm.step(1)
+        fastest = max(fastest, float(np.max(np.abs(arm.sense().velocity) / made.bounds.velocity)))
+    assert arm.violations == 0
+    assert arm.clipped > 50
+    assert fastest > 0.9 or kind == "swings"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("misses", [False, True])
+def test_nor_an_arm_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interface: Interface, kind: str, misses: bool
+) -> None:
+    # Its drives cycle at 4 kHz, so they may be quick.
+    monkeypatch.setattr(set_points, "VELOCITY_GAIN", 400.0)
+
+    def beyond(is_guarded: bool) -> float:
+        arm, guard = own(tmp_path, interface)
+        random = np.random.default_rng(1)
+        low, high = arm.cell.bounds.position.T
+        worst = -np.inf
+        for target in hostile(arm.cell, kind, 400):
+            guard.sense()
+            assert (guard if is_guarded else arm).follow(target, 0.0) is None or not is_guarded
+            for _ in range(random.integers(1, arm.patience, endpoint=True) if misses else 1):
+                arm.step(1)
+                far = np.maximum(low - arm._q, arm._q - high)
+                fast = np.abs(arm._qd) - arm.cell.bounds.velocity
+                worst = max(worst, float(far.max()), float(fast.max()))
+        assert arm.violations == 0 or not is_guarded
+        return worst
+
+    assert beyond(is_guarded=True) <= 0.0
+    assert beyond(is_guarded=False) > 0.1
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("is_own", [False, True])
+@pytest.mark.parametrize(
+    ("wrong", "alarm"),
+    [
+        ({"position": np.nan}, Alarm.SET_POINT),
+        ({"velocity": np.inf}, Alarm.SET_POINT),
+        ({"torque": np.nan}, Alarm.COMMAND_INVALID),
+        ({"torque": 1e4}, Alarm.COMMAND_LIMIT),
+    ],
+)
+def test_what_no_drive_may_have_engages_the_brakes(
+    tmp_path: Path, interface: Interface, is_own: bool, wrong: dict[str, float], alarm: Alarm
+) -> None:
+    link: GuardedArm | SimulatedArm
+    arm: ServoArm | SimulatedArm
+    if is_own:
+        arm, link = own(tmp_path, interface)
+    else:
+        arm = link = simulated("puma560", interface)[0]
+    good = JointTarget(arm.cell.home, 0.0 * arm.cell.home, load(arm.cell))
+    link.sense()
+    assert link.follow(good, 0.0) is None
+    assert not arm.braked
+    arm.step(1)
+    link.sense()
+    ((field, value),) = wrong.items()
+    bad = getattr(good, field).copy()
+    bad[1] = value
+    refused = link.follow(good._replace(**{field: bad}), 0.0)
+    assert refused is not None
+    assert (refused.alarm, refused.subject) == (alarm, 1)
+    assert (arm.braked, arm.clipped) == (True, 1)
+    # The next good one is followed again.
+    link.sense()
+    assert link.follow(good, 0.0) is None
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("is_own", [False, True])
+def test_the_first_set_point_after_brakes_must_be_where_the_arm_is(
+    tmp_path: Path, interface: Interface, is_own: bool
+) -> None:
+    link: GuardedArm | SimulatedArm
+    arm: ServoArm | SimulatedArm
+    if is_own:
+        arm, link = own(tmp_path, interface)
+    else:
+        arm = link = simulated("puma560", interface)[0]
+    there = arm.cell.home.copy()
+    there[1] += 0.02
+    away = JointTarget(there, 0.0 * there, load(arm.cell))
+    for _ in range(3):
+        link.sense()
+        refused = link.follow(away, 0.0)
+        assert refused is not None
+        assert (refused.alarm, refused.subject) == (Alarm.SET_POINT, 1)
+        assert refused.value == pytest.approx(0.02, abs=1e-3)
+        assert arm.braked
+        arm.step(1)
+    link.sense()
+    assert link.follow(away._replace(position=link.sense().position), 0.0) is None
+    assert not arm.braked
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("missed", [0, 1, 5])
+def test_a_restored_arm_continues_bit_for_bit(interface: Interface, missed: int) -> None:
+    arm, made = simulated("puma560", interface)
+    targets = list(hostile(made, "jumps", 200))
+    for target in targets[:150]:
+        arm.follow(target, 0.0)
+        arm.step(1)
+    again, _ = simulated("puma560", interface)
+    again.restore(saved(arm))
+    for each in (arm, again):
+        each.step(missed)
+        for target in targets[150:]:
+            each.follow(target, 0.0)
+            each.step(1)
+    assert saved(again).raw == saved(arm).raw
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_drives_go_on_for_their_patience_then_brake(interface: Interface) -> None:
+    arm, made = simulated("puma560", interface)
+    velocity = 0.1 * made.bounds.velocity
+    position = made.home.copy()
+    for _ in range(200):
+        assert arm.follow(JointTarget(position, velocity, load(made)), 0.0) is None
+        arm.step(1)
+        position = position + TICK_S * velocity
+    for _ in range(arm.patience - 1):
+        arm.step(1)
+        assert arm.sense().velocity == pytest.approx(velocity, rel=0.05)
+        assert not arm.braked
+    arm.step(100)
+    assert arm.braked
+    assert np.abs(arm.sense().velocity).max() < 1e-2
+    assert arm.violations == 0

@@ -1,0 +1,209 @@
+"""A servo level whose arm has drives that follow set points: it follows, stops, and finds what does
+not follow, as with torques."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.backplane.watch.alarms import NO_TORQUE, Alarm
+from rack.boards.config import load
+from rack.boards.config.resolved import resolve
+from rack.boards.errors import ConfigError
+from rack.levels.arm import JointTarget
+from rack.levels.level import Finding
+from rack.levels.messages import Error
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.servo.control import LoopGains, SetPointLaw
+from rack.levels.servo.curves import Motion
+from rack.levels.tables import Interface, SceneConfig
+from tests.levels.arm.test_own_arm import GOAL, START
+from tests.levels.arm.test_set_points import SET_POINTS, ServoArm
+from tests.levels.arms import CLOCK_NS, pendulum
+from tests.levels.servo.rig import TICK_S, Course, ServoRig
+
+COURSE = Course(START, GOAL, 0.8)
+OWN = "tests.levels.servo.test_set_point_law:"
+STUCK_AT = 150
+
+
+class StuckServoArm(ServoArm):
+    """From a tick on its drives stay where they are, and say nothing of it."""
+
+    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
+        kept = self._rows[0].copy()
+        found = super().follow(target, grip_force)
+        if self.tick >= STUCK_AT:
+            self._rows[0, 1] = kept[1]
+            self._rows[1, 1] = 0.0
+        return found
+
+
+class PositionArm(ServoArm):
+    """Its drives have loops of position alone."""
+
+    @classmethod
+    def takes(cls, interface: Interface) -> bool:
+        return interface == "position"
+
+
+def rig(folder: Path, interface: Interface, arm: str = "", **robot: object) -> ServoRig:
+    params = {"arm": arm} if arm else {}
+    return ServoRig(pendulum(folder, interface=interface, **robot), SceneConfig(), **params)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", ["", OWN + "ServoArm"])
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_it_follows_a_course(tmp_path: Path, interface: Interface, arm: str) -> None:
+    servo = rig(tmp_path, interface, arm)
+    servo.run(500, COURSE.at)
+    assert np.abs(servo.errors(COURSE.at)).max() < 8e-3
+    assert np.abs(servo.status.position - GOAL).max() < 5e-4
+    assert not servo.alarms()
+    assert (servo.status.clipped, servo.status.violations) == (0, 0)
+    # It says what torque was predicted for the motion: at rest that of gravity.
+    holding = servo.servo.terms().bias
+    assert servo.status.torque == pytest.approx(holding, abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_a_restarted_board_goes_on(tmp_path: Path, interface: Interface) -> None:
+    servo = rig(tmp_path, interface)
+    servo.run(160, COURSE.at)
+    servo.restart()
+    servo.run(440, COURSE.at)
+    assert np.abs(servo.status.position - GOAL).max() < 5e-4
+    assert servo.status.violations == 0
+    assert set(servo.alarms()) <= {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_missed_cycles_brake_it_and_it_goes_on(tmp_path: Path, interface: Interface) -> None:
+    servo = rig(tmp_path, interface)
+    servo.run(150, COURSE.at)
+    servo.miss(1)
+    servo.run(50, COURSE.at)
+    assert not servo.alarms()
+    servo.miss(12)
+    servo.run(400, COURSE.at)
+    assert servo.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
+    assert servo.found[0].finding.subject == NO_TORQUE
+    assert np.abs(servo.status.position - GOAL).max() < 5e-4
+    assert servo.status.violations == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_a_weak_motor_is_found_by_the_torque_that_drives_report(
+    tmp_path: Path, interface: Interface
+) -> None:
+    servo = rig(tmp_path, interface)
+    servo.run(100, COURSE.at)
+    since = servo.inject("actuator-off", joint=0)
+    servo.run(30, COURSE.at)
+    found = next(f for f in servo.found if f.finding.alarm is Alarm.ACTUATOR)
+    assert found.finding.subject == 0
+    assert found.tick - since < 12
+    assert servo.servo.arm.braked
+    servo.heal()
+    servo.run(900, COURSE.at)
+    assert np.abs(servo.status.position - GOAL).max() < 5e-4
+    assert servo.status.violations == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_a_drive_that_does_not_follow_is_a_motor_fault(
+    tmp_path: Path, interface: Interface
+) -> None:
+    servo = rig(tmp_path, interface, OWN + "StuckServoArm")
+    servo.run(STUCK_AT, COURSE.at)
+    assert not servo.alarms()
+    servo.run(100, COURSE.at)
+    found = servo.found[0].finding
+    assert (found.alarm, found.subject) == (Alarm.ACTUATOR, 1)
+    assert abs(found.value) == pytest.approx(servo.servo.given.following, rel=0.3)
+    assert servo.status.error == Error.NONE
+    assert "motor of 'elbow'" in servo.status.reason
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize(
+    ("kind", "alarm"),
+    [("command-nan", Alarm.COMMAND_INVALID), ("sensor-nan", Alarm.SENSOR_RANGE)],
+)
+def test_what_is_not_finite_is_not_followed(
+    tmp_path: Path, interface: Interface, kind: str, alarm: Alarm
+) -> None:
+    servo = rig(tmp_path, interface)
+    servo.run(100, COURSE.at)
+    servo.inject(kind, joint=1)
+    servo.run(3, COURSE.at)
+    assert servo.servo.arm.braked
+    assert alarm in servo.alarms()
+    assert servo.status.violations == 0
+
+
+def test_a_refused_set_point_is_said(tmp_path: Path) -> None:
+    servo = rig(tmp_path, "position")
+    servo.run(20)
+    servo.servo.stopping.refuse(Finding(Alarm.SET_POINT, 1, 0.25), servo.rack.tick)
+    assert servo.servo.stopping.reason.startswith(
+        "rejected: set point of 'elbow' is 0.25 rad from the joint"
+    )
+
+
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
+    cell: Cell = build_cell(pendulum(tmp_path, interface=interface), SceneConfig(), CLOCK_NS)
+    law = SetPointLaw(cell, LoopGains(bandwidth=60.0, damping=1.5), TICK_S)
+    now, later = (np.array([[0.1, 0.2], [1.0, -1.0], [4.0, 8.0]]) for _ in range(2))
+    later[1] += TICK_S * now[2]
+    later[0] += TICK_S * 0.5 * (now[1] + later[1])
+    off = np.array([0.01, 0.0])
+    torque = np.array([3.0, 4.0])
+    target = law.target(Motion(now), now[0] - off, torque)
+    correction = 20.0 * off if interface == "velocity" else 0.0
+    assert target.position == pytest.approx(later[0], abs=1e-12)
+    assert target.velocity == pytest.approx(later[1] + correction, abs=1e-12)
+    assert target.torque is torque
+
+
+def test_an_arm_may_take_set_points_of_one_kind_alone() -> None:
+    own = f"board.servo.params.arm='{OWN}PositionArm'"
+    resolve(load("k1607", ["robot.interface='position'", own]))
+    with pytest.raises(ConfigError, match="no `follow` of the class takes"):
+        resolve(load("k1607", ["robot.interface='velocity'", own]))
+
+
+@pytest.mark.parametrize(
+    ("rack", "changes", "mistake"),
+    [
+        ("rccl", [], 'board.arm.executor = "ArmExecutor": it gives torques'),
+        ("penn", [], 'board.arm.executor = "ForceArmExecutor": it gives torques'),
+        ("hic", [], 'robot.interface = "position": tendons of a hand take tensions'),
+        (
+            "k1607",
+            ["board.servo.params.arm='tests.levels.arm.test_own_arm:IdealArm'"],
+            'board.servo.params.arm = "tests.levels.arm.test_own_arm:IdealArm": no `follow`',
+        ),
+        (
+            "k1607",
+            [
+                "board.servo.params.modifications.pd.class='rack.levels.servo.common_modifications:JointPd'"
+            ],
+            'board.servo.params.modifications = "pd": they modify a law of torques',
+        ),
+    ],
+)
+def test_what_makes_no_sense_with_set_points_is_refused(
+    rack: str, changes: list[str], mistake: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        resolve(load(rack, ["robot.interface='position'", *changes]))
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(mistake)
