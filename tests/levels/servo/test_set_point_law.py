@@ -15,13 +15,15 @@ from rack.boards.errors import ConfigError
 from rack.levels.arm import JointTarget
 from rack.levels.level import Finding
 from rack.levels.messages import Error
+from rack.levels.operator import Answer, Operation
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.servo.control import LoopGains, SetPointLaw
 from rack.levels.servo.curves import Motion
-from rack.levels.tables import Interface, SceneConfig
+from rack.levels.tables import CalibrationConfig, Interface, SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START
 from tests.levels.arm.test_set_points import SET_POINTS, ServoArm
 from tests.levels.arms import CLOCK_NS, pendulum
+from tests.levels.lockstep import Operator
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
 
 COURSE = Course(START, GOAL, 0.8)
@@ -67,6 +69,33 @@ def test_it_follows_a_course(tmp_path: Path, interface: Interface, arm: str) -> 
     # It says what torque was predicted for the motion: at rest that of gravity.
     holding = servo.servo.terms().bias
     assert servo.status.torque == pytest.approx(holding, abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_drives_that_count_from_elsewhere_get_set_points_as_they_count(
+    tmp_path: Path, interface: Interface
+) -> None:
+    servo = rig(tmp_path, interface, calibration=CalibrationConfig(offset=(0.3, -0.2)))
+    servo.run(500, COURSE.at)
+    truth = servo.servo.arm.sense().position + np.array([0.3, -0.2])
+    assert np.abs(truth - GOAL).max() < 5e-4
+    assert not servo.alarms()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", SET_POINTS)
+def test_the_end_of_a_bring_up_does_not_move_the_set_points(
+    tmp_path: Path, interface: Interface
+) -> None:
+    servo = rig(tmp_path, interface, OWN + "ServoArm", bring_up=0.5)
+    slow = Course(START, GOAL, 1.6)
+    servo.run(320, slow.at)
+    Operator(servo.rack).say("servo", Operation.RELEASE)
+    servo.run(600, slow.at)
+    assert np.abs(servo.status.position - GOAL).max() < 1e-3
+    assert servo.status.answer == Answer.DONE
+    assert not servo.alarms()
 
 
 @pytest.mark.slow
