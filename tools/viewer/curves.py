@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import prod
 
+import mujoco
 import numpy as np
 
 from rack.backplane.layout import FieldSpec, MailboxSpec
@@ -56,9 +57,12 @@ class Joints:
                     style_curves(stream, entity, both, [COMMANDED, of_joint(at)], [2.5, 1.0])
         labels = [f"{name}, mrad" for name in names]
         style_curves(stream, (ERROR,), labels, [of_joint(at) for at in range(len(names))])
-        if has_gripper:
-            style_curves(stream, (GRIPPER, "opening"), ["opening, mm"])
-            style_curves(stream, (GRIPPER, "force"), ["force, N"])
+        if cell.gripper is not None and has_gripper:
+            joint = cell.model.dof_jntid[cell.gripper.dof]
+            turns = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+            way, force = ("mrad", "N m") if turns else ("mm", "N")
+            style_curves(stream, (GRIPPER, "opening"), [f"opening, {way}"])
+            style_curves(stream, (GRIPPER, "force"), [f"force, {force}"])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of that level."""
