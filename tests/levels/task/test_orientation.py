@@ -18,7 +18,7 @@ from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from rack.levels.task.actions import goto, rehearse
 from rack.levels.task.program import Goto, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
-from tests.levels.arms import CLOCK_NS, config
+from tests.levels.arms import CLOCK_NS
 from tests.levels.whole_rack import WholeRack
 
 FIVE = """
@@ -26,7 +26,6 @@ FIVE = """
   <compiler angle="radian"/>
   <worldbody>
     <geom name="table" type="box" size=".5 .5 .02" pos="0 0 -.02" friction="1"/>
-    {roof}
     <body name="can" pos="{x} 0 .05"><freejoint/>
       <geom name="can" type="cylinder" size=".014 .05" density="400" friction="1 .02 .001"
         condim="4" solimp=".95 .99 .001" solref=".004 1"/></body>
@@ -70,10 +69,10 @@ FIVE = """
 SCENE = SceneConfig(objects=("can",), supports=("table",))
 
 
-def five(folder: Path, x: float = 0.25, bend: float = 2.0, roof: str = "") -> RobotConfig:
+def five(folder: Path, x: float = 0.25, bend: float = 2.0) -> RobotConfig:
     """Write an arm of five joints with a can at `x`, m, on its table; return its config."""
     model = folder / "five.xml"
-    model.write_text(FIVE.format(x=x, bend=bend, roof=roof))
+    model.write_text(FIVE.format(x=x, bend=bend))
     return RobotConfig(
         model=model,
         joints=("turn", "shoulder", "elbow", "bend", "roll"),
@@ -144,17 +143,3 @@ def test_five_joints_transfer_a_can(tmp_path: Path, bend: float) -> None:
     assert status.state == State.DONE, status.reason
     assert rack.read("servo.status").touches == 0
     assert rack.read("world.model").position[0] == pytest.approx(to, abs=0.01)
-
-
-def test_an_object_under_a_roof_is_taken_from_the_side(tmp_path: Path) -> None:
-    robot, scene = config("puma560")
-    text = (robot.model.parent / "puma560_cell.xml").read_text()
-    assert 'name="peg" pos=".50 -.30 .50"' in text
-    roof = '<geom name="roof" type="box" size=".06 .06 .005" pos=".56 -.30 .66"/>'
-    (tmp_path / "cell.xml").write_text(text.replace('<body name="peg"', roof + '<body name="peg"'))
-    (tmp_path / "puma560.xml").write_text((robot.model.parent / "puma560.xml").read_text())
-    start = rehearsal(robot.model_copy(update={"model": tmp_path / "cell.xml"}), scene)
-    program = TaskConfig(
-        action=[{"do": "transfer", "object": "peg", "to": [0.45, 0.38, 0.5], "lift": 0.05}]
-    )
-    assert leaning_of(rehearse(program, scene, start)) > 0.1
