@@ -130,6 +130,9 @@ class ServoExecutor(ArmDriver):
         reference = self.reference
         if self.abandoned:
             reference.start(sensors.position, sensors.velocity, tick)
+        elif self.ahead is not None and self.arm.braked:
+            # The first set point after brakes is where the arm is.
+            reference.meet(sensors.position, sensors.velocity, tick, astray=0.0)
         elif missed:
             reference.meet(sensors.position, sensors.velocity, tick)
         if reaction:

@@ -82,11 +82,11 @@ class Reference:
         self.goal = None
         self.holding = True
 
-    def meet(self, position: Array, velocity: Array, tick: int) -> None:
-        """Start from where the arm is after missed cycles, if it has strayed, and lead it back to
-        the set points."""
+    def meet(self, position: Array, velocity: Array, tick: int, astray: float = ASTRAY_RAD) -> None:
+        """Start from where the arm is after missed cycles, if it has strayed as far as `astray`,
+        rad, and lead it back to the set points."""
         now = self._motion(tick)
-        if np.max(np.abs(now.position - position)) < ASTRAY_RAD:
+        if np.max(np.abs(now.position - position)) < astray:
             return
         if self.holding or tick >= self._due:
             self.start(position, velocity, tick)

@@ -127,6 +127,24 @@ def test_missed_cycles_brake_it_and_it_goes_on(tmp_path: Path, interface: Interf
 
 @pytest.mark.slow
 @pytest.mark.parametrize("interface", SET_POINTS)
+def test_as_often_as_cycles_are_missed_the_first_set_point_is_where_the_arm_is(
+    tmp_path: Path, interface: Interface
+) -> None:
+    servo = rig(tmp_path, interface)
+    random = np.random.default_rng(4)
+    course = Course(START, GOAL, 0.8)
+    for _ in range(30):
+        servo.run(int(random.integers(5, 20)), course.at)
+        # Some of these outlast the patience of the drives.
+        servo.miss(int(random.integers(1, 7)))
+    servo.run(400, course.at)
+    assert set(servo.alarms()) == {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
+    assert np.abs(servo.status.position - GOAL).max() < 5e-4
+    assert servo.status.violations == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interface", SET_POINTS)
 def test_a_weak_motor_is_found_by_the_torque_that_drives_report(
     tmp_path: Path, interface: Interface
 ) -> None:
