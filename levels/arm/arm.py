@@ -4,9 +4,8 @@ The servo level drives whatever class `[board.servo.params] arm = "package.modul
 simulated arm by default, your own hardware or simulation otherwise. In every cycle it calls, in
 this order, `step` (the ticks since the last cycle), `sense`, then either `drive` (`follow` for
 drives that take set points) or `brake` or neither (the last command stays in force), `save` and
-`look`. All calls come from the executor's
-process, within its cycle: none may block. An exception ends the board, which is restarted as after
-any crash; report a broken arm in `fault` instead.
+`look`. All calls come from the executor's process, within its cycle: none may block. An exception
+ends the board, which is restarted as after any crash; report a broken arm in `fault` instead.
 """
 
 from __future__ import annotations
