@@ -35,6 +35,8 @@ Mode = Literal["realtime", "lockstep"]
 IdleCores = Literal["sleep", "awake"]
 OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
+Motion = Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"]
+Power = Literal["enable", "disable", "reset", "release"]
 
 
 def _listed(value: Any) -> Any:
@@ -409,19 +411,7 @@ class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
     level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal[
-        "hold",
-        "resume",
-        "setpoint",
-        "goto",
-        "modify",
-        "table",
-        "do",
-        "enable",
-        "disable",
-        "reset",
-        "release",
-    ] = Field(
+    what: Literal[Motion, Power] = Field(
         description=(
             "hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there;"
             " modify: put a control modification in or take it out; table: decide by another state"

@@ -286,7 +286,7 @@ def _monitors(config: RackConfig) -> Iterator[dict[str, Any]]:
         if kind is None or not issubclass(kind, ArmParams):
             continue
         sensors = find_arm(read_params(kind, given.params).arm).sensors
-        cell = built_cell(robot, config.scene, config.clock_ns)
+        cell = built_cell(config)
         stands = tolerance(sensed_by(cell, robot, sensors))
         yield {
             "board": board,

@@ -32,7 +32,7 @@ BLOCK = 1024
 """Messages of a mailbox that are made into JSON at once."""
 
 
-class Sample(NamedTuple):
+class ChannelMessage(NamedTuple):
     """A message of a channel. They sort by time."""
 
     log_ns: int  # simulated, since the start of the run
@@ -103,7 +103,7 @@ def _of_shape(kind: str, shape: Sequence[int]) -> dict[str, Any]:
     return found
 
 
-def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[Sample]:
+def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[ChannelMessage]:
     """Yield the messages of a mailbox, oldest first."""
     rows = recording.rows(box.name)
     signals = [Signal(column.name, box.name, column, ()) for column in columns_of(box)]
@@ -120,12 +120,12 @@ def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[S
             serial, tick = values[:2]
             data = json.dumps(dict(zip(names, values, strict=True))).encode()
             sequence = serial & 0xFFFFFFFF
-            yield Sample(tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data)
+            yield ChannelMessage(tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data)
 
 
-def _events(recording: Recording, channel: int) -> Iterator[Sample]:
+def _events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
     ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
     clock_ns = recording.layout.clock_ns
     for number, event in enumerate(sorted(ticked, key=lambda event: int(event["tick"]))):
         data = json.dumps(event).encode()
-        yield Sample(event["tick"] * clock_ns, channel, number, event["time_ns"], data)
+        yield ChannelMessage(event["tick"] * clock_ns, channel, number, event["time_ns"], data)

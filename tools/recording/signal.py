@@ -84,7 +84,9 @@ class Signal:
 
     def values(self, messages: np.ndarray) -> np.ndarray:
         """Return it in each of these messages, shape (messages, *what is left of its own)."""
-        return self.column.of(messages)[(slice(None), *self.index)]
+        place: Any = (slice(None), *self.index)
+        found: np.ndarray = self.column.of(messages)[place]
+        return found
 
     def plain(self, messages: np.ndarray) -> list[Any]:
         """Return it in each of these messages as users read it: numbers, names of states, text,
@@ -96,7 +98,7 @@ class Signal:
             names = {number: name for name, number in self.column.values}
             values = np.vectorize(lambda number: names.get(number, number), "O")(values)
         elif values.dtype.kind == "f" and not np.isfinite(values).all():
-            values = np.where(np.isfinite(values), values, None)
+            values = np.where(np.isfinite(values), values, np.array(None))
         found: list[Any] = values.tolist()
         return found
 
