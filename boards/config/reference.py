@@ -24,7 +24,7 @@ from rack.boards.faults.kind import KINDS
 UNIT = re.compile(
     r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N"
     r" m|N|rad/s[23]?|rad|m/s|mm|m|ms|us|1/s|s|Hz|ticks|cycles)"
-    r"(?: or (?:rad/s|rad|N m))?)(?=$|[;:,])"
+    r"(?: or (?:rad/s|rad|N m s/rad|N m/rad|N m))?)(?=$|[;:,])"
 )
 """The unit in a description: between a comma and the end, or further punctuation."""
 REQUIRED = "required"

@@ -242,8 +242,11 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
         if why := next(filter(None, map(motion.checker.why, reachable)), ""):
             return Refused(Error.NO_PATH, why)
         beyond = beyond or (tool if not reachable else None)
-    begin = motion.ik.tool_at(here)
     end = beyond or tools[0]
+    out_of_reach = f"out of reach: {in_metres(end)}; in reach"
+    if motion.ik.reachable(end, here, turned=False):
+        return Refused(Error.UNREACHABLE, f"{out_of_reach} in another orientation")
+    begin = motion.ik.tool_at(here)
     low = 0.0
     high = 1.0
     for _ in range(HALVINGS):
@@ -253,7 +256,4 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
         )
         low, high = (middle, high) if reached else (low, middle)
     in_reach = begin.towards(end, low)
-    why = f"out of reach: {in_metres(end)}; in reach: {in_metres(in_reach)}"
-    if motion.ik.reachable(end, here, turned=False):
-        why += "; or the place itself, with the tool turned otherwise"
-    return Refused(Error.UNREACHABLE, why)
+    return Refused(Error.UNREACHABLE, f"{out_of_reach}: {in_metres(in_reach)}")

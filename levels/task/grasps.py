@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import mujoco
@@ -62,14 +63,14 @@ def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
 def leaning(yaw: float, tilt: float) -> Array:
     """Return the quaternion of a tool that points down but for `tilt`, rad, towards `yaw`; its y
     axis is level."""
-    across = np.sin(tilt)
-    return pointing((across * np.cos(yaw), across * np.sin(yaw), -np.cos(tilt)), yaw)
+    across = math.sin(tilt)
+    return pointing((across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw)
 
 
 def bearing(cell: Cell, position: Array) -> float:
     """Return the direction, rad, in which the arm's first joint sees a position."""
     base = cell.start().xanchor[cell.model.dof_jntid[cell.dof[0]]]
-    return float(np.arctan2(position[1] - base[1], position[0] - base[0]))
+    return math.atan2(position[1] - base[1], position[0] - base[0])
 
 
 def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[Pose]:

@@ -15,7 +15,16 @@ from rack.boards.errors import ConfigError
 from rack.levels.servo.control import ServoParams
 
 DIMENSIONLESS = {
-    *("speed", "small_share", "phase", "damping", "braking", "tolerance", "bring_up"),  # ratios
+    *(
+        "speed",
+        "small_share",
+        "phase",
+        "damping",
+        "braking",
+        "tolerance",
+        "bring_up",
+        "ratio",
+    ),  # ratios
     *("quaternion", "direction", "x", "z"),
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
     *("lead", "posture", "reserve"),  # of hands: parts and factors

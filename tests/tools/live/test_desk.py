@@ -133,7 +133,7 @@ REFUSED = {
         "--timeout needs --wait; give both, or neither",
     ),
     "nothing said": (("upper",), "LEVEL and WHAT are needed, as in: rack command "),
-    "nothing that is said": (("upper", "halt"), "'setpoint', 'goto', 'modify', 'table' or 'do'"),
+    "nothing that is said": (("upper", "halt"), "'enable', 'disable', 'reset' or 'release'"),
     "not for this level": (
         ("lower", "setpoint", "joints=1"),
         "'lower' does not take setpoint; it takes: hold, resume",
