@@ -252,6 +252,16 @@ class HandConfig(Table):
     )
 
 
+class ToolConfig(Table):
+    """`[robot.tool_offset]`: the tool's frame on a body, for a model without a site for it."""
+
+    position: Vector = Field((0.0, 0.0, 0.0), description="of the tool in the body's frame, m")
+    quaternion: tuple[Finite, Finite, Finite, Finite] = Field(
+        (1.0, 0.0, 0.0, 0.0),
+        description="of the tool in the body's frame, as w, x, y, z; its z axis approaches",
+    )
+
+
 class RobotConfig(Table):
     """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per
     joint."""
@@ -260,13 +270,32 @@ class RobotConfig(Table):
         strict=False, description="MJCF file of the arm and its cell; relative to the config"
     )
     joints: tuple[str, ...] = Field(
-        min_length=1, max_length=16, description="MJCF joints of the arm, base to tool"
+        (),
+        min_length=1,
+        max_length=16,
+        description=(
+            "MJCF joints of the arm, base to tool; default: those with an actuator, without the"
+            " gripper's"
+        ),
     )
     tool: str = Field(
-        description="MJCF site whose pose is the tool's; for a model without one, its last body"
+        "",
+        min_length=1,
+        description=(
+            "MJCF site whose pose is the tool's, or a body; default: the last site that the arm"
+            " carries, else its last body"
+        ),
+    )
+    tool_offset: ToolConfig | None = Field(
+        None, description="pose of the tool on the body that `tool` names; default: the body's own"
     )
     home: tuple[Finite, ...] = Field(
-        description="joint positions to which tasks return, and the simulated start, rad"
+        (),
+        min_length=1,
+        description=(
+            "joint positions to which tasks return, and the simulated start, rad; default: those of"
+            " the first keyframe"
+        ),
     )
     start: tuple[Finite, ...] | None = Field(
         None, description="where the simulated arm starts, rad; default: home"
@@ -288,6 +317,9 @@ class RobotConfig(Table):
             "what the drives take in every cycle: torques, or set points of position or velocity,"
             " which they follow by loops of their own; the simulated arm's drives are such, too"
         ),
+    )
+    exclude: tuple[tuple[str, str], ...] = Field(
+        (), description="pairs of MJCF bodies whose contacts do not count, beside the model's own"
     )
     gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
     sensors: SensorConfig | None = Field(
@@ -363,6 +395,11 @@ class RobotConfig(Table):
             if name.partition(".")[0] not in cls.model_fields:
                 raise ValueError(f"'{name}' is no key of [robot]; `rack schema robot` lists them")
         return names
+
+    @property
+    def tool_name(self) -> str:
+        """The site whose pose is the tool's: one that the table places has a name of its own."""
+        return self.tool if self.tool_offset is None else f"tool of {self.tool}"
 
 
 class MotionConfig(Table):

@@ -33,6 +33,7 @@ COMMANDS = (
         "Run a rack until its task ends, and report on the run.",
     ),
     ("check", "rack.tools.commands.check:check", "Validate a config and predict its timing."),
+    ("robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."),
     (
         "schema",
         "rack.tools.commands.schema:schema",
@@ -116,6 +117,7 @@ GROUPS = {
     "Command and disturb": ("command", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),
     "Compare": ("bench", "reproduce"),
+    "Bring up": ("robot",),
     "Reach others": ("lan",),
     "Look up": ("schema",),
 }

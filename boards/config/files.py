@@ -49,8 +49,9 @@ def named_classes(tables: Tables) -> tuple[str, ...]:
 def read(name_or_path: str | Path) -> Tables:
     """Return the tables of a config, merged with those of the files that it extends.
 
-    A name means a bundled config; text that contains '/' or ends in '.toml' is a path, if it is no
-    name as `names` lists them, or such a file exists. Raises `ConfigError`.
+    A name means a bundled config, or else one in the current folder; text that contains '/' or ends
+    in '.toml' is a path, if it is no name as `names` lists them, or such a file exists. Raises
+    `ConfigError`.
     """
     return _read(_path(name_or_path, "config", CONFIGS), (), {})
 
@@ -161,6 +162,7 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     files = [
         *([file_at(Path(text))] if is_path else []),
         *(_named(text, folder) for folder in known),
+        *([] if is_path else [_named(text, Path.cwd())]),
     ]
     found = next((file for file in files if file is not None), None)
     if found is None:

@@ -23,7 +23,7 @@ from rack.backplane.process import cores_kept_awake, mapped_and_locked
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
-from rack.boards.config.cell import cell_sizes
+from rack.boards.config.cell import cell_sizes, with_derived
 from rack.boards.config.commands import requests
 from rack.boards.config.faults import injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
@@ -393,7 +393,7 @@ def validated(tables: Tables) -> RackConfig:
         found = mistakes_of(error, RackConfig, tables)
         raise ConfigError([*found, *_Examined(config, faults, commands, broken).mistakes]) from None
     extend_path(config.python_path)
-    return config
+    return with_derived(config)
 
 
 def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:

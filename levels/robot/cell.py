@@ -101,6 +101,17 @@ def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 
 @lru_cache(maxsize=4)
 def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+    cell = unchecked_cell(robot, scene, clock_ns)
+    for key, position in (("home", cell.home), ("start", cell.begin)):
+        cell.model.key_qpos[0] = start_qpos(cell, position)
+        check_start(cell, robot, key, position)
+    if robot.gripper is not None and cell.gripper is not None and cell.gripper.linkage.yields:
+        check_fingers(cell, cell.gripper, robot.gripper)
+    return cell
+
+
+def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+    """Build the cell as `build_cell` does, wherever the arm is at home. Raises `RobotError`."""
     spec = load_spec(robot.model)
     check_joints(robot, spec)
     if robot.hand is None:
@@ -111,11 +122,7 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
     if robot.gripper is not None and ease_gripper(cell, spec, robot.gripper, clock_ns * 1e-9):
         cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
-    for key, position in (("home", cell.home), ("start", cell.begin)):
-        cell.model.key_qpos[0] = start_qpos(cell, position)
-        check_start(cell, robot, key, position)
-    if robot.gripper is not None and cell.gripper is not None and cell.gripper.linkage.yields:
-        check_fingers(cell, cell.gripper, robot.gripper)
+    cell.model.key_qpos[0] = start_qpos(cell, cell.begin)
     return cell
 
 
@@ -148,7 +155,7 @@ def index(
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
-    tool = lookup.tool_site(model, robot.tool, moved if hand is None else None)
+    tool = lookup.tool_site(model, robot.tool_name, moved if hand is None else None)
     joint = lookup.gripper_joint(model, robot, moved)
     bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects = bodies[: len(scene.objects)]

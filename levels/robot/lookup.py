@@ -35,6 +35,8 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
         "actuator": model.nu,
     }
     have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(counts[NOUNS[kind]])])
+    if place == "robot.tool":  # a body serves as well
+        have += "; bodies: " + listed([model.body(k).name for k in range(model.nbody)])
     raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
 
 
@@ -53,6 +55,7 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     wanted = [(kind.mjOBJ_JOINT, name, "robot.joints") for name in robot.joints]
     if mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) < 0:
         wanted.append((kind.mjOBJ_SITE, robot.tool, "robot.tool"))
+    wanted += [(kind.mjOBJ_BODY, name, "robot.exclude") for pair in robot.exclude for name in pair]
     if robot.gripper is not None:
         wanted.append((kind.mjOBJ_JOINT, robot.gripper.joint, "robot.gripper.joint"))
     if robot.hand is not None:

@@ -7,7 +7,7 @@ The file is not trusted: every mistake is one `RobotError`, in bounded time and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
-from rack.levels.tables import FollowConfig, GripperConfig, RobotConfig
+from rack.levels.tables import FollowConfig, GripperConfig, RobotConfig, ToolConfig
 
 GRID_CELLS = 4_000_000
 """Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
@@ -104,8 +104,12 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
         joint = spec.joint(name)
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             joint.armature = max(joint.armature, robot.min_armature)
-    if spec.site(robot.tool) is None and spec.body(robot.tool) is not None:
-        spec.body(robot.tool).add_site(name=robot.tool)
+    tool = robot.tool_offset or ToolConfig()
+    carrier = spec.body(robot.tool)
+    if spec.site(robot.tool_name) is None and carrier is not None:
+        carrier.add_site(name=robot.tool_name, pos=tool.position, quat=tool.quaternion)
+    for first, second in robot.exclude:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
     if robot.gripper is not None:
         fit_gripper(spec, robot.gripper)
     if robot.interface != "torque":
@@ -213,16 +217,21 @@ def torque_limit(
     """Return the torque limit of one joint, N m. Raises `RobotError` when there is none."""
     if robot.torque is not None:
         return robot.torque[index]
-    own = spec.joint(joint)
-    found = [reach(own.actfrclimited, own.actfrcrange)]
-    found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
-    limit = min((x for x in found if x > 0), default=0.0)
+    limit = stated_torque(spec, joint, drives)
     if not (limit > 0 and np.isfinite(limit)):
         raise RobotError(
             f"joint '{joint}': the model gives no torque limit; give robot.torque, N m, one value a"
             " joint"
         )
     return limit
+
+
+def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]) -> float:
+    """Return the tightest torque limit that a model states for a joint, N m; 0: none."""
+    own = spec.joint(joint)
+    found = [reach(own.actfrclimited, own.actfrcrange)]
+    found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
+    return min((x for x in found if x > 0), default=0.0)
 
 
 def drive_limit(actuator: mujoco.MjsActuator) -> float:

@@ -317,3 +317,14 @@ def test_every_export_exists_once() -> None:
         AttributeError, match=r"module 'rack\.boards\.config' has no attribute 'nothing'"
     ):
         rack.boards.config.nothing  # noqa: B018
+
+
+def test_a_name_may_be_that_of_a_config_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "mine.toml").write_text('format = 2\nname = "mine"\nextends = ["fig2"]\n')
+    (tmp_path / "fig2.toml").write_text('format = 2\nname = "other"\n')
+    monkeypatch.chdir(tmp_path)
+    assert assembled("mine")["name"] == "mine"
+    assert assembled("fig2")["name"] == "fig2"

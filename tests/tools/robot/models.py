@@ -1,0 +1,64 @@
+"""A small URDF arm with two fingers, written by the tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+LENGTHS = (0.1, 0.3, 0.3, 0.1, 0.08, 0.06)  # m
+AXES = ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
+LINK = """<link name="{name}"><inertial><origin xyz="0 0 {half}"/><mass value="{mass}"/>
+<inertia ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision></link>
+"""
+JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
+<origin xyz="{at}"/><axis xyz="{axis}"/>{limit}{mimic}</joint>
+"""
+LIMIT = '<limit lower="{low}" upper="{high}" effort="{effort}" velocity="2"/>'
+
+
+def link(name: str, size: str, at: str, mass: float = 1.0, inertia: float = 0.01) -> str:
+    return LINK.format(name=name, half=0.02, mass=mass, inertia=inertia, at=at, size=size)
+
+
+def joint(
+    name: str, parent: str, child: str, at: str, axis: str, *, limit: str, kind: str = "revolute",
+    mimic: str = "",
+) -> str:  # fmt: skip
+    return JOINT.format(
+        name=name, kind=kind, parent=parent, child=child, at=at, axis=axis, limit=limit, mimic=mimic
+    )
+
+
+def urdf(gripper: bool = True, effort: float = 60.0) -> str:
+    """Return an arm of six joints; with a gripper, of two fingers of which one mimics the other."""
+    parts = [link("base", "0.1 0.1 0.1", "0 0 0")]
+    parent = "base"
+    below = 0.05
+    for number, (length, axis) in enumerate(zip(LENGTHS, AXES, strict=True), 1):
+        limit = LIMIT.format(low=-2.8, high=2.8, effort=effort)
+        parts.append(link(f"l{number}", f"0.04 0.04 {length * 0.6}", f"0 0 {length / 2}"))
+        parts.append(joint(f"j{number}", parent, f"l{number}", f"0 0 {below}", axis, limit=limit))
+        parent = f"l{number}"
+        below = length
+    if gripper:
+        parts.append(link("hand", "0.04 0.12 0.02", "0 0 0.01", 0.3, 0.001))
+        parts.append(
+            joint("mount", parent, "hand", f"0 0 {below}", "0 0 1", limit="", kind="fixed")
+        )
+        limit = LIMIT.format(low=0, high=0.04, effort=30)
+        for side, name in ((1, "left"), (-1, "right")):
+            parts.append(link(name, "0.02 0.01 0.06", f"0 {0.005 * side} 0.03", 0.1, 0.0001))
+            mimic = '<mimic joint="left_finger"/>' if side < 0 else ""
+            finger = f"{name}_finger"
+            parts.append(
+                joint(finger, "hand", name, "0 0 0.02", f"0 {side} 0", limit=limit,
+                      kind="prismatic", mimic=mimic)
+            )  # fmt: skip
+    return f'<robot name="small">{"".join(parts)}</robot>'
+
+
+def written(folder: Path, text: str, name: str = "small.urdf") -> Path:
+    """Write a model; return its path."""
+    path = folder / name
+    path.write_text(text)
+    return path

@@ -1,0 +1,63 @@
+"""`rack robot check`: what is wrong with an arm is seen before it moves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.tools.command_line import ROOT, rack
+from tests.tools.robot.models import urdf, written
+
+EXAMPLE = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.toml"
+pytestmark = pytest.mark.slow
+
+
+def checked(folder: Path, given: object, status: int) -> dict[str, Any]:
+    done = rack("robot", "check", given, "--json", "--out", folder / "arm.png", folder=folder)
+    assert done.returncode == status, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def failing(found: dict[str, Any]) -> dict[str, str]:
+    return {one["about"]: one["text"] for one in found["findings"] if one["fails"]}
+
+
+def test_a_sound_arm_passes_with_its_axes_and_what_it_can_do(tmp_path: Path) -> None:
+    found = checked(tmp_path, EXAMPLE, 0)
+    assert [row["axis"] for row in found["joints"]][:2] == [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    assert found["reach_m"] == pytest.approx(0.97, abs=0.01)
+    assert not failing(found)
+    is_drawn = (tmp_path / "arm.png").exists()
+    assert is_drawn or "OpenGL" in found["picture"]
+
+
+def test_contacts_at_home_bodies_that_nothing_holds_and_endless_falls_fail(tmp_path: Path) -> None:
+    model = EXAMPLE.with_name("desk-arm.xml").read_text()
+    loose = '<body name="flap" pos="0 2 1"><joint axis="0 1 0"/><geom size=".05"/></body>'
+    cup = '<body name="cup" pos="5 5 1"><freejoint/><geom size=".02"/></body>'
+    written(tmp_path, model.replace("</worldbody>", f"{loose}{cup}</worldbody>"), "desk-arm.xml")
+    text = EXAMPLE.read_text().replace("objects = []", 'objects = ["cup"]')
+    text = text.replace("1.8, 0.0, 1.9416, 0.0]", "2.5, 0.0, 1.9416, 0.0]")
+    text = text.replace("home = [0.0, -0.6", "home = [0.0, 1.2")
+    found = failing(checked(tmp_path, written(tmp_path, text, "own.toml"), 1))
+    assert "desk" in found["contacts at home"] or "world" in found["contacts at home"]
+    assert found["bodies that nothing holds"] == "flap"
+    assert found["objects"] == "'cup' falls without end"
+
+
+def test_of_a_model_file_the_arm_is_drafted_first(tmp_path: Path) -> None:
+    found = checked(tmp_path, written(tmp_path, urdf()), 0)
+    assert found["robot"] == "small"
+    texts = {one["about"]: one["text"] for one in found["findings"]}
+    assert texts["actuators"] == "1 motor"
+    assert "home" in texts["guessed"]
+
+
+def test_what_is_no_model_has_exit_status_2(tmp_path: Path) -> None:
+    done = rack("robot", "check", written(tmp_path, "<sdf/>", "a.xml"), folder=tmp_path)
+    assert done.returncode == 2
+    assert "<sdf>" in done.stderr

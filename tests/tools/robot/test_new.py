@@ -1,0 +1,129 @@
+"""`rack robot new`: from a model file to an arm that moves, with nothing edited."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load
+from tests.tools.command_line import ROOT, rack
+from tests.tools.robot.models import urdf, written
+
+DESK_ARM = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml"
+MESH = '<geometry><mesh filename="package://small/meshes/l2.stl" scale="1 -1 1"/></geometry>'
+BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
+TAIL = "</robot>"
+BAD = {
+    "no inertia": (urdf().replace('"1.0"', '"0"').replace('"0.01"', '"0"'), "inertia"),
+    "no mesh": (urdf().replace(BOX, MESH), "no mesh 'package://small/meshes/l2.stl'"),
+    "two roots": (urdf().replace(TAIL, f'<link name="top"/>{TAIL}'), "roots: base, top"),
+    "two links": (urdf().replace(TAIL, f'<link name="l2"/>{TAIL}'), "links named twice: l2"),
+    "no drives": (urdf(effort=0.0, gripper=False), "no actuator and no effort at j1"),
+    "no XML": ("not a model", "malformed XML"),
+    "another language": ("<sdf/>", "<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)"),
+}
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which `rack robot new` made "small" of a URDF."""
+    folder = tmp_path_factory.mktemp("new")
+    done = rack("robot", "new", written(folder, urdf()), "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["task"] == "a table, two blocks to move"
+    return folder
+
+
+@pytest.mark.thorough
+def test_a_urdf_with_two_fingers_transfers_two_blocks_with_nothing_edited(small: Path) -> None:
+    words = ("--lockstep", "--json", "--out", small / "run", "--set", "name=small-of-test")
+    done = rack("run", "small", *words, folder=small)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["worked"]
+
+
+@pytest.mark.slow
+def test_what_the_urdf_states_is_taken_and_the_rest_named_as_guessed(small: Path) -> None:
+    text = (small / "small" / "small.toml").read_text()
+    robot = tomllib.loads(text)["robot"]
+    assert robot["joints"] == ["j1", "j2", "j3", "j4", "j5", "j6"]
+    assert robot["torque"] == [60.0] * 6
+    assert robot["velocity"] == [2.0] * 6
+    assert robot["gripper"]["open"] == pytest.approx(0.04)
+    assert robot["gripper"]["force"] == 30.0
+    assert robot["tool_offset"]["quaternion"] in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    assert set(robot["guessed"]) == {"gripper", "tool", "acceleration", "jerk", "home"}
+    assert "velocity = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]\n" in text
+    assert "\nhome = " in text
+    assert "# guessed: free of contact" in text
+
+
+@pytest.mark.slow
+def test_a_folder_that_exists_is_refused(small: Path) -> None:
+    done = rack("robot", "new", small / "small.urdf", folder=small)
+    assert done.returncode == 2
+    assert "'small' is there already" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("text", "why"), BAD.values(), ids=BAD)
+def test_a_bad_model_is_one_line_and_nothing_is_written(
+    tmp_path: Path, text: str, why: str
+) -> None:
+    model = written(tmp_path, text)
+    done = rack("robot", "new", model, folder=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert why in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == [model]
+
+
+@pytest.mark.parametrize("name", ["nasrem", "a b", ".."])
+def test_a_name_that_rack_run_would_not_find_is_refused(tmp_path: Path, name: str) -> None:
+    done = rack("robot", "new", DESK_ARM, "--name", name, "--out", "new", folder=tmp_path)
+    assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
+    assert f"--name = {name}: permitted" in done.stderr
+
+
+def test_a_model_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    done = rack("robot", "new", "gone.urdf", folder=tmp_path)
+    assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
+    assert done.stderr == "model 'gone.urdf': no such file\n"
+
+
+@pytest.mark.slow
+def test_an_arm_without_gripper_tours_and_keeps_what_was_said(tmp_path: Path) -> None:
+    home = "0,-0.6,1.8,0,1.9416,0"
+    words = ("--name", "desk", "--home", home, "--gripper", "none")
+    done = rack("robot", "new", DESK_ARM, *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "a tour of poses" in done.stdout
+    config = load(tmp_path / "desk" / "desk.toml")
+    assert config.robot is not None
+    assert config.robot.home == (0.0, -0.6, 1.8, 0.0, 1.9416, 0.0)
+    assert config.robot.tool == "tip"
+    assert config.robot.torque == (40.0, 60.0, 30.0, 10.0, 10.0, 6.0)
+    assert "home" not in config.robot.guessed
+    assert [action["do"] for action in config.task["action"]] == ["goto"] * 4 + ["home"]
+
+
+@pytest.mark.slow
+def test_of_two_arms_one_is_held_and_what_flies_is_left_out(tmp_path: Path) -> None:
+    text = DESK_ARM.read_text()
+    arm = text[text.index('<body name="turret"') : text.index("</worldbody>")]
+    second = arm.replace('name="', 'name="second_').replace('pos="0 0 .18"', 'pos="0 1.5 .18"')
+    cup = '<body name="cup" pos="1 1 1"><freejoint/><geom size=".02"/></body>'
+    both = text.replace("</worldbody>", f"{second}{cup}</worldbody>")
+    model = written(tmp_path, both, "both.xml")
+    words = ("--tip", "flange", "--name", "one", "--json")
+    done = rack("robot", "new", model, *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert any("cup" in note for note in json.loads(done.stdout)["notes"])
+    config = load(tmp_path / "one" / "one.toml")
+    assert config.robot is not None
+    assert config.robot.joints == ("waist", "shoulder", "elbow", "roll", "pitch", "twist")
+    assert "second_waist" not in (tmp_path / "one" / "one.xml").read_text()
+    assert 'name="second_turret"' in (tmp_path / "one" / "one.xml").read_text()

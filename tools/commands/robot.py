@@ -1,0 +1,217 @@
+"""`rack robot`: any arm, from a model file to a config that runs."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rack.boards.config import load, names
+from rack.levels.errors import RobotError
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json
+from rack.tools.console.tables import table, terminal_width
+
+if TYPE_CHECKING:
+    from rack.tools.robot.draft import Wishes
+    from rack.tools.robot.findings import Examined
+
+app = typer.Typer(
+    rich_markup_mode=None, no_args_is_help=True, help="Bring up any arm, from MJCF or URDF."
+)
+
+Model = Annotated[Path, typer.Argument(metavar="MODEL", help="model file: MJCF, or URDF")]
+ModelOrConfig = Annotated[
+    str, typer.Argument(metavar="MODEL|CONFIG", help="model file, or config by name or path")
+]
+Picture = Annotated[
+    Path | None, typer.Option(metavar="PNG", help="file of the picture; default: NAME.png")
+]
+MODELS = (".xml", ".urdf", ".mjcf")
+Tip = Annotated[
+    str, typer.Option(metavar="NAME", help="body or site at the end of the arm, if there are two")
+]
+Joints = Annotated[
+    str, typer.Option(metavar="J,J,...", help="joints of the arm, base to tool, in place of --tip")
+]
+Tool = Annotated[
+    str, typer.Option(metavar="NAME", help="site or body whose pose is the tool's, z outward")
+]
+Gripper = Annotated[
+    str, typer.Option(metavar="NAME|none", help="joint that drives the gripper, or none")
+]
+Home = Annotated[
+    str, typer.Option(metavar="NAME|Q,Q,...", help="keyframe, or positions of the joints, rad")
+]
+Torque = Annotated[
+    str, typer.Option(metavar="T,T,...", help="torque limits, N m, for a model without any")
+]
+Name = Annotated[str, typer.Option(metavar="NAME", help="name of the rack; default: the model's")]
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="new folder; default: NAME")]
+
+
+@app.command("new")
+def new(
+    model: Model,
+    name: Name = "",
+    tip: Tip = "",
+    joints: Joints = "",
+    tool: Tool = "",
+    gripper: Gripper = "",
+    home: Home = "",
+    torque: Torque = "",
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Write a folder with a config, a scene and a task for the arm of a model file.
+
+    What the model states is taken: the joints along the chain, their limits, torques of actuators
+    or of a URDF's efforts, a keyframe. The rest is found (the tool, a home free of contact, the
+    gripper's drive and what follows it, bodies that always overlap) or guessed: each guess is
+    named here, in the file, and in [robot] guessed. Two blocks on a table are moved, or, without a
+    gripper that can, poses toured; the planner has rehearsed it. On a terminal it asks for what
+    no option says.
+
+    Exit status: 0 written; 2 nothing can be made of the model, and nothing is written.
+
+    \b
+    Examples:
+      rack robot new panda.urdf && rack run panda
+      rack robot new cell.xml --tip left_hand --name left --home ready
+      rack robot new arm.xml --joints j1,j2,j3,j4,j5,j6 --gripper none --json
+    """
+    from rack.tools.robot.draft import Wishes
+
+    if sys.stdin.isatty() and sys.stdout.isatty() and not as_json:
+        name = name or _asked("name", _plain(model.stem))
+        tip = tip or (
+            "" if joints else _asked("body at the end of the arm, or nothing: the longest")
+        )
+        gripper = gripper or _asked("joint that drives the gripper, none, or nothing: found")
+        home = home or _asked("keyframe for home, positions, or nothing: found")
+    name = name or _plain(model.stem)
+    folder = out or Path(name)
+    if folder.exists():
+        raise Failure(f"--out: '{folder}' is there already; name a folder that is not", 2)
+    if name != _plain(name) or name in names():
+        why = "permitted: letters, digits, '-' and '_', and no bundled config's name"
+        raise Failure(f"--name = {name}: {why}", 2)
+    chain = tuple(filter(None, joints.split(",")))
+    wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque, "--torque"))
+    with TemporaryDirectory() as draft:
+        made = _made(model, wanted, Path(draft) / name, name)
+        shutil.copytree(Path(draft) / name, folder)
+    print_answer(made | {"folder": str(folder)}, _lines(made, folder, name), as_json)
+
+
+@app.command("check")
+def check(model: ModelOrConfig, out: Picture = None, as_json: Json = False) -> None:
+    """Examine an arm before it moves, and draw it: everything at once.
+
+    Of a config its arm, of a model file the arm that `rack robot new` would make of it: axes,
+    limits, reach, payload at the edge of its reach, contacts at home, bodies that nothing holds,
+    actuators by kind, coupling of the gripper, natural frequency, objects that fall without end.
+
+    Exit status: 0 all is well; 1 something fails; 2 nothing can be made of it.
+
+    \b
+    Examples:
+      rack robot check nasrem
+      rack robot check arm.urdf --out arm.png
+    """
+    with TemporaryDirectory() as folder:
+        try:
+            examined, name = _examined(model, Path(folder))
+        except RobotError as error:
+            raise Failure(str(error), 2) from None
+        from rack.tools.robot.picture import draw
+
+        picture = draw(examined.cell, out or Path(f"{name}.png"))
+    able = examined.able
+    document = {
+        "robot": name,
+        "joints": examined.joints,
+        "reach_m": round(able.reach, 3),
+        "payload_kg": round(able.payload, 3),
+        "findings": [asdict(finding) for finding in examined.findings],
+        "picture": picture,
+    }
+    print_answer(document, _report(document), as_json)
+    sys.exit(1 if any(finding.fails for finding in examined.findings) else 0)
+
+
+def _examined(given: str, folder: Path) -> tuple[Examined, str]:
+    """Return the arm of a config or a model, and its name. Raises `RobotError`."""
+    from rack.tools.robot.draft import CLOCK_NS, NOTHING, Wishes, draft
+    from rack.tools.robot.findings import examine
+    from rack.tools.robot.source import read_source
+
+    if Path(given).suffix.lower() in MODELS:
+        made = draft(read_source(Path(given)), Wishes(), folder, "arm")
+        return examine(made.robot, NOTHING, CLOCK_NS), _plain(Path(given).stem)
+    config = load(given)
+    if config.robot is None:
+        raise RobotError(f"config '{given}' has no [robot]")
+    return examine(config.robot, config.scene, config.clock_ns), config.name
+
+
+def _report(found: dict[str, Any]) -> Iterator[str]:
+    head = list(found["joints"][0])
+    rows = [[str(row[key]) for key in head] for row in found["joints"]]
+    yield from table(head, rows, terminal_width())
+    yield f"reach {found['reach_m']} m, payload {found['payload_kg']} kg wherever it reaches"
+    for finding in found["findings"]:
+        yield f"{'FAILS' if finding['fails'] else 'ok'}  {finding['about']}: {finding['text']}"
+    yield f"picture: {found['picture']}"
+
+
+def _asked(text: str, default: str = "") -> str:
+    return str(typer.prompt(text, default, show_default=bool(default))).strip()
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "arm"
+
+
+def _numbers(text: str, option: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(number) for number in text.split(",") if text)
+    except ValueError:
+        raise Failure(f"{option} = {text}: not numbers, as in 80,80,12", 2) from None
+
+
+def _made(model: Path, wanted: Wishes, folder: Path, name: str) -> dict[str, Any]:
+    """Write the folder of an arm; return what it is. Raises `Failure`."""
+    from rack.tools.robot.assignment import lay_out
+    from rack.tools.robot.draft import draft
+    from rack.tools.robot.folder import config_text, document
+    from rack.tools.robot.picture import NO_PICTURE, draw
+    from rack.tools.robot.source import read_source
+
+    folder.mkdir()
+    try:
+        made = draft(read_source(model), wanted, folder, name)
+        layout = lay_out(made)
+    except RobotError as error:
+        raise Failure(str(error), 2) from None
+    (folder / f"{name}.toml").write_text(config_text(made, layout, name, model), encoding="utf-8")
+    picture = draw(made.cell(layout.scene), folder / f"{name}.png")
+    if picture == NO_PICTURE:
+        made.notes.append(picture)
+    return document(made, layout, folder, name)
+
+
+def _lines(made: dict[str, Any], folder: Path, name: str) -> Iterator[str]:
+    yield f"{folder}: {len(made['joints'])} joints, {', '.join(made['joints'])}; {made['task']}"
+    yield from made["notes"]
+    for key, why in made["guessed"].items():
+        yield f"guessed: {key}: {why}"
+    ways = name if folder == Path(name) else folder / f"{name}.toml"
+    yield f"rack run {ways}"

@@ -1,0 +1,328 @@
+"""From a model to a `[robot]` table: what the model states is taken, the rest found or guessed, and
+each guess named."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from pydantic import ValidationError
+
+from rack.levels.algebra import Array
+from rack.levels.errors import RobotError
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.ik import sampling_range
+from rack.levels.robot.abilities import Statics
+from rack.levels.robot.cell import Cell, unchecked_cell
+from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
+from rack.levels.tables import RobotConfig, SceneConfig
+from rack.tools.robot.arm import ArmParts, find_arm, hold
+from rack.tools.robot.gripper import Fingertips, find_fingertips, fit_fingers, tool_outward
+from rack.tools.robot.source import Source, copy_model
+
+CLOCK_NS = 2_500_000
+"""Of `nasrem`, whose levels and boards the arm gets."""
+SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
+"""Guesses, rad/s and m/s."""
+SPEED_UP_S = 0.5
+"""Time to full speed of planned motion, where the motors can; jerk follows, ten times in a
+second."""
+LEAST_PART = 0.2
+"""Part of each torque that gravity must leave at home."""
+ROOM = 2.0
+"""A guessed torque in the weights and inertia that it moves."""
+DRAG_PART = 0.4
+"""Of the torque that gravity leaves, for friction at a guessed velocity."""
+POSES = 400
+SKIN_M = 1e-4
+"""What is closer counts as in contact: planning would find no way there."""
+APART_M = 0.005
+"""Home is rather where nothing is closer: a linkage settles a little off its equalities."""
+ALWAYS = 0.95
+"""Bodies in contact in so many poses are neighbours, whose shapes overlap."""
+TOOLS = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
+"""Parts of the names of frames at the end of an arm, the best first."""
+NOTHING = SceneConfig()
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user says of an arm; empty: find it."""
+
+    tip: str = ""
+    joints: tuple[str, ...] = ()
+    tool: str = ""
+    gripper: str = ""
+    home: str = ""
+    torque: tuple[float, ...] = ()
+
+
+@dataclass
+class Draft:
+    """An arm as far as it is known."""
+
+    model: Path  # of its own
+    spec: mujoco.MjSpec  # the same, or what it is to be
+    wanted: Wishes
+    arm: ArmParts
+    starts: Mapping[str, Array]  # positions of the arm's joints, by the names of keyframes
+    guessed: dict[str, str] = field(default_factory=dict)  # by key, what was guessed
+    notes: list[str] = field(default_factory=list)
+    table: dict[str, Any] = field(default_factory=dict)
+    jaws: Fingertips | None = None  # None: nothing can be taken
+
+    @property
+    def robot(self) -> RobotConfig:
+        """The table as it is now. Raises `RobotError`."""
+        try:
+            return RobotConfig(**self.table, guessed=tuple(self.guessed))
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"]))
+            raise RobotError(f"robot.{key} = {first['input']}: {first['msg'].lower()}") from None
+
+    def cell(self, scene: SceneConfig = NOTHING) -> Cell:
+        """Return the cell as it is now. Raises `RobotError`."""
+        return unchecked_cell(self.robot, scene, CLOCK_NS)
+
+    def write_model(self) -> None:
+        """Write the model. Raises `RobotError`."""
+        compile_spec(self.spec, self.model)
+        self.model.write_text(self.spec.to_xml(), encoding="utf-8")
+
+    def hold(self, joints: Sequence[str]) -> list[str]:
+        """Hold all joints but these; return the bodies that are left out, since they fly."""
+        left = hold(self.model, joints)
+        self.spec = load_spec(self.model)
+        return left
+
+    def search_home(self, scene: SceneConfig = NOTHING) -> None:
+        """Set home to a free pose in which the arm carries itself. Raises `RobotError`."""
+        self.table["home"], guess = _home(self.cell(scene), scene, self.starts, self.wanted.home)
+        self.guessed.pop("home", None)
+        if guess:
+            self.guessed["home"] = guess
+
+
+def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
+    """Return the arm of a model. Raises `RobotError`, one line."""
+    model = source.compiled()
+    arm = find_arm(model, wanted.tip, wanted.joints)
+    addresses = [model.joint(joint).qposadr[0] for joint in arm.joints]
+    starts = {
+        model.key(k).name or f"key {k}": model.key_qpos[k][addresses] for k in range(model.nkey)
+    }
+    fingers = () if wanted.gripper == "none" else arm.fingers
+    path = folder / f"{name}.xml"
+    copy_model(source, path)
+    made = Draft(path, source.spec, wanted, arm, starts, notes=list(source.notes))
+    if left := made.hold((*arm.joints, *fingers)):
+        made.notes.append(f"left out, as nothing holds it: {listed(left)}")
+    if arm.others:
+        others = listed(list(arm.others))
+        made.notes.append(f"held: what begins at {others}; --tip chooses another arm")
+    spec = made.spec
+    kinds = [spec.joint(joint).type for joint in arm.joints]
+    known = source.velocity
+    velocity = [known.get(j, SPEED[kind]) for j, kind in zip(arm.joints, kinds, strict=True)]
+    missing = [joint for joint in arm.joints if joint not in known]
+    if missing:
+        made.guessed["velocity"] = f"the model states none for {listed(missing)}"
+    stated = [stated_torque(spec, joint, spec.actuators) for joint in arm.joints]
+    if not (any(stated) or wanted.torque or _driven(spec, arm.joints)):
+        why = "no actuator and no effort"
+        raise RobotError(f"{why} at {listed(list(arm.joints))}; --torque T,... states the limits")
+    made.table = {
+        "model": path,
+        "joints": arm.joints,
+        "tool": _mount(compile_spec(spec, path), arm.tip, wanted.tool),
+        "home": [0.0] * len(arm.joints),
+        "velocity": velocity,
+        "acceleration": velocity,
+        "jerk": velocity,
+        "torque": list(wanted.torque or (limit or 1e6 for limit in stated)),
+    }
+    if fingers:
+        _add_gripper(made)
+    _exclude(made)
+    if not wanted.tool and made.jaws is None:
+        tool, offset = tool_outward(made.cell(), made.table["tool"])
+        made.table |= {"tool": tool, "tool_offset": offset}
+        made.guessed["tool"] = "z along the last joint, outward"
+    unknown = [not limit for limit in wanted.torque or stated]
+    _dimension(made, unknown, [joint in missing for joint in arm.joints])
+    made.search_home()
+    return made
+
+
+def _driven(spec: mujoco.MjSpec, joints: Sequence[str]) -> bool:
+    return any(actuator.target in joints for actuator in spec.actuators)
+
+
+def _mount(model: mujoco.MjModel, tip: str, wanted: str) -> str:
+    """Return the body or site that ends an arm."""
+    if wanted:
+        return wanted
+    carried = [model.body(tip).id]
+    for body in range(carried[0] + 1, model.nbody):
+        if model.body_parentid[body] in carried and not model.body_jntnum[body]:
+            carried.append(body)
+    names = [model.body(body).name for body in carried]
+    named = [name for part in TOOLS for name in names[1:] if part in name.lower()]
+    return str((named or names[-1:])[0])
+
+
+def _add_gripper(made: Draft) -> None:
+    """Add the gripper that the arm carries, if it can be used, and the tool between its fingers."""
+    wanted = made.wanted.gripper
+    arm = made.arm
+    if wanted and wanted not in arm.fingers:
+        raise RobotError(
+            f"--gripper: no joint '{wanted}' beyond the arm; {listed(list(arm.fingers))}, none"
+        )
+    try:
+        config, is_known = fit_fingers(made.spec, compile_spec(made.spec, made.model), arm, wanted)
+        made.table["gripper"] = config
+        made.write_model()
+        jaws = find_fingertips(made.cell(), arm.tip)
+        if jaws is None:
+            raise RobotError("no two fingers that close on a block between them")
+    except RobotError as error:
+        made.notes.append(f"no gripper: {error}")
+        made.table.pop("gripper", None)
+        made.write_model()
+        made.hold(arm.joints)
+        return
+    made.guessed["gripper"] = "stiffness and damping" + ("" if is_known else ", force")
+    made.jaws = jaws
+    made.table["gripper"] = config.model_copy(update={"open": round(jaws.opening, 5)})
+    if not made.wanted.tool:
+        made.table |= {"tool": arm.tip, "tool_offset": jaws.tool}
+        made.guessed["tool"] = "between the fingers, z out of the hand, y across"
+
+
+def _exclude(made: Draft) -> None:
+    """Exclude contacts of bodies whose shapes always overlap."""
+    cell = made.cell()
+    cell.model.geom_margin[:] = SKIN_M
+    data = cell.start()
+    count: Counter[tuple[str, str]] = Counter()
+    for q in poses(cell):
+        count.update(touching(cell, data, q))
+    pairs = tuple(sorted(pair for pair, n in count.items() if n >= ALWAYS * POSES))
+    if pairs:
+        made.table["exclude"] = pairs
+        made.guessed["exclude"] = "these bodies overlap in every pose"
+
+
+def poses(cell: Cell) -> list[Array]:
+    """Return poses all over the joints' ranges, (joints,), rad."""
+    low, high = sampling_range(cell)
+    edge = 0.1 * (high - low)
+    drawn = np.random.default_rng(0).uniform(low + edge, high - edge, (POSES, len(low)))
+    return list(drawn)
+
+
+def touching(
+    cell: Cell, data: mujoco.MjData, q: Array, skin_m: float = SKIN_M
+) -> set[tuple[str, str]]:
+    """Return the pairs of bodies in unintended contact at `q`, or closer than `skin_m`, if geoms
+    have that margin."""
+    model = cell.model
+    data.qpos[cell.qpos] = q
+    mujoco.mj_fwdPosition(model, data)
+    pairs = data.contact.geom[data.contact.dist < skin_m]
+    bodies = model.geom_bodyid[pairs[cell.touch[pairs[:, 0], pairs[:, 1]]]]
+    names = [sorted(str(model.body(body).name) for body in pair) for pair in bodies]
+    return {(first, second) for first, second in names}
+
+
+def _dimension(made: Draft, unknown: list[bool], guessed: list[bool]) -> None:
+    """Set the torques that are unknown, the velocities that are guessed, and accelerations that the
+    motors can give."""
+    cell = made.cell()
+    dynamics = Dynamics(cell)
+    velocity = np.array(made.table["velocity"])
+    weight, drag, inertia = np.zeros((3, len(velocity)))
+    for q in poses(cell):
+        # The terms are views of one array.
+        bias, still = (dynamics.terms(q, v).bias.copy() for v in (velocity, 0.0 * velocity))
+        weight = np.maximum(weight, np.abs(still))
+        drag = np.maximum(drag, np.abs(bias - still))
+        inertia = np.maximum(inertia, np.diag(dynamics.terms(q, velocity).inertia))
+    weight = weight + np.abs(dynamics.friction(velocity))
+    wanted = velocity / SPEED_UP_S
+    torque = np.array(made.table["torque"])
+    torque = np.where(unknown, ROOM * (weight + drag + inertia * wanted), torque)
+    if any(unknown):
+        made.guessed["torque"] = f"{ROOM:g} times what weight, friction and inertia take"
+    room = torque - weight
+    slower = np.clip(DRAG_PART * room / np.maximum(drag, 1e-9), LEAST_PART, 1.0)
+    slower = np.where(guessed, slower, 1.0)
+    drag = slower * drag
+    made.table["velocity"] = _rounded(slower * velocity)
+    acceleration = np.clip(0.5 * (room - drag) / inertia, 0.1 * wanted, wanted)
+    made.guessed["acceleration"] = made.guessed["jerk"] = "by the torques"
+    made.table["torque"] = _rounded(torque)
+    made.table["acceleration"] = _rounded(acceleration)
+    made.table["jerk"] = _rounded(10.0 * acceleration)
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{value:.3g}") for value in values]
+
+
+def _home(
+    cell: Cell, scene: SceneConfig, starts: Mapping[str, Array], wanted: str
+) -> tuple[list[float], str]:
+    """Return home, and why if it is a guess: a keyframe that serves, or the best pose that does.
+    Raises `RobotError`."""
+    checker = CollisionChecker(cell, scene)
+    statics = Statics(cell)
+    low, high = cell.limits.position.T
+
+    def left(q: Array) -> float:
+        """Return the part of the torques that gravity leaves; negative: the pose does not serve."""
+        if not (np.all(q >= low) and np.all(q <= high) and checker.free(q, 0.0)):
+            return -1.0
+        return float(statics.held(q)[0].min()) - LEAST_PART
+
+    if wanted and wanted not in starts:
+        try:
+            return [float(value) for value in wanted.split(",")], ""
+        except ValueError:
+            known = listed(list(starts))
+            raise RobotError(
+                f"--home: '{wanted}' is no keyframe: {known}; valid, too: q1,q2,..."
+            ) from None
+    named = sorted(starts, key=lambda name: name != (wanted or "home"))
+    for name in named:
+        if left(starts[name]) > 0:
+            return starts[name].round(5).tolist(), ""
+    data = cell.start()
+    cell.model.geom_margin[:] = 0.5 * APART_M  # of two geoms they add up
+
+    def rating(q: Array) -> float:
+        is_near = bool(touching(cell, data, q, APART_M))
+        return left(q) + _downward(checker, cell, q) - 2.0 * is_near
+
+    found = [(rating(q), q) for q in poses(cell) if left(q) > 0]
+    if not found:
+        raise RobotError(
+            "no pose is free of contact and carries itself; --home q1,q2,... states one"
+        )
+    best = max(found, key=lambda pair: pair[0])[1]
+    return best.round(4).tolist(), "free of contact, the tool as far down as found"
+
+
+def _downward(checker: CollisionChecker, cell: Cell, q: Array) -> float:
+    """Return how far the tool points down, -1 to 1."""
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, checker.tool_at(q).quaternion)
+    return -float(turned[8])

@@ -1,0 +1,144 @@
+"""What is to be known of an arm before it moves: its joints, what it can do, and what is wrong."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from rack.levels.robot.abilities import Abilities, Statics, abilities
+from rack.levels.robot.cell import Cell, unchecked_cell
+from rack.levels.robot.model import load_spec
+from rack.levels.tables import RobotConfig, SceneConfig
+from rack.levels.task.program import DOWN
+from rack.tools.robot.draft import touching
+
+MOST_TURN = 0.5
+"""Angle of the fastest vibration in one step, rad, at which its simulation is sound."""
+MOST_RESIDUAL = 1e-3
+"""Of an equality in the gripper's linkage, m or rad."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One thing that was looked at."""
+
+    about: str
+    text: str
+    fails: bool
+
+
+@dataclass(frozen=True)
+class Examined:
+    """An arm, examined."""
+
+    cell: Cell
+    joints: list[dict[str, Any]]
+    able: Abilities
+    findings: list[Observation]
+
+
+def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
+    """Examine an arm in its cell; contacts at home are found, not refused. Raises `RobotError`."""
+    cell = unchecked_cell(robot, scene, clock_ns)
+    able = abilities(cell)
+    findings = list(_findings(cell, robot, able))
+    return Examined(cell, list(_joints(cell, robot)), able, findings)
+
+
+def _joints(cell: Cell, robot: RobotConfig) -> Iterator[dict[str, Any]]:
+    data = cell.start()
+    left, _ = Statics(cell).held(cell.home)
+    for k, name in enumerate(robot.joints):
+        joint = cell.model.dof_jntid[cell.dof[k]]
+        yield {
+            "joint": name,
+            "axis": (data.xaxis[joint] + 0.0).round(2).tolist(),
+            "low": round(float(cell.bounds.position[k, 0]), 3),
+            "high": round(float(cell.bounds.position[k, 1]), 3),
+            "velocity": float(cell.bounds.velocity[k]),
+            "torque": float(cell.bounds.torque[k]),
+            "home": float(cell.home[k]),
+            "gravity_part": round(1.0 - float(left[k]), 2),
+        }
+
+
+def _findings(cell: Cell, robot: RobotConfig, able: Abilities) -> Iterator[Observation]:
+    model = cell.model
+    data = cell.start()
+    low, high = cell.limits.position.T
+    off = [
+        n for n, q, a, b in zip(robot.joints, cell.home, low, high, strict=True) if not a <= q <= b
+    ]
+    yield Observation("home", f"outside its limits: {', '.join(off) or 'no joint'}", bool(off))
+    weak = able.left < 0.0
+    held = f"gravity takes {100 * (1 - able.left):.0f} % of '{robot.joints[able.joint]}' at worst"
+    yield Observation("weight", held, weak)
+    pairs = sorted(" and ".join(pair) for pair in touching(cell, data, cell.home))
+    yield Observation("contacts at home", ", ".join(pairs) or "none", bool(pairs))
+    known = {*cell.qpos, *cell.object_qpos}
+    if cell.gripper is not None:
+        known |= {cell.gripper.linkage.driven, *cell.gripper.linkage.joints}
+    loose = {
+        int(model.jnt_bodyid[k]) for k in range(model.njnt) if model.jnt_qposadr[k] not in known
+    }
+    names = sorted(model.body(body).name for body in loose)
+    yield Observation("bodies that nothing holds", ", ".join(names) or "none", bool(names))
+    kinds = Counter(map(_kind, load_spec(robot.model).actuators))
+    yield Observation(
+        "actuators", ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "none", False
+    )
+    if cell.gripper is not None:
+        residual = _residual(cell)
+        text = f"equalities {1e3 * residual:.2g} mm or mrad off at most"
+        yield Observation("coupling", text, residual > MOST_RESIDUAL)
+    turn, spring = _fastest(cell)
+    needed = int(np.ceil(robot.substeps * turn / MOST_TURN)) or 1
+    text = f"{spring:.3g} Hz at most; {needed} of {robot.substeps} substeps are enough"
+    yield Observation("natural frequency", text, needed > robot.substeps)
+    below = np.full(1, -1, dtype=np.int32)
+    for body in cell.bodies[: len(cell.object_qpos)]:
+        mujoco.mj_ray(model, data, data.xpos[body], np.array(DOWN), None, 1, int(body), below)
+        if below[0] < 0:
+            yield Observation("objects", f"'{model.body(body).name}' falls without end", True)
+    if robot.guessed:
+        yield Observation("guessed", ", ".join(robot.guessed), False)
+
+
+def _kind(actuator: mujoco.MjsActuator) -> str:
+    if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
+        return "motor"
+    return "position" if actuator.biasprm[1] else "velocity"
+
+
+def _residual(cell: Cell) -> float:
+    """Return the largest error of an equality while the gripper closes, m or rad."""
+    gripper = cell.gripper
+    assert gripper is not None, "there is one"
+    data = cell.start()
+    worst = 0.0
+    for opening in gripper.linkage.openings:
+        gripper.linkage.set(data.qpos, float(opening))
+        mujoco.mj_fwdPosition(cell.model, data)
+        equal = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        worst = max(worst, float(np.max(np.abs(data.efc_pos[equal]), initial=0.0)))
+    return worst
+
+
+def _fastest(cell: Cell) -> tuple[float, float]:
+    """Return the fastest vibration against springs and the gripper's loop: its angle in a step,
+    rad, and its frequency, Hz."""
+    model = cell.model
+    data = cell.start()
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    stiffness = model.jnt_stiffness[model.dof_jntid].copy()
+    if cell.gripper is not None:
+        stiffness[cell.gripper.dof] += cell.gripper.stiffness
+    squared = np.linalg.eigvals(np.linalg.solve(inertia, np.diag(stiffness))).real.max(initial=0.0)
+    speed = float(np.sqrt(max(squared, 0.0)))
+    return speed * model.opt.timestep, speed / (2.0 * np.pi)

@@ -1,0 +1,71 @@
+"""A picture of an arm at home, as MuJoCo draws it: axes of the joints, the tool, contacts."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.robot.cell import Cell
+
+WIDTH = 960
+HEIGHT = 600
+MOST_SHAPES = 5000
+SHOWN = (mujoco.mjtVisFlag.mjVIS_JOINT, mujoco.mjtVisFlag.mjVIS_CONTACTPOINT)
+NO_PICTURE = "no picture: it needs OpenGL (EGL); on Debian: libegl1 libgl1-mesa-dri"
+
+
+def draw(cell: Cell, path: Path) -> str:
+    """Draw the arm of a cell at home to a PNG file; return its path, or why there is none."""
+    model = cell.model
+    data = cell.start()
+    model.vis.global_.offwidth = WIDTH
+    model.vis.global_.offheight = HEIGHT
+    model.vis.headlight.ambient = [0.35, 0.35, 0.35]
+    model.vis.headlight.diffuse = [0.6, 0.6, 0.6]
+    try:
+        from mujoco.egl import GLContext
+
+        context = GLContext(WIDTH, HEIGHT)
+        context.make_current()
+        drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    except (AttributeError, ImportError, RuntimeError, mujoco.FatalError):
+        return NO_PICTURE
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawn)
+    option = mujoco.MjvOption()
+    option.flags[np.array(SHOWN, dtype=int)] = True
+    option.frame = mujoco.mjtFrame.mjFRAME_SITE
+    option.label = mujoco.mjtLabel.mjLABEL_JOINT
+    camera = mujoco.MjvCamera()
+    joints = data.xanchor[cell.model.dof_jntid[cell.dof]]
+    arm = np.vstack((joints, data.site_xpos[cell.tool]))
+    camera.lookat = np.mean([arm.min(axis=0), arm.max(axis=0)], axis=0)
+    camera.distance = 2.2 * float(np.linalg.norm(np.ptp(arm, axis=0))) + 0.2
+    camera.azimuth = 135.0
+    camera.elevation = -25.0
+    scene = mujoco.MjvScene(model, MOST_SHAPES)
+    every = mujoco.mjtCatBit.mjCAT_ALL
+    mujoco.mjv_updateScene(model, data, option, None, camera, every, scene)
+    pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    window = mujoco.MjrRect(0, 0, WIDTH, HEIGHT)
+    mujoco.mjr_render(window, scene, drawn)
+    mujoco.mjr_readPixels(pixels, None, window, drawn)
+    drawn.free()
+    context.free()
+    path.write_bytes(_png(pixels[::-1]))
+    return str(path)
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    """Return pixels (height, width, 3) as a PNG file: every row unfiltered."""
+    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (1, 0)))
+    head = struct.pack(">IIBBBBB", pixels.shape[1], len(pixels), 8, 2, 0, 0, 0)
+    found = b"\x89PNG\r\n\x1a\n"
+    for kind, body in ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")):
+        check = struct.pack(">I", zlib.crc32(kind + body))
+        found += struct.pack(">I", len(body)) + kind + body + check
+    return found
