@@ -107,6 +107,11 @@ def children_of(pid: int) -> list[int]:
     return []
 
 
+def own_can_channel() -> str:
+    """Return the address of a CAN bus on UDP multicast that no other process of tests uses."""
+    return f"239.75.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+
+
 def descriptors() -> int:
     """Return how many files this process has open and in use."""
     gc.collect()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import RACK
+from tests.processes import RACK, own_can_channel
 
 pytestmark = pytest.mark.thorough
 
@@ -22,6 +22,8 @@ RACK_NAME = re.compile(r"""^(\W*name ?= ?["'])([\w-]+)""", re.MULTILINE)
 RECORDED = ("own-arm", "own-level")
 """Examples whose recording differs from that of every other rack: another arm, and messages of the
 user's own."""
+REAL_TIME = ("can-arm",)
+"""Examples that run in real time alone."""
 PROGRAMS = {"rack": RACK, "python": (sys.executable,)}
 
 
@@ -32,8 +34,14 @@ def commands(folder: Path) -> list[list[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FOLDERS)
-def test_example_runs_as_its_readme_says(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.alone] * (name in REAL_TIME)) for name in FOLDERS],
+)
+def test_example_runs_as_its_readme_says(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAN_CHANNEL", own_can_channel())
     folder = Path(shutil.copytree(EXAMPLES / name, tmp_path / name))
     for path in (*folder.glob("*.toml"), *folder.glob("*.py")):
         path.write_text(RACK_NAME.sub(rf"\1\2-{os.getpid()}", path.read_text(), count=1))

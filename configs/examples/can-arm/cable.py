@@ -1,0 +1,75 @@
+"""The cable from a drive to the bus, and what may be wrong with it."""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable
+from enum import IntEnum
+from time import monotonic, time
+
+import can
+from wire import DISTURB, SPAN, Frame, receive, send
+
+
+class Disturbance(IntEnum):
+    """What may be wrong with a drive or its cable; in brackets its size."""
+
+    NONE = 0
+    UNPLUGGED = 1
+    BUS_OFF = 2  # the drive's controller takes no part in the bus
+    LATE = 3  # [s] frames come, and are answered, so late
+    LOST = 4  # [part of the frames]
+    DOUBLED = 5
+    TOO_HOT = 6
+    RESET = 7
+
+
+class Cable:
+    """Passes frames between a drive and the bus."""
+
+    def __init__(self, bus: can.BusABC, node: int) -> None:
+        self._bus = bus
+        self._node = node
+        self._random = random.Random(node)
+        self._kind = Disturbance.NONE
+        self._size = 0.0
+        self._until_s = 0.0
+        self._coming: deque[Frame] = deque()
+
+    @property
+    def disturbance(self) -> Disturbance:
+        """What is wrong now."""
+        return self._kind if monotonic() < self._until_s else Disturbance.NONE
+
+    def send(self, kind: int, data: bytes) -> None:
+        """Send a frame of the drive's."""
+        for _ in range(self._times()):
+            send(self._bus, kind, self._node, data)
+
+    def receive(self, take: Callable[[Frame], None]) -> None:
+        """Give what has come to `take`, in order, each frame with its time by CLOCK_MONOTONIC."""
+        late_s = self._size if self.disturbance is Disturbance.LATE else 0.0
+        # Of arrival, by the kernel: that this process looks later makes no difference to the drive.
+        epoch_s = time() - monotonic() - late_s
+        for frame in receive(self._bus):
+            if (frame.kind, frame.node) == (DISTURB, self._node):
+                self._disturb(*SPAN.unpack_from(frame.data))
+            else:
+                self._coming += [frame._replace(time_s=frame.time_s - epoch_s)] * self._times()
+        while self._coming and self._coming[0].time_s <= monotonic():
+            take(self._coming.popleft())
+
+    def _disturb(self, kind: int, seconds: float, size: float) -> None:
+        self._kind = next((known for known in Disturbance if known == kind), Disturbance.NONE)
+        self._size = size
+        self._until_s = monotonic() + seconds
+
+    def _times(self) -> int:
+        """Return how often a frame comes out of the cable."""
+        kind = self.disturbance
+        if kind in (Disturbance.UNPLUGGED, Disturbance.BUS_OFF):
+            return 0
+        if kind is Disturbance.LOST and self._random.random() < self._size:
+            return 0
+        return 2 if kind is Disturbance.DOUBLED else 1

@@ -1,0 +1,173 @@
+"""An arm whose drives hang on CAN: the rack's side of the bus."""
+
+from __future__ import annotations
+
+import numpy as np
+import wire
+from wire import Control, Power, Report
+
+from rack.backplane.message import Message
+from rack.levels.algebra import Array
+from rack.levels.arm import Arm, DriveState, Sensed
+from rack.levels.errors import LevelError
+from rack.levels.level import Finding
+from rack.levels.robot.cell import Cell
+from rack.levels.tables import SceneConfig
+
+INCOMPLETE = 20
+"""Most ticks of which reports are kept until those of all drives are there."""
+ANSWER_S = 5.0
+"""Time in which drives must answer when they are to be enabled: they may still be booting."""
+ON = (Power.SWITCHED_ON, Power.OPERATION_ENABLED)
+UP: dict[int, Control] = {
+    Power.SWITCH_ON_DISABLED: Control.SHUT_DOWN,
+    **dict.fromkeys((Power.READY_TO_SWITCH_ON, *ON), Control.SWITCH_ON),
+}
+"""What switches a drive on, its brake engaged, by its state."""
+
+
+class CanArm(Arm):
+    """Sends a SYNC and a command in every cycle, and takes the reports that have come; waits for
+    nothing.
+
+    The newest sample is that of the newest SYNC which all drives have answered. The arm is enabled
+    while all drives are switched on. One that then leaves this state, reports a fault, or is not
+    heard of, is a fault of the arm, and the power is taken from all others.
+    """
+
+    def __init__(
+        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
+    ) -> None:
+        super().__init__(cell, scene, clock_ns, every, seed)
+        self._rate_hz = 1e9 / clock_ns
+        self._joints = len(cell.home)
+        if self._joints > wire.MOST_DRIVES:
+            raise LevelError(f"{self._joints} joints; a command has room for {wire.MOST_DRIVES}")
+        self._sample = Sensed(cell.home.copy(), np.zeros(self._joints), 0.0, 0.0, -1)
+        self._coming: dict[int, dict[int, Report]] = {}  # by tick and joint
+        self._newest: dict[int, Report] = {}  # by joint
+        self._heard = [0.0] * self._joints  # tick
+        self._beat = 0.0  # tick of the next heartbeat
+        self._reset_until = 0.0  # tick
+        self._wanted = False  # enabled
+        self._bus = wire.open_bus()
+
+    def sense(self) -> Sensed:
+        """Return the newest sample."""
+        return self._sample
+
+    def drive(self, torque: Array, grip_force: float) -> Finding | None:
+        """Command torques; brake on one that no drive may be given."""
+        finding = self.refused(torque)
+        if finding is not None:
+            self.brake()
+            return finding
+        self.torque = torque.copy()
+        self.waited = 0
+        self.braked = False
+        self._command([Control.ENABLE_OPERATION] * self._joints)
+        return None
+
+    def brake(self) -> None:
+        """Engage the brakes."""
+        self.torque = np.zeros(self._joints)
+        self.braked = True
+        self._command([self._control(joint) for joint in range(self._joints)])
+
+    def step(self, ticks: int) -> None:
+        """Let time pass: take what has come, and ask for the next sample."""
+        self.tick += ticks
+        self.waited += ticks
+        self.braked = self.braked or self.waited >= self.patience
+        for frame in wire.receive(self._bus):
+            if 0 < frame.node <= self._joints:
+                self._take(frame.node - 1, frame)
+        self._judge()
+        wire.send(self._bus, wire.SYNC, 0, wire.TICK.pack(self.tick))
+        if self.tick >= self._beat:
+            self._beat = self.tick + wire.HEARTBEAT_S * self._rate_hz
+            wire.send(self._bus, wire.HEARTBEAT, wire.RACK, wire.OPERATIONAL)
+
+    def enable(self) -> None:
+        """Ask the drives for torque."""
+        self._want()
+        self.state = DriveState.ENABLING
+
+    def disable(self) -> None:
+        """Take the power from the drives."""
+        self._wanted = False
+        self.state = DriveState.DISABLED
+        self.brake()
+
+    def reset(self) -> None:
+        """Let drives leave their fault."""
+        if self.state is DriveState.FAULT:
+            self.fault = ""
+            self.state = DriveState.DISABLED
+            self._reset_until = self.tick + wire.SILENT_S * self._rate_hz
+
+    def restore(self, state: Message) -> None:
+        """Continue: the drives are as they were, but for what their watchdogs have done."""
+        super().restore(state)
+        if self.state is not DriveState.DISABLED:
+            self._want()
+
+    def _want(self) -> None:
+        self._wanted = True
+        self._newest.clear()  # of drives that are not heard of any more, too
+        self._heard = [self.tick + ANSWER_S * self._rate_hz] * self._joints
+
+    def _command(self, control: list[Control]) -> None:
+        wire.send(self._bus, wire.COMMAND, 0, wire.command(self.tick, control, self.torque))
+
+    def _control(self, joint: int) -> Control:
+        """Return what leads a drive, its brake engaged, to where it is wanted."""
+        if self._wanted and joint not in self._newest:
+            # It may be on, as after a restart of the board: that takes nothing from it but torque.
+            return Control.SWITCH_ON
+        power = self._newest[joint].power if joint in self._newest else Power.FAULT
+        if power == Power.FAULT and self.tick < self._reset_until:
+            return Control.RESET_FAULT
+        return UP.get(power, Control.DISABLE_VOLTAGE) if self._wanted else Control.DISABLE_VOLTAGE
+
+    def _take(self, joint: int, frame: wire.Frame) -> None:
+        self._heard[joint] = self.tick
+        if frame.kind != wire.STATUS:
+            return
+        report = Report(*wire.REPORT.unpack_from(frame.data))
+        # Older ones were late; one from the future is of another run.
+        if not self._sample.tick < report.tick <= self.tick:
+            return
+        self._newest[joint] = report
+        reports = self._coming.setdefault(report.tick, {})
+        reports[joint] = report
+        if len(reports) == self._joints:
+            table = wire.UNIT * np.array([reports[j][-2:] for j in range(self._joints)]).T
+            self._sample = Sensed(table[0].copy(), table[1].copy(), 0.0, 0.0, report.tick)
+            self._coming = {tick: r for tick, r in self._coming.items() if tick > report.tick}
+        elif len(self._coming) > INCOMPLETE:
+            del self._coming[min(self._coming)]
+
+    def _judge(self) -> None:
+        """Set `state`, and `fault`, by what the drives report."""
+        on = sum(report.power in ON for report in self._newest.values())
+        if fault := self._broken():
+            self.fault = self.fault or fault
+            self.state = DriveState.FAULT
+            self._wanted = False
+        elif self._wanted and on == self._joints:
+            self.state = DriveState.ENABLED
+
+    def _broken(self) -> str:
+        """Return what is wrong with a drive."""
+        silent = self.tick - wire.SILENT_S * self._rate_hz
+        for joint, heard in enumerate(self._heard):
+            if self._wanted and heard < silent:
+                return f"drive {joint + 1}: no heartbeat"
+        for joint, report in self._newest.items():
+            if report.power == Power.FAULT and self.tick >= self._reset_until:
+                why = wire.FAULTS.get(report.fault, "unknown fault")
+                return f"drive {joint + 1}: {why} ({report.fault:#x})"
+            if self.state is DriveState.ENABLED and report.power not in ON:
+                return f"drive {joint + 1}: has lost its power"
+        return ""
