@@ -7,9 +7,10 @@ from collections.abc import Collection
 from contextlib import suppress
 
 from rack.backplane import semaphores
+from rack.backplane.address_map import HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import SegmentError
-from rack.backplane.segment import Segment, racks, stranger, unlink
+from rack.backplane.segment import Segment, racks, shm_path, stranger, unlink
 from rack.backplane.words import Head
 
 
@@ -20,18 +21,29 @@ def remove_dead(rack: str) -> bool:
     """
     if rack not in racks():
         return False
+    if _is_too_small(rack):
+        unlink(rack)
+        return True
     try:
         segment = Segment.open(rack)
     except SegmentError:
-        if stranger(rack) is not None:
+        if rack in racks():
             raise
-        # Too small for a head, so no process can be using it.
-        unlink(rack)
-        return True
+        # Another program has just removed it.
+        return False
     try:
         return _remove(segment)
     finally:
         segment.close()
+
+
+def _is_too_small(rack: str) -> bool:
+    """Whether a file has no room for a head, so that no process can be using it: launches link
+    whole segments to their names."""
+    try:
+        return stranger(rack) is None and shm_path(rack).stat().st_size < HEAD_SIZE
+    except FileNotFoundError:
+        return False
 
 
 def _remove(segment: Segment) -> bool:

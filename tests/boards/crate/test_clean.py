@@ -149,6 +149,41 @@ def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
     again.close()
 
 
+def test_what_another_removes_and_launches_anew_at_that_moment_stays(
+    spec: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_dead(spec)
+    anew = []
+    look = Segment.open
+
+    def overtaken(rack: str) -> Segment:
+        unlink(rack)
+        try:
+            return look(rack)
+        finally:
+            anew.append(Segment.create(spec, ""))
+
+    monkeypatch.setattr(Segment, "open", overtaken)
+    with pytest.raises(SegmentError):
+        remove_dead(spec.rack)
+    assert anew[0].has_its_name
+    anew[0].close()
+
+
+def test_what_another_removes_at_that_moment_is_not_removed_again(
+    spec: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_dead(spec)
+    look = Segment.open
+
+    def overtaken(rack: str) -> Segment:
+        unlink(rack)
+        return look(rack)
+
+    monkeypatch.setattr(Segment, "open", overtaken)
+    assert not remove_dead(spec.rack)
+
+
 def test_a_removal_under_way_is_left_alone(spec: Layout) -> None:
     leave_dead(spec)
     found = Segment.open(spec.rack)
