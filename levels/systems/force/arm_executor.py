@@ -10,13 +10,14 @@ from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, norm
 from rack.levels.arm import wrist
-from rack.levels.arm.wrist import ContactWrench
 from rack.levels.errors import LevelError
 from rack.levels.level import Finding, Input, LevelContext, Ports
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Reaction
+from rack.levels.systems.force import contact_wrench
 from rack.levels.systems.force.contact import HALVES
+from rack.levels.systems.force.contact_wrench import ContactWrench
 from rack.levels.systems.force.messages import WRENCH
 from rack.levels.systems.force.wrist_level import WristLevel
 from rack.levels.systems.joint_boards import ArmExecutor
@@ -77,6 +78,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         """Load the compiled functions of the level, its arm and its sensor."""
         super().preload()
         wrist.preload()
+        contact_wrench.preload()
 
     def self_test(self) -> None:
         """Raise `LevelError` for a class of arms that has no wrist sensor."""

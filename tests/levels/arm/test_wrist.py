@@ -11,9 +11,9 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
-from rack.levels.arm.wrist import ContactWrench
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.systems.force.contact_wrench import ContactWrench
 from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000
