@@ -248,6 +248,11 @@ class Layout:
         return max(exchanged, default=self.task(reader).grid)
 
 
+SPARE = 2
+"""Slots of a host board's mailbox more than messages may wait: the one being written, and one that
+the adapter copies meanwhile."""
+
+
 def depth_for(span_ticks: int, every: int, least: int = 4) -> int:
     """Return the slots, a power of two, that keep `span_ticks` ticks of a writer of period
     `every`."""

@@ -14,16 +14,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.layout import FieldSpec
+from rack.backplane.layout import SPARE, FieldSpec
 from rack.backplane.mailbox.mailbox import DoubleBufferWriter
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
-SPARE = 2
-"""Slots more than messages may wait: the one being written, and one that the adapter copies
-meanwhile."""
 _HEAD = int(Box.HEAD)
 _TAKEN = int(Box.TAKEN)
 _REFUSED = int(Box.REFUSED)

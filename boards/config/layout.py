@@ -12,6 +12,7 @@ import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import (
+    SPARE,
     ExchangeSpec,
     FieldSpec,
     InterruptSpec,
@@ -20,7 +21,6 @@ from rack.backplane.layout import (
     TaskSpec,
     depth_for,
 )
-from rack.backplane.mailbox.host_ring import SPARE
 from rack.backplane.mailbox.queue import TAKEN, taken_name
 from rack.backplane.message import MessageType
 from rack.boards.config.protocols import UNREAD

@@ -30,7 +30,7 @@ from rack.boards.config.schema import (
     TaskPlace,
 )
 from rack.boards.exchange import EXCHANGE, exchange_message
-from rack.boards.host.bus_adapter import BusAdapter
+from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
 from rack.levels.level import Executor, Input, Output, Planner, Program
@@ -93,6 +93,11 @@ class TaskPorts:
     def task(self) -> str:
         """Name of the task."""
         return self.place.name
+
+    @property
+    def joins_sides(self) -> bool:
+        """Whether it is the bus adapter between boards and host boards."""
+        return issubclass(self.kind, Adapter) and self.kind.joins_sides
 
     @cached_property
     def sources(self) -> list[tuple[str, str]]:
@@ -258,7 +263,7 @@ class Wiring:
         self.passed = {
             f"{ports.place.board}.{port}": source
             for ports in self.tasks
-            if issubclass(ports.kind, BusAdapter)
+            if ports.joins_sides
             for port, source in ports.sources
         }
         """The mailboxes that bus adapters write, with those that they pass on."""

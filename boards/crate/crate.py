@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from multiprocessing.connection import Connection
 
 from rack.backplane import semaphores
@@ -46,13 +47,14 @@ from rack.boards.crate.requests import (
 )
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
-from rack.boards.host.board import run_host_board
 from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
+HOST_BOARD = "rack.boards.host.board"
+"""What runs a host board's program, by name: a rack without host boards does not load it."""
 HOST_PROCESSES = 4
 """Processes beside those of the layout: Rack, crate, clock, recorder."""
 REST_MS = 10
@@ -117,11 +119,8 @@ class Crate:
             case PowerOn(name, ClockWiring() as clock):
                 self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
             case PowerOn(name, HostWiring() as host):
-                output = self._output(name)
-                self._fork(
-                    name,
-                    lambda segment: run_host_board(segment, host, self._attention, output.writer),
-                )
+                output = self._output(name).writer
+                self._fork(name, lambda segment: self._run_host_board(segment, host, output))
             case PowerOn(name, HogWiring(entry)):
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
@@ -156,6 +155,12 @@ class Crate:
                 return False
             self._preloaded.add(reference)
         return True
+
+    def _run_host_board(self, segment: Segment, wiring: HostWiring, output: int) -> int:
+        """Run a host board in its process, which alone imports what that takes."""
+        board = import_module(HOST_BOARD)
+        status: int = board.run_host_board(segment, wiring, self._attention, output)
+        return status
 
     def _output(self, name: str) -> HostOutput:
         """Return what a host board prints into, in all its processes."""

@@ -3,11 +3,10 @@ rack."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from rack.backplane.segment import Segment
-from rack.boards.host.entries import Rows
+from rack.boards.wiring import Entries
 from rack.levels.level import Executor
 
 STATUS = "status"
@@ -18,8 +17,10 @@ class Adapter(Executor):
 
     wired_by: ClassVar[str]
     """Key of its board under which its ports are listed."""
+    joins_sides: ClassVar[bool] = False
+    """Whether what is not on the backplane are host boards: it reads on both sides."""
 
-    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
+    def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Take the segment, before the self-test; in a replay with what was recorded in place of
         what is out."""
 

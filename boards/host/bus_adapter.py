@@ -68,6 +68,7 @@ class BusAdapter(Adapter):
 
     params = AdapterParams
     wired_by = "params.pass"
+    joins_sides = True
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from rack.backplane.layout import MailboxSpec
 from rack.boards.classes import find_class
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
-from rack.boards.host.adapter import STATUS
-from rack.boards.host.bus_adapter import BusAdapter
-from rack.boards.host.entries import AdapterParams, EntryConfig
+from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.wiring import Entries
-from rack.levels.level import Executor
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
@@ -25,31 +21,29 @@ def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
     Raises `ConfigError` for mistakes in the config, and `Failure` if the run has other entries, or
     lost some.
     """
-    layout = resolve(config).layout
+    plan = resolve(config)
+    layout = plan.layout
     recording = Recording(run)
     ran = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
     hosts = {host.name for host in layout.hosts}
     found: dict[str, Entries] = {}
-    for board, entries in _bridges(config):
+    for task in plan.tasks:
+        kind = find_class(task.target, object)
+        if not (issubclass(kind, Adapter) and kind.joins_sides):
+            continue
+        entries = kind.made_ports(task.context.params, {}).inputs
         inward = [
             port for port, entry in entries.items() if layout.mailbox(entry.source).writer in hosts
         ]
-        boxes = {port: layout.mailbox(f"{board}.{port}") for port in (*inward, STATUS)}
+        boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in (*inward, STATUS)}
         for box in boxes.values():
             _check(box, ran.get(box.name), recording)
-        found[board] = {
-            port: _rows(recording, box, is_queued=port != STATUS and entries[port].asynchronous)
-            for port, box in boxes.items()
+        found[task.task] = {
+            port: _rows(recording, box, is_queued=port in task.sent) for port, box in boxes.items()
         }
     if not found:
         raise Failure(f"--entries {run}: '{config.name}' has no bus adapter", 2)
     return found
-
-
-def _bridges(config: RackConfig) -> Iterator[tuple[str, dict[str, EntryConfig]]]:
-    for name, board in config.board.items():
-        if issubclass(find_class(board.executor, Executor), BusAdapter):
-            yield name, AdapterParams.entries_of(board.params)
 
 
 def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:

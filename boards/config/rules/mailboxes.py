@@ -19,7 +19,6 @@ from rack.boards.config.wiring import (
 from rack.boards.errors import Mistake
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
-from rack.boards.host.bus_adapter import BusAdapter
 
 PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 
@@ -119,7 +118,7 @@ def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
     """Return why a task or host board must not read a mailbox; empty if it may."""
     is_host = task.place.role == "host"
     is_of_host = mailbox in wiring.of_host
-    if issubclass(task.kind, BusAdapter):
+    if task.joins_sides:
         return "it is on the host side already" if mailbox in wiring.to_host else ""
     if is_host == is_of_host:
         return ""
