@@ -45,7 +45,7 @@ class ChannelMessage(NamedTuple):
 def export(recording: Recording, path: Path, show: Callable[[float], None]) -> int:
     """Write the file; return its number of messages. `show` is called with the part that is
     done."""
-    boxes = {box.name: box for box in recording.whole_layout.mailboxes}
+    boxes = {box.name: box for box in recording.layout.mailboxes}
     found = [boxes[name] for name in recording.mailboxes]
     total = sum(len(recording.signal(box.name, "serial")) for box in found)
     count = 0

@@ -150,17 +150,9 @@ class Recording:
 
     @cached_property
     def layout(self) -> Layout:
-        """The rack's layout, without the fields of its messages: see `fields` and `signal`."""
+        """The rack's layout."""
         with _naming(self.folder / "signals.parquet"):
-            text = json.loads(self._schema.metadata[b"layout"])
-            boxes = [{**box, "fields": ()} for box in text["mailboxes"]]
             # Earlier versions recorded no host boards.
-            return layout_of({"hosts": (), **text, "mailboxes": boxes})
-
-    @cached_property
-    def whole_layout(self) -> Layout:
-        """The rack's layout with the fields of its messages."""
-        with _naming(self.folder / "signals.parquet"):
             return layout_of({"hosts": (), **json.loads(self._schema.metadata[b"layout"])})
 
     @property
@@ -333,7 +325,7 @@ class Recording:
         messages of a mailbox."""
         if name in self.cycles:
             return self.cycles[name]
-        box = self.whole_layout.mailbox(name)
+        box = self.layout.mailbox(name)
         found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
         for field in HEAD:
             found[field] = self.signal(name, field)

@@ -30,7 +30,7 @@ def write_merged(
     for place in placed:
         run = place.own.recording
         rack = place.own.rack
-        ran[rack] = of = Ran.of(run.whole_layout, run.config, run.folder)
+        ran[rack] = of = Ran.of(run.layout, run.config, run.folder)
         roots[rack] = (rack,) if len(placed) > 1 else ()
         views[rack] = RackViews(of.layout, of.config, of.cell, roots[rack])
     name = ", ".join(ran)
@@ -58,7 +58,7 @@ def _blocks(
     recording: Recording, last: int, block: int
 ) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
     """Yield the rows of all rings, by ring, up to a tick, and that tick, block by block."""
-    layout = recording.whole_layout
+    layout = recording.layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
     recorded = {*recording.cycles, *recording.mailboxes}
     rings = {name: recording.rows(name) for name in names if name in recorded}

@@ -26,7 +26,7 @@ def test_levels_do_what_they_do_in_a_rack_in_lockstep(
         assert rack.serials
         for name, serial in rack.serials.items():
             (row,) = np.flatnonzero(recording.signal(name, "serial") == serial)
-            box = recording.whole_layout.mailbox(name)
+            box = recording.layout.mailbox(name)
             assert rack.newest(name).record[()] == recording.messages(box)[row], name
 
 

@@ -62,7 +62,7 @@ def test_schemas_have_units_and_meanings(run: Path, exported: Path) -> None:
         channel.topic: json.loads(summary.schemas[channel.schema_id].data)["properties"]
         for channel in summary.channels.values()
     }
-    for box in Recording(run).whole_layout.mailboxes:
+    for box in Recording(run).layout.mailboxes:
         if box.name in schemas:
             fields = schemas[box.name]
             assert fields["tick"]["type"] == "integer"

@@ -96,7 +96,7 @@ def test_signals_without_their_layout_are_named(damaged: Path) -> None:
 
 
 def messages(recording: Recording) -> dict[str, list[bytes]]:
-    return {box.name: recording.rows(box.name).tolist() for box in recording.whole_layout.timed}
+    return {box.name: recording.rows(box.name).tolist() for box in recording.layout.timed}
 
 
 def test_the_one_file_of_an_earlier_version_is_read(damaged: Path) -> None:
@@ -121,8 +121,8 @@ def test_a_long_run_has_many_parts_which_are_one_table(
         shutil.copy(damaged / name, folder / name)
     # What a killed recorder has left is replaced.
     for _ in range(2):
-        signals = SignalsFile(folder / "signals.parquet", recording.whole_layout)
-        for box in recording.whole_layout.timed:
+        signals = SignalsFile(folder / "signals.parquet", recording.layout)
+        for box in recording.layout.timed:
             rows = recording.rows(box.name)
             for begin in range(0, len(rows), 16):
                 signals.add(box.name, rows[begin : begin + 16])
