@@ -253,8 +253,8 @@ SPARE = 2
 the adapter copies meanwhile."""
 
 
-def depth_for(span_ticks: int, every: int, least: int = 4) -> int:
-    """Return the slots, a power of two, that keep `span_ticks` ticks of a writer of period
-    `every`."""
-    wanted = max(least, -(-span_ticks // every) + 3)
+def depth_for(span_ticks: int, every: int) -> int:
+    """Return the slots, a power of two and at least 4, that keep `span_ticks` ticks of a writer of
+    period `every`."""
+    wanted = max(4, -(-span_ticks // every) + 3)
     return 1 << (wanted - 1).bit_length()

@@ -179,7 +179,7 @@ class AlarmEvents:
     def __init__(
         self,
         segment: Segment,
-        joints: Sequence[str] = (),
+        joints: Sequence[str],
         geom: Callable[[int], str] = str,
         name: Callable[[str, int], str] = lambda board, number: str(number),
     ) -> None:

@@ -219,7 +219,7 @@ class EndOfRun:
         return self._stop_tick
 
 
-def run_clock(segment: Segment, wiring: ClockWiring, attention: int | None = None) -> None:
+def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
     """Run the clock until the run is over; a restarted clock continues on the existing grid."""
     words = segment.words
     words[System.CLOCK_PID] = os.getpid()

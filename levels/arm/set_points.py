@@ -37,9 +37,7 @@ class SetPointGate:
     sensed, those of position where the last one was.
     """
 
-    def __init__(
-        self, arm: Arm, bounds: Bounds, tick_s: float, span_s: float, last: Array | None = None
-    ) -> None:
+    def __init__(self, arm: Arm, bounds: Bounds, tick_s: float, span_s: float, last: Array) -> None:
         """Keep `bounds` for `span_s`, as later cycles may be missed; `last`, (2, joints), rad,
         rad/s, is room for the last set point."""
         cell = arm.cell
@@ -55,7 +53,7 @@ class SetPointGate:
         self._most = MOST_ACCELERATION * self._braking * self._period_s  # rad/s
         # A set point that no joint can reach in a cycle from where it is sensed.
         self._reach = self._fastest * self._period_s + cell.encoders.off
-        self._last = np.full((2, len(cell.dof)), np.nan) if last is None else last
+        self._last = last
 
     def admit(self, target: JointTarget, q: Array, qd: Array) -> JointTarget | Finding:
         """Return the set point that may pass to the arm, sensed at `q`, `qd`; or why none may: the

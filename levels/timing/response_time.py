@@ -255,7 +255,7 @@ def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
     return max((other.locked_ns for other in below), default=0)
 
 
-def load_of(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[int, float]:
+def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
     """Return the load of each core, by core, context switches included; above 1 it is
     overloaded."""
     loads: dict[int, float] = {}

@@ -140,7 +140,7 @@ def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[st
     return budgets_of(cycles_of(recording), percentile)
 
 
-def budgets_of(found: Mapping[str, Cycles], percentile: float = WORST) -> dict[str, Budget]:
+def budgets_of(found: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
     """Return the budgets, by board, of cycles from `cycles_of`."""
     executors = {name: cycles for name, cycles in found.items() if cycles.task.role == "executor"}
     return {
