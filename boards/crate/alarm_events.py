@@ -20,6 +20,7 @@ from rack.boards.config.cell import geom_name
 from rack.boards.config.commands import setting_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
+from rack.boards.faults.bounds import counting
 from rack.boards.faults.describe import board_of, joint_name, subject_of
 from rack.boards.faults.describe import describe as describe_fault
 from rack.boards.operator import describe, level_of, message_of
@@ -282,12 +283,6 @@ class AlarmEvents:
 
     def _span(self, ticks: float) -> str:
         return f"{counting(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"
-
-
-def counting(number: float, noun: str) -> str:
-    """Return a number with its noun, as in "1 tick" or "3 ticks"."""
-    text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
-    return f"{text} {noun}{'' if text == '1' else 's'}"
 
 
 def _demand(demand: Demand, subject: str) -> str:

@@ -149,7 +149,7 @@ class Bound:
 def cycles(count: int) -> Bound:
     """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host
     board has none."""
-    text = _counted(count, "cycle") if count else "the same cycle"
+    text = counting(count, "cycle") if count else "the same cycle"
     return Bound(text, lambda case: None if case.is_host else count * case.cycle)
 
 
@@ -160,24 +160,24 @@ def cycles_and_time(count: int, time_ns: int) -> Bound:
     def ticks(case: BoundCase) -> int:
         return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))
 
-    return Bound(f"{_counted(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", ticks)
+    return Bound(f"{counting(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", ticks)
 
 
 def clock_ticks(count: int) -> Bound:
     """Return a bound of `count` ticks."""
-    return Bound(_counted(count, "tick"), lambda case: count)
+    return Bound(counting(count, "tick"), lambda case: count)
 
 
 def writes(count: int) -> Bound:
     """Return a bound of `count` periods of the mailbox's writer."""
-    return Bound(_counted(count, "write"), lambda case: count * case.write)
+    return Bound(counting(count, "write"), lambda case: count * case.write)
 
 
 def missing_writes(count: int) -> Bound:
     """Return a bound of `count` periods without a message; none for a planner, which writes at no
     fixed period."""
     return Bound(
-        _counted(count, "write"), lambda case: None if case.is_planner else count * case.write
+        counting(count, "write"), lambda case: None if case.is_planner else count * case.write
     )
 
 
@@ -223,5 +223,7 @@ BY_SIZE = Bound("depends on size", lambda case: None)
 NOT_ARMED = Bound("the launch fails", lambda case: None)
 
 
-def _counted(count: int, unit: str) -> str:
-    return f"{count} {unit}{'' if count == 1 else 's'}"
+def counting(number: float, noun: str) -> str:
+    """Return a number with its noun, as in "1 tick" or "3 ticks"."""
+    text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
+    return f"{text} {noun}{'' if text == '1' else 's'}"
