@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -63,6 +64,17 @@ def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_m
     shown = rack("gantt", "fig2", "--process", "level=3,2", "--to-ms", 16, "--out", tmp_path)
     assert "RXXXWPPPRXXWPPPU\n" in shown.stdout
     assert "R X W P | R X W P U: 10 of 10 plans" in shown.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start_ms", [8000, 100_000])
+def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(
+    start_ms: int, tmp_path: Path
+) -> None:
+    rack("gantt", "nasrem", "--level", "servo", "--from-ms", start_ms, "--out", tmp_path)
+    # matplotlib draws letters as shapes, and names each text in a comment.
+    labels = re.findall(r"<!-- ([\d.+e]+) -->", (tmp_path / "gantt.svg").read_text())
+    assert labels == [str(start_ms + ms) for ms in (0, 20, 40)]
 
 
 @pytest.mark.slow

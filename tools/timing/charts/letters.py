@@ -102,10 +102,9 @@ def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
 
 def _axis(panel: Panel, column_ns: int) -> Iterator[str]:
     """Yield the time below the chart."""
-    chart = panel.chart
-    step = step_for(panel, max(LABEL_COLUMNS, len(ms(chart.end_ns)) + 2) * column_ns)
-    times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
-    yield f"{label_row(((time - chart.start_ns) // column_ns, ms(time)) for time in times)} ms"
+    start = panel.chart.start_ns
+    times = label_times(panel, column_ns)
+    yield f"{label_row(((time - start) // column_ns, ms(time)) for time in times)} ms"
 
 
 def label_row(labels: Iterable[tuple[int, str]]) -> str:
@@ -114,6 +113,19 @@ def label_row(labels: Iterable[tuple[int, str]]) -> str:
     for column, label in labels:
         row = row.ljust(column) + label
     return row
+
+
+def label_times(panel: Panel, column_ns: int) -> range:
+    """Return the times to write along the axis, ns: far enough apart for their numbers."""
+    chart = panel.chart
+    columns = 0
+    widest = LABEL_COLUMNS
+    while widest > columns:
+        columns = widest
+        step = step_for(panel, columns * column_ns)
+        times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
+        widest = max((len(ms(time)) + 2 for time in times), default=0)
+    return times
 
 
 def step_for(panel: Panel, narrowest_ns: int) -> int:

@@ -10,7 +10,8 @@ from matplotlib.patches import Patch
 
 from rack.levels.timing.tasks import Unit
 from rack.tools.console.pictures import paths_of, picture
-from rack.tools.timing.charts.letters import step_for
+from rack.tools.console.tables import ms
+from rack.tools.timing.charts.letters import COLUMNS, label_times
 from rack.tools.timing.charts.panel import NS_PER_MS, Panel
 from rack.tools.timing.charts.patterns import IDLE
 
@@ -45,8 +46,6 @@ FRAME = "#999999"
 WIDTH_IN = 10.0
 LANE_IN = 0.55
 BAR = 0.66
-LABELS = 16
-"""Most numbers along the axis."""
 LETTER = 0.012
 """Part of the window from which on a span has room for its letter."""
 
@@ -98,12 +97,9 @@ def _draw(axes: Axes, panel: Panel) -> None:
             )
     axes.set_xlim(chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS)
     axes.set_ylim(-0.5, count - 0.5)
-    step = step_for(panel, (chart.end_ns - chart.start_ns) // LABELS)
-    labels = [
-        time / NS_PER_MS
-        for time in range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
-    ]
-    axes.set_xticks(labels)
+    # The axis is as wide as a chart in letters.
+    times = label_times(panel, (chart.end_ns - chart.start_ns) // COLUMNS)
+    axes.set_xticks([time / NS_PER_MS for time in times], [ms(time) for time in times])
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
     axes.set_title(panel.kind, fontsize=9, loc="left", pad=14 if panel.frames else None)
