@@ -56,8 +56,9 @@ class Events:
         self._read += sum(map(len, lines))
         for line in lines:
             event = json.loads(line)
-            # The last line, the outcome of the run, is no event.
-            if "tick" in event:
+            # The last line, the outcome of the run, is no event. What the launch waited for, class
+            # by class on a slow machine, is no news to who sees the run.
+            if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):
                 self._write(Event(**event))
 
     def _write(self, event: Event) -> None:

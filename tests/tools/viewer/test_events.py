@@ -1,0 +1,34 @@
+"""The log of the viewer: the events of the run, without those of a slow launch."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import rerun.blueprint as rrb
+
+from rack.backplane.segment import Launch
+from rack.boards.config import load, rack_timing, wire
+from rack.boards.events import Event
+from rack.tools.viewer.events import Events
+from rack.tools.viewer.levels import Hierarchy
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.stream import Stream, Timelines, new_recording
+
+
+def test_what_a_launch_waits_for_is_not_in_the_log(tmp_path: Path) -> None:
+    config = load("fig2")
+    layout = wire(config)
+    times = Timelines(layout.clock_ns, Launch(time.time_ns(), 0))
+    stream = Stream(new_recording("events", "run", tmp_path / "run.rrd", rrb.Blueprint()), times)
+    texts = {"preloading 'a:B'": -1, "preloading 'a:C'": -1, "rack 'x' is awaited": 4}
+    events = [Event(time.time_ns(), at, "waiting", "", text) for text, at in texts.items()]
+    (tmp_path / "events.jsonl").write_text("".join(json.dumps(asdict(e)) + "\n" for e in events))
+    hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
+    Events(stream, tmp_path / "events.jsonl", hierarchy).advance()
+    stream.flush()
+    stream.close()
+    log = read(tmp_path / "run.rrd", "/log/events", "TextLog:text")
+    assert log.values.ravel().tolist() == ["waiting: rack: rack 'x' is awaited"]
