@@ -90,7 +90,8 @@ def command(
     release   end the bring-up of an arm: full speed from now on
 
     `hold`, `setpoint`, `goto` and `do` stay in force until `resume`. They survive a restart of the
-    level's board. An emergency stop takes precedence.
+    level's board. An emergency stop takes precedence. On a rack that is held a command waits for
+    the next step: it is given then, and this returns at once.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.

@@ -12,6 +12,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
 from rack.tools.console.address import AT_THE_RACK, OPERATOR, Asker, RackAddress, needing_zenoh
 from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.held import waits
 from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json
 
 Reset = Annotated[
@@ -35,6 +36,8 @@ def estop(
     ACFAIL is asserted. On another machine's rack, HOST/RACK, it may be set by who has the right
     there, and never reset.
 
+    The arm of a rack that is held brakes when the rack goes on.
+
     Exit status: 0 the latch is set, or with --reset clear; 1 the reset was refused, or there is no
     such rack.
 
@@ -47,16 +50,17 @@ def estop(
     if "/" in rack:
         tick = _stop_from_afar(RackAddress.of(rack), reset, Asker.of(name, certificates))
         own = rack.partition("/")[2]
+        held = ""
     else:
-        tick = _latch(rack, reset)
+        tick, held = _latch(rack, reset)
         own = rack
     where = ", on its own machine" if own != rack else ""
-    state = (
-        f"reset at tick {tick}"
-        if reset
-        else f"latched at tick {tick}; to release{where}: rack estop {own} --reset"
-    )
-    document = {"rack": own, "emergency_stop": not reset, "tick": tick}
+    state = f"reset at tick {tick}" if reset else f"latched at tick {tick}"
+    if held:
+        state += f"; the arm {held}"
+    if not reset:
+        state += f"; to release{where}: rack estop {own} --reset"
+    document = {"rack": own, "emergency_stop": not reset, "tick": tick, "waits": held}
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 
@@ -70,9 +74,11 @@ def _stop_from_afar(address: RackAddress, reset: bool, asker: Asker) -> int:
     return stop(address, asker)
 
 
-def _latch(rack: str, reset: bool) -> int:
-    """Set or clear the latch of a rack on this machine, and wait until the clock has seen it;
-    return its tick."""
+def _latch(rack: str, reset: bool) -> tuple[int, str]:
+    """Set or clear the latch of a rack on this machine, and wait until the clock has seen it.
+
+    Return its tick, and that the arm waits for it, on a rack that is held; empty: it does not.
+    """
     segment = Segment.attach(rack)
     words = segment.words
     lines = UtilityLines(segment)
@@ -84,11 +90,14 @@ def _latch(rack: str, reset: bool) -> int:
         lines.latch_emergency_stop()
     deadline = time.monotonic() + OBEY_S
     # The demand on the arm follows at the next tick; a lost board may cause a demand, too.
+    held = ""
     while (words[System.DEMAND] == Demand.BRAKE) == reset and words[System.STATE] == Run.RUNNING:
+        if held := waits(segment):
+            break
         if time.monotonic() > deadline:
             raise Failure(
                 f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but no tick has"
                 " followed"
             )
         time.sleep(0.001)
-    return words[System.TICK]
+    return words[System.TICK], held

@@ -85,8 +85,8 @@ def inject(
     """Inject a fault into a running rack.
 
     It begins at the next tick and lasts to the end of the run, unless --tick, --when, --for or
-    --cycles say otherwise. With --tick or --when the command arms the fault and returns at once;
-    with --wait it returns when the fault is over.
+    --cycles say otherwise. With --tick or --when, or on a rack that is held, the command arms the
+    fault and returns at once; with --wait it returns when the fault is over.
 
     Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or
     --timeout has passed; 2 usage.

@@ -23,11 +23,13 @@ from rack.boards.faults.describe import describe, document
 from rack.boards.faults.kind import KINDS
 from rack.boards.faults.tasks import act_on_core
 from rack.tools.console.answer import Failure
+from rack.tools.console.held import waits
 from rack.tools.console.tables import table
 
 BEGIN_S = 5.0
 """Longest wait for a fault to begin at the next tick."""
 LOOK_S = 0.001
+NEXT_TICK = "the next tick"
 SEEDS = 2**31
 
 
@@ -44,8 +46,8 @@ class LiveRack:
     def inject(
         self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
     ) -> dict[str, Any]:
-        """Inject a fault; return it as plain data when it has begun, or, with a tick or a
-        condition, when it is armed.
+        """Inject a fault; return it as plain data when it has begun, or, with a tick, a condition
+        or on a rack that is held, when it is armed.
 
         With `wait`, return when it is over. Raises `ConfigError` with every mistake, and `Failure`
         when it does not begin, or is not over within `timeout_s` of wall-clock time.
@@ -147,10 +149,14 @@ class LiveRack:
         return True
 
     def _await_begin(self, entry: FaultEntry) -> None:
-        if not self._wait_until(lambda: entry.stage != Stage.WAITING, BEGIN_S):
+        held = self._segment.words
+        if not self._wait_until(
+            lambda: entry.stage != Stage.WAITING or held[System.HELD] > 0, BEGIN_S
+        ):
             why = f"the clock has not begun it within {BEGIN_S:g} s"
             raise Failure(f"{self._described(entry)}: {why}")
-        self._check_begun(entry)
+        if not held[System.HELD]:
+            self._check_begun(entry)
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
         """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it
@@ -174,7 +180,9 @@ class LiveRack:
         last = entry[Entry.UNTIL] - 1
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
-            return f"{fault}: armed, waits for {self._awaited(entry)}; {how}"
+            awaited = self._awaited(entry)
+            held = waits(self._segment) if awaited == NEXT_TICK else ""
+            return f"{fault}: armed, {held or f'waits for {awaited}'}; {how}"
         if entry.stage == Stage.OVER:
             acted = "once" if entry[Entry.COUNT] == 1 else f"{entry[Entry.COUNT]} times"
             return f"{fault}: ticks {first} to {last}, acted {acted}"
@@ -185,7 +193,7 @@ class LiveRack:
         """Return the tick or the condition that a fault waits for."""
         if entry[Entry.WHEN_BOX] < 0:
             if entry[Entry.FROM] <= 0:
-                return "the next tick"
+                return NEXT_TICK
             now = self._segment.words[System.TICK]
             return f"tick {entry[Entry.FROM]}; the rack is at tick {now}"
         when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])

@@ -25,6 +25,7 @@ from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
 from rack.levels.operator import Answer, Operation
 from rack.tools.console.answer import Failure
+from rack.tools.console.held import waits
 from rack.tools.console.tables import table
 from rack.tools.live.holds import resume_command
 from rack.tools.live.watched import WatchedRack
@@ -44,9 +45,9 @@ Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 class Reply:
     """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
 
-    The fate "waiting" is that of a command to a rack held for single steps; it has no serial yet.
-    The fate stays "given" where the level's status does not answer operators. `objection` is why it
-    was refused.
+    The fate "waiting" is that of a command to a rack that is held; it has no serial yet, and
+    `waits` says until when. The fate stays "given" where the level's status does not answer
+    operators. `objection` is why it was refused.
     """
 
     serial: int
@@ -57,6 +58,7 @@ class Reply:
     taken_up: int = -1
     done: int = -1
     objection: str = ""
+    waits: str = ""
 
     @property
     def worked(self) -> bool:
@@ -76,10 +78,7 @@ class Reply:
     def line(self) -> str:
         """All of it as one line."""
         if self.fate == "waiting":
-            return (
-                f"command to '{self.level}', {self.text}: waits for the next step of the rack,"
-                " which is held"
-            )
+            return f"command to '{self.level}', {self.text}: {self.waits}"
         ends = {
             "given": "; the status of this level does not answer operators",
             "taken": f", taken up at tick {self.taken_up}",
@@ -136,12 +135,11 @@ class LiveDesk:
             raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
         if _Patience(self._rack, "").is_in_vain:
             raise Failure(f"rack '{segment.rack}': its run is over")
-        if segment.words[System.HELD]:
+        if held := waits(segment):
             # Without a client: the user steps the rack afterwards.
             entry = OperatorTable(segment).add(wanted)
-            return Reply(
-                0, command.level, describe(message_of(entry, segment.layout)), -1, "waiting"
-            )
+            text = describe(message_of(entry, segment.layout))
+            return Reply(0, command.level, text, -1, "waiting", waits=held)
         if (answering := _answering(segment, command.level)) is not None:
             self._rack.follow(answering.name)
         # However the wait ends, leaving the claim withdraws a request that has not been given.
@@ -250,7 +248,7 @@ class Replies:
 
 
 class _Patience:
-    """Waits as long as the rack's clock ticks; explains a long wait on stderr, once."""
+    """Waits as long as the rack's clock ticks, or is held; explains a long wait on stderr, once."""
 
     def __init__(self, rack: WatchedRack, what: str) -> None:
         self._rack = rack
@@ -265,7 +263,7 @@ class _Patience:
         self._rack.refresh()
         now = time.monotonic()
         tick = self._words[System.TICK]
-        if tick != self._tick:
+        if tick != self._tick or self._words[System.HELD]:
             self._tick = tick
             self._changed = now
         if self._note_at is not None and now > self._note_at:

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
+from rack.backplane.words import Demand, System
 from tests.boards.table_racks import counting
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
@@ -72,15 +73,37 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(
     tick, level = stepped(rack_name, "--until", "counter")
     assert (tick, level["row"]) == (41, "row 4 'turn', now in 'down', table saw")
     given = rack("command", rack_name, "counter", "table", "slow")
-    assert (
-        given.stdout
-        == "command to 'counter', table slow: waits for the next step of the rack, which is held\n"
-    )
+    held_at = f"the rack is held before tick 41; 'rack step {rack_name}' lets it go on"
+    assert given.stdout == f"command to 'counter', table slow: waits: {held_at}\n"
     tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
     assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
     assert f"{rack_name}: held before tick 50, 0.125 s" in text
     assert f"HELD: 'rack step {rack_name}' lets it go on" in rack("status", rack_name).stdout
+
+
+@pytest.mark.slow
+def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
+    held: subprocess.Popen[str], rack_name: str
+) -> None:
+    waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' lets it go on"
+    for words, before in {
+        ("command", rack_name, "counter", "table", "slow"): "command to 'counter', table slow: ",
+        ("inject", rack_name, "watch", "mute"): "mute of watch: armed, ",
+        ("estop", rack_name): f"rack '{rack_name}': emergency stop latched at tick 0; the arm ",
+    }.items():
+        done = rack(*words)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.startswith(before + waits)
+    segment = Segment.attach(rack_name)
+    fault = FaultTable(segment).entries[0]
+    assert (fault.stage, segment.words[System.DEMAND]) == (Stage.WAITING, Demand.NONE)
+    assert stepped(rack_name, "--cycles", "2")[0] == 9
+    assert (fault.stage, segment.words[System.DEMAND]) == (Stage.ACTIVE, Demand.BRAKE)
+    assert rack("estop", rack_name, "--reset").stdout == (
+        f"rack '{rack_name}': emergency stop reset at tick 8; the arm"
+        f" {waits.replace('tick 0', 'tick 9')}\n"
+    )
 
 
 @pytest.mark.slow
