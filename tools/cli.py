@@ -63,6 +63,8 @@ COMMANDS = (
         "Remove the shared memory that killed racks left behind.",
     ),
     ("command", "rack.tools.commands.command:command", "Command one level of a running rack."),
+    ("pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."),
+    ("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
     ("step", "rack.tools.commands.step:step", "Let a rack in lockstep go on by single cycles."),
     (
         "prompt",
@@ -112,7 +114,7 @@ COMMANDS = (
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 GROUPS = {
-    "Run": ("run", "stop", "step", "list", "clean"),
+    "Run": ("run", "stop", "pause", "resume", "step", "list", "clean"),
     "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "export", "report"),
     "Command and disturb": ("command", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),

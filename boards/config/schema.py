@@ -562,6 +562,11 @@ class RackConfig(Table):
             if {*link} <= self.board.keys() and link[0] != link[1]
         )
 
+    def all_below(self, board: str) -> set[str]:
+        """Return the boards below a board, directly or not."""
+        direct = {lower for upper, lower in self.links() if upper == board}
+        return direct.union(*(self.all_below(lower) for lower in direct))
+
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""
         for name, board in self.board.items():

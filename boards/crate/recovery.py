@@ -37,7 +37,7 @@ class Supervision:
         self._restarts: dict[str, list[int]] = defaultdict(list)
         self._needs: dict[str, set[str]] = {CLOCK: set()}
         for task in layout.tasks:
-            below = _all_below(config, task.board)
+            below = config.all_below(task.board)
             needed = {other.name for other in layout.tasks if other.board in below}
             self._needs[task.name] = {CLOCK, *needed} | (
                 {task.board} if task.role == "planner" else set()
@@ -74,12 +74,6 @@ class Supervision:
         board = config.host[task] if spec.role == "host" else config.board[spec.board]
         most = common.restarts if board.restarts is None else board.restarts
         return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
-
-
-def _all_below(config: RackConfig, board: str) -> set[str]:
-    """Return the boards below a board, directly or not."""
-    direct = {lower for upper, lower in config.links() if upper == board}
-    return direct.union(*(_all_below(config, lower) for lower in direct))
 
 
 class Recovery:

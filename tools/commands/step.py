@@ -3,25 +3,23 @@ did."""
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from rack.backplane.layout import TaskSpec
-from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
-
-LOOK_S = 0.001
+from rack.tools.live.stepper import Stepper
 
 Cycles = Annotated[
     int | None,
     typer.Option(
         metavar="N", min=1, max=1_000_000, help="cycles of the slowest level, or of --until"
     ),
+]
+Count = Annotated[
+    int | None,
+    typer.Argument(metavar="N", min=1, max=1_000_000, help="cycles; the same as --cycles"),
 ]
 Ticks = Annotated[
     int | None,
@@ -35,6 +33,7 @@ LetGo = Annotated[bool, typer.Option("--run", help="let the rack run on without 
 
 def step(
     rack: RackName,
+    count: Count = None,
     cycles: Cycles = None,
     ticks: Ticks = None,
     until: Until = None,
@@ -54,14 +53,17 @@ def step(
     \b
     Examples:
       rack step nist-state-table
-      rack step nist-state-table --cycles 10
+      rack step nist-state-table 10
       rack step nist-state-table --until task
       rack step nist-state-table --ticks 1
       rack step nist-state-table --run
     """
+    if count is not None and cycles is not None:
+        raise Failure(f"N = {count}: the same as --cycles; give one of them", 2)
+    cycles = cycles if count is None else count
     if ticks is not None and (cycles is not None or until is not None):
         raise Failure(
-            "--ticks counts ticks, --cycles and --until count cycles; give one of them", 2
+            "--ticks counts ticks, N, --cycles and --until count cycles; give one of them", 2
         )
     if run and any(given is not None for given in (cycles, ticks, until)):
         raise Failure("--run lets the rack run on; leave out the steps", 2)
@@ -74,102 +76,3 @@ def step(
     stepper.go(at + ticks if ticks is not None else stepper.after_cycles(at, cycles or 1, until))
     found = stepper.look()
     print_answer(found.document(), found.text(), as_json)
-
-
-@dataclass(frozen=True)
-class Stepped:
-    """A rack that is held. `levels` has one dict a level: level, state, row, reason."""
-
-    rack: str
-    tick: int
-    time_s: float
-    levels: tuple[dict[str, str], ...]
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return {
-            "rack": self.rack,
-            "tick": self.tick,
-            "time_s": self.time_s,
-            "levels": list(self.levels),
-        }
-
-    def text(self) -> str:
-        """Return the same as readable text."""
-        from rack.tools.console.tables import table, terminal_width
-
-        rows = [list(level.values()) for level in self.levels]
-        lines = table(["level", "state", "row", "reason"], rows, terminal_width())
-        return "\n".join(
-            [f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s", *lines]
-        )
-
-
-class Stepper:
-    """Steps one rack. Raises `SegmentError` when there is no such rack, `Failure` when it is not in
-    lockstep."""
-
-    def __init__(self, rack: str) -> None:
-        self._segment = Segment.attach(rack)
-        self._words = self._segment.words
-        if not self._words[System.LOCKSTEP]:
-            hint = f"end it, and start it with: rack run {rack} --lockstep --step"
-            raise Failure(f"rack '{rack}' runs in real time, which cannot be held; {hint}")
-
-    def let_go(self) -> None:
-        """Let the rack run on."""
-        self._words[System.HOLD_AT] = 0
-
-    def hold(self) -> int:
-        """Hold the rack, if it is not held yet; return the tick before which it holds."""
-        if not self._words[System.HOLD_AT]:
-            self._words[System.HOLD_AT] = 1
-        return self._await_hold(0)
-
-    def go(self, tick: int) -> None:
-        """Let the rack go on, and hold it before `tick`."""
-        self._words[System.HOLD_AT] = tick + 1
-        self._await_hold(tick)
-
-    def after_cycles(self, at: int, cycles: int, level: str | None) -> int:
-        """Return the tick after the release of the last of `cycles` of a level, or of the slowest
-        level.
-
-        Raises `Failure` for an unknown level.
-        """
-        executors = {task.name: task for task in self._executors()}
-        if level is not None and level not in executors:
-            raise Failure(f"--until {level}: no such level; levels: {', '.join(executors)}", 2)
-        task = (
-            executors[level]
-            if level is not None
-            else max(executors.values(), key=lambda task: task.every)
-        )
-        return task.grid.since(at) + (cycles - 1) * task.every + 1
-
-    def look(self) -> Stepped:
-        """Return the rack as it is held."""
-        from rack.tools.live.snapshot import RackMonitor
-
-        found = RackMonitor(self._segment).look()
-        executors = {task.name for task in self._executors()}
-        rows = [row for row in found.tasks if row.task in executors]
-        levels = [
-            {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
-            for row in rows
-        ]
-        tick = self._words[System.HELD] - 1
-        return Stepped(found.rack, tick, tick * self._segment.layout.clock_ns * 1e-9, tuple(levels))
-
-    def _executors(self) -> list[TaskSpec]:
-        return [task for task in self._segment.layout.tasks if task.role == "executor"]
-
-    def _await_hold(self, tick: int) -> int:
-        """Wait until the rack holds before `tick` or a later one; return which."""
-        while (held := self._words[System.HELD] - 1) < tick:
-            if self._segment.run_is_over:
-                raise Failure(
-                    f"rack '{self._segment.rack}': its run ended at tick {self._words[System.TICK]}"
-                )
-            time.sleep(LOOK_S)
-        return held

@@ -118,6 +118,17 @@ class LiveDesk:
             ["level", "in force", "takes"], [list(row.values()) for row in self.levels()], width
         )
 
+    def highest(self, *in_force: str) -> list[str]:
+        """Return the levels that take a hold and have one of these commands in force ("": none),
+        without those below another one of them."""
+        found = [
+            name
+            for name, commands in commandable(self._config).items()
+            if Operation.HOLD in commands and self._in_force(name) in in_force
+        ]
+        lower = set[str]().union(*map(self._config.all_below, found))
+        return [name for name in found if name not in lower]
+
     def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Reply:
         """Give a command and wait until its level takes it up; with `wait`, until it is done.
 

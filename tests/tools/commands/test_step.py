@@ -69,7 +69,7 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(
     assert stepped(rack_name, "--ticks", "3")[0] == 20
     tick, level = stepped(rack_name, "--until", "counter")
     assert (tick, level["row"]) == (21, "row 3 'count up', now in 'up', table saw")
-    assert stepped(rack_name, "--cycles", "4", "--until", "counter")[0] == 37
+    assert stepped(rack_name, "4", "--until", "counter")[0] == 37
     tick, level = stepped(rack_name, "--until", "counter")
     assert (tick, level["row"]) == (41, "row 4 'turn', now in 'down', table saw")
     given = rack("command", rack_name, "counter", "table", "slow")
@@ -133,8 +133,9 @@ def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[str], rack_na
     [
         (
             ("--ticks", "1", "--until", "counter"),
-            "--ticks counts ticks, --cycles and --until count cycles",
+            "--ticks counts ticks, N, --cycles and --until count cycles",
         ),
+        (("1", "--cycles", "1"), "N = 1: the same as --cycles; give one of them"),
         (("--run", "--ticks", "1"), "--run lets the rack run on; leave out the steps"),
     ],
 )

@@ -14,6 +14,7 @@ import pytest
 
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.commands.command import goal_of
@@ -121,6 +122,53 @@ def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
     }
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
     assert rows["lower"]["takes"] == "hold, resume, modify twice on|off"
+
+
+@pytest.mark.slow
+def test_a_paused_rack_goes_on_from_there(running: str) -> None:
+    words = Segment.attach(running).words
+    done = rack("pause", running, "--json")
+    paused = json.loads(done.stdout)
+    assert (done.returncode, paused["paused"]) == (0, True)
+    if words[System.LOCKSTEP]:
+        assert (paused["levels"], words[System.HELD]) == ([], paused["tick"] + 1)
+        again = rack("pause", running).stdout
+        assert again.startswith(f"rack '{running}': held before tick {paused['tick']}; ")
+    else:
+        assert paused["levels"] == ["upper"]
+        assert LiveDesk(LocalRack(running)).highest("hold") == ["upper"]
+        tick = words[System.TICK]
+        wait_until(lambda: words[System.TICK] > tick)
+    done = rack("resume", running)
+    assert (done.returncode, done.stdout) == (0, f"rack '{running}' goes on\n")
+    tick = words[System.TICK]
+    wait_until(lambda: words[System.TICK] > tick)
+    again = rack("resume", running)
+    assert (again.returncode, again.stderr) == (1, f"rack '{running}' is not paused\n")
+
+
+@pytest.mark.slow
+def test_a_level_that_does_a_command_of_its_operator_keeps_it_in_a_pause(
+    running: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = LiveDesk(LocalRack(running))
+    in_force = {"upper": "goto", "lower": ""}
+    monkeypatch.setattr(desk, "_in_force", in_force.get)
+    assert (desk.highest("", "hold"), desk.highest("hold")) == (["lower"], [])
+    in_force.update(upper="hold", lower="hold")
+    assert desk.highest("", "hold") == desk.highest("hold") == ["upper"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("running", ["realtime"], indirect=True)
+@pytest.mark.parametrize("levels", [[], ["lower", "upper"]], ids=str)
+def test_a_rack_in_real_time_without_one_highest_level_cannot_be_paused(
+    running: str, levels: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LiveDesk, "highest", lambda desk, *in_force: levels)
+    done = rack("pause", running)
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"highest: {', '.join(levels) or 'none'}\n")
 
 
 REFUSED = {
