@@ -5,8 +5,8 @@ level must do.
   `LevelContext`, `Pace`.
 - Declare messages: `MessageType`, `Field`, `command`, `status`, `Message`, `State`; the default
   levels' messages are in `rack.levels.messages`, and their error codes in `Error`.
-- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`; arm and cell: `RobotConfig`,
-  `SceneConfig`.
+- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
+  cell: `RobotConfig`, `SceneConfig`.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OPERATOR_COMMAND`, `ANSWER`,
   `RESTS_ON`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
@@ -52,10 +52,20 @@ if TYPE_CHECKING:
         Operation,
         Orders,
     )
-    from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, read_params
+    from rack.levels.tables import (
+        LIVE,
+        Finite,
+        Positive,
+        RobotConfig,
+        SceneConfig,
+        Table,
+        read_params,
+        set_live,
+    )
 
 __all__ = [
     "ANSWER",
+    "LIVE",
     "OPERATOR_COMMAND",
     "RESTS_ON",
     "Alarm",
@@ -91,6 +101,7 @@ __all__ = [
     "Verdict",
     "command",
     "read_params",
+    "set_live",
     "status",
 ]
 _PLACES = {
@@ -122,12 +133,14 @@ _PLACES = {
         "Orders",
     ),
     "rack.levels.tables": (
+        "LIVE",
         "Finite",
         "Positive",
         "RobotConfig",
         "SceneConfig",
         "Table",
         "read_params",
+        "set_live",
     ),
 }
 

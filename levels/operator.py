@@ -42,6 +42,7 @@ class Operation(IntEnum):
     DISABLE = 9  # brake the arm, and take the torque from its drives
     RESET = 10  # let the arm's drives leave their fault
     RELEASE = 11  # end the bring-up: full speed from now on
+    SET = 12  # set a live parameter of the level, `name` being key=value
 
 
 class Goal(IntEnum):
@@ -56,7 +57,7 @@ class Goal(IntEnum):
     OFF = 6
 
 
-SETTINGS = (Operation.MODIFY, Operation.TABLE)
+SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET)
 """Operations that are done at once and leave the command in force as it is; each names what it
 sets."""
 DRIVES = (Operation.ENABLE, Operation.DISABLE, Operation.RESET, Operation.RELEASE)

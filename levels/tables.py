@@ -7,6 +7,7 @@ both.
 from __future__ import annotations
 
 import inspect
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -19,6 +20,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.config import JsonDict
 
 from rack.levels.errors import LevelError
 from rack.levels.references import module_and_name
@@ -33,6 +35,10 @@ Interface = Literal["torque", "position", "velocity"]
 """What drives take; with the last two they close loops of their own."""
 LAST_TICK = 10**15
 """Ticks are 64-bit words: this many of the shortest ones last 300 years."""
+
+
+LIVE: JsonDict = {"live": True}
+"""Declares a field of params live: an operator may set it while the level runs; see `set_live`."""
 
 
 class Table(BaseModel):
@@ -78,6 +84,33 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
         raise LevelError(
             f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}"
         ) from error
+
+
+def live_keys(kind: type[Table] | None) -> tuple[str, ...]:
+    """Return the params that may be set while their level runs."""
+    fields = {} if kind is None else kind.model_fields
+    return tuple(key for key, field in fields.items() if field.json_schema_extra == LIVE)
+
+
+def read_setting(setting: str) -> tuple[str, Any]:
+    """Return key and value of "key=value", with the value in TOML. Raises `LevelError`."""
+    key, _, text = setting.partition("=")
+    try:
+        return key.strip(), tomllib.loads(f"value = {text}")["value"]
+    except ValueError:  # the parser's own errors are such
+        raise LevelError("must be key=value, as in bandwidth=80") from None
+
+
+def set_live(params: Params, setting: str) -> tuple[Params, str]:
+    """Return `params` with a live one set anew by "key=value", and why not; empty: it is set."""
+    kind = type(params)
+    try:
+        key, value = read_setting(setting)
+        if key not in (live := live_keys(kind)):
+            return params, f"params.{key} is not live; live: {', '.join(live) or 'none'}"
+        return read_params(kind, {**dict(params), key: value}), ""
+    except LevelError as error:
+        return params, str(error)
 
 
 def named_class(reference: str, base: type[T]) -> type[T]:

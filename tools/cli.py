@@ -65,6 +65,7 @@ COMMANDS = (
     ("command", "rack.tools.commands.command:command", "Command one level of a running rack."),
     ("pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."),
     ("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
+    ("set", "rack.tools.commands.set:set_param", "Set a live parameter of a running rack."),
     ("step", "rack.tools.commands.step:step", "Let a rack in lockstep go on by single cycles."),
     (
         "prompt",
@@ -116,7 +117,7 @@ COMMANDS = (
 GROUPS = {
     "Run": ("run", "stop", "pause", "resume", "step", "list", "clean"),
     "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "export", "report"),
-    "Command and disturb": ("command", "prompt", "estop", "inject", "campaign"),
+    "Command and disturb": ("command", "set", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),
     "Compare": ("bench", "reproduce"),
     "Bring up": ("robot",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -18,11 +18,13 @@ from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.config.timing import first_tick
+from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor
-from rack.levels.operator import NAMED, Commands, Goal, goal_names
+from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names
+from rack.levels.tables import live_keys, read_params
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -34,18 +36,33 @@ def takes(config: RackConfig, board: str, commands: Commands) -> str:
     executor = find_class(table.executor, Executor)
     words = []
     for what, goals in commands.items():
-        names = ""
-        # A table may be in the middle of being edited.
-        with suppress(LevelError):
-            names = (
-                "|".join(executor.wording(what, table.params, config.scene))
-                if what in NAMED
-                else ""
-            )
-        words.append(
-            " ".join(word for word in (what.name.lower(), names, goal_names(goals)) if word)
-        )
+        names: Sequence[str] = ()
+        if what is Operation.SET:
+            names = live_keys(executor.params)
+        elif what in NAMED:
+            # A table may be in the middle of being edited.
+            with suppress(LevelError):
+                names = executor.wording(what, table.params, config.scene)
+        wording = (what.name.lower(), "|".join(names), goal_names(goals))
+        words.append(" ".join(word for word in wording if word))
     return ", ".join(words)
+
+
+def live_params(config: RackConfig) -> dict[str, Sequence[str]]:
+    """Return the params that an operator may set live, by board; boards without any are omitted."""
+    return {
+        name: live_keys(find_class(config.board[name].executor, Executor).params)
+        for name, commands in commandable(config).items()
+        if Operation.SET in commands
+    }
+
+
+def launched_with(config: RackConfig, board: str, key: str) -> Any:
+    """Return a parameter of a board as it was launched; None: there is no such."""
+    kind = find_class(config.board[board].executor, Executor).params
+    if kind is None:
+        return None
+    return getattr(read_params(kind, config.board[board].params), key, None)
 
 
 def setting_name(config: RackConfig, board: str, number: int) -> str:

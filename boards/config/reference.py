@@ -169,7 +169,7 @@ def _key(name: str, entry: Schema, is_required: bool) -> Key:
         unit=unit[1] if unit else "",
         permitted=_permitted(entry),
         default=REQUIRED if is_required else "" if default in (None, [], {}) else shown(default),
-        meaning=UNIT.sub("", description, count=1),
+        meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
     )
 
 

@@ -35,7 +35,7 @@ Mode = Literal["realtime", "lockstep"]
 IdleCores = Literal["sleep", "awake"]
 OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
-Motion = Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do"]
+Motion = Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do", "set"]
 Power = Literal["enable", "disable", "reset", "release"]
 
 
@@ -415,7 +415,8 @@ class CommandConfig(Table):
         description=(
             "hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there;"
             " modify: put a control modification in or take it out; table: decide by another state"
-            " table; do: do one of the level's own commands; enable, disable: give torque to the"
+            " table; do: do one of the level's own commands; set: set a live parameter of"
+            " the level; enable, disable: give torque to the"
             " arm, or take it; reset: clear a fault of its drives; release: end robot.bring_up"
         )
     )
@@ -446,7 +447,7 @@ class CommandConfig(Table):
         None,
         description=(
             "control modification to put in or take out; name of a table; command to do, as in pick"
-            " block1"
+            " block1; parameter to set, as in bandwidth=80"
         ),
     )
     on: bool | None = Field(None, description="true: put it in; false: take it out")

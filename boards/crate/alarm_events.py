@@ -12,20 +12,23 @@ import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
+from rack.backplane.message import Message
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
-from rack.boards.config.commands import setting_name
+from rack.boards.config.commands import launched_with, setting_name
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.bounds import counting
 from rack.boards.faults.describe import board_of, joint_name, subject_of
 from rack.boards.faults.describe import describe as describe_fault
 from rack.boards.operator import describe, level_of, message_of
+from rack.levels.errors import LevelError
 from rack.levels.messages import Error
 from rack.levels.operator import Operation
+from rack.levels.tables import read_setting
 
 About = Literal["task", "mailbox", "joint", "geom", "name", "brakes", "nothing"]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
@@ -152,7 +155,8 @@ class AlarmWatch:
         # The cell is built at the first collision.
         geom = str if config.robot is None else partial(geom_name, config)
         name = partial(setting_name, config)
-        self._events = AlarmEvents(segment, config.joints, geom, name)
+        param = partial(launched_with, config)
+        self._events = AlarmEvents(segment, config.joints, geom, name, param)
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
@@ -174,7 +178,7 @@ class AlarmEvents:
     """Turns a rack's alarms into events.
 
     `joints` are the robot's; `geom` returns the name of a geom of the cell, `name` one of
-    `Executor.names` of a board.
+    `Executor.names` of a board, `param` the parameter that a board was launched with, by key.
     """
 
     def __init__(
@@ -183,6 +187,7 @@ class AlarmEvents:
         joints: Sequence[str],
         geom: Callable[[int], str] = str,
         name: Callable[[str, int], str] = lambda board, number: str(number),
+        param: Callable[[str, str], object] = lambda board, key: None,
     ) -> None:
         self._layout = segment.layout
         self._faults = FaultTable(segment)
@@ -190,6 +195,8 @@ class AlarmEvents:
         self._joints = joints
         self._geom = geom
         self._name = name
+        self._param = param
+        self._live: dict[tuple[str, str], object] = {}  # by board and key: params set since
 
     def of(self, row: np.void, owner: str) -> Event:
         """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring
@@ -221,7 +228,8 @@ class AlarmEvents:
             kind = "command"
             since = -1
             code = Operation(message.what).name.lower()
-            text = f"{describe(message)} (command {value:.0f})"
+            before = self._before(board, message) if message.what == Operation.SET else ""
+            text = f"{describe(message)}{before} (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
             demand = Demand(int(value))
             subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
@@ -271,6 +279,16 @@ class AlarmEvents:
         return subject, text.format(
             **named, value=value, span=self._span(value), late_ms=value * 1e-6
         )
+
+    def _before(self, board: str, command: Message) -> str:
+        """Return what a parameter was before a command that sets it."""
+        try:
+            key, value = read_setting(command.name)
+        except LevelError:  # given past the checks of a config: the level refuses it
+            return ""
+        before = self._live.get((board, key), self._param(board, key))
+        self._live[board, key] = value
+        return f", before {before}"
 
     def _duration(self, entry: FaultEntry, code: str) -> str:
         """Return the duration of a fault that begins, or how often a fault that ends has acted."""

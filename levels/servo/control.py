@@ -18,7 +18,7 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import ModifiableParams
-from rack.levels.tables import GripperConfig, Positive, Table
+from rack.levels.tables import LIVE, GripperConfig, Positive, Table
 
 Reacting = Literal["hold", "stop", "brake"]
 
@@ -27,9 +27,19 @@ class LoopGains(Table):
     """Gains of the joint loop."""
 
     bandwidth: Positive = Field(
-        60.0, le=400.0, description="natural frequency of the error in every joint, rad/s"
+        60.0,
+        le=400.0,
+        description="natural frequency of the error in every joint, rad/s",
+        json_schema_extra=LIVE,
     )
-    damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
+    damping: Positive = Field(
+        1.0, le=3.0, description="damping ratio of the error", json_schema_extra=LIVE
+    )
+
+    def fill(self, table: Array) -> None:
+        """Fill the first two rows of a law's constants: stiffness, 1/s2, and damping, 1/s."""
+        table[0] = self.bandwidth**2
+        table[1] = 2.0 * self.damping * self.bandwidth
 
 
 class ArmParams(Table):
@@ -93,8 +103,8 @@ class ComputedTorque:
         """Use `dynamics` of the cell: the arm's, which saves its limit gate another evaluation."""
         self._dynamics = dynamics
         table = np.zeros((5, len(cell.dof)))  # in the rows of `set_torque`
-        table[0] = params.bandwidth**2
-        table[1] = 2.0 * params.damping * params.bandwidth
+        self._constants = table
+        self.tune(params)
         table[2] = dynamics.dry
         table[3] = cell.bounds.torque
         self._torque: Array = table[4]
@@ -103,6 +113,10 @@ class ComputedTorque:
         self.cut = 0  # cycles in which a torque limit cut a torque
         self._payload: Payload | None = None
         self._inertia: Array | None = None  # (joints, joints), kg m2: planned
+
+    def tune(self, gains: LoopGains) -> None:
+        """Use these gains from now on."""
+        gains.fill(self._constants)
 
     def take(self, plan: Message) -> None:
         """Take a new plan."""
@@ -165,8 +179,12 @@ class SetPointLaw:
 
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:
         self._period_s = period_s
-        is_velocity = cell.interface == "velocity"
-        self._gain = 0.5 * params.bandwidth / params.damping if is_velocity else 0.0  # 1/s
+        self._is_velocity = cell.interface == "velocity"
+        self.tune(params)
+
+    def tune(self, gains: LoopGains) -> None:
+        """Use these gains from now on."""
+        self._gain = 0.5 * gains.bandwidth / gains.damping if self._is_velocity else 0.0  # 1/s
 
     def target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
         """Return the set points for a motion, with the arm at `position`, (joints,), rad, and

@@ -23,7 +23,7 @@ from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.servo.stopping import Reaction
-from rack.levels.tables import read_params
+from rack.levels.tables import read_params, set_live
 
 
 class ServoExecutor(ArmDriver):
@@ -45,6 +45,7 @@ class ServoExecutor(ArmDriver):
         Operation.RESUME: (),
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
+        Operation.SET: (),
         **dict.fromkeys(DRIVES, ()),
     }
     params: ClassVar[type[ServoParams]] = ServoParams
@@ -111,8 +112,18 @@ class ServoExecutor(ArmDriver):
         """Do what leaves the command in force as it is; return why not, empty: it does."""
         if command.what == Operation.MODIFY:
             return self._modified.obey(command)
+        if command.what == Operation.SET:
+            return self._tune(command.name)
         why = self.obey(command)
         self.reference.part = self.part
+        return why
+
+    def _tune(self, setting: str) -> str:
+        """Set a live parameter; return why not, empty: it is set."""
+        self.given, why = set_live(self.given, setting)
+        self._loop.tune(self.given)
+        if self.ahead is not None:
+            self.ahead.tune(self.given)
         return why
 
     def adopted(self) -> None:

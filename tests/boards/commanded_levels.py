@@ -6,9 +6,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import pydantic
+
 from rack.backplane.message import Field, Message, State, command, status
 from rack.levels.level import Executor, Input, Ports
 from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, Operation, Orders
+from rack.levels.tables import LIVE, Table, read_params, set_live
 
 STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: hold"))
 COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))
@@ -44,15 +47,28 @@ class Upper(Executor):
         self.orders = Orders(self.commands)
 
 
+class CountParams(Table):
+    """Params of the lower level."""
+
+    by: int = pydantic.Field(1, ge=1, le=9, description="counts in a cycle", json_schema_extra=LIVE)
+    label: str = ""
+
+
 class Lower(Executor):
-    """Counts, unless it is held from above or here; by two at a time while it is set to `twice`."""
+    """Counts, unless it is held from above or here; twice as fast while it is set to `twice`."""
 
     inputs = {
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
         "command": Input(STEP, "above.command"),
     }
     outputs = {"status": COUNTED}
-    commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.MODIFY: (Goal.ON, Goal.OFF)}
+    commands = {
+        Operation.HOLD: (),
+        Operation.RESUME: (),
+        Operation.MODIFY: (Goal.ON, Goal.OFF),
+        Operation.SET: (),
+    }
+    params = CountParams
     step = 1
 
     @classmethod
@@ -64,7 +80,7 @@ class Lower(Executor):
         """Take commands and count."""
         self.orders.take(read.operator, self._set)
         held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
-        write.status.count += 0 if held else self.step
+        write.status.count += 0 if held else self.step * self.given.by
         self.orders.done()
         self.orders.report(write.status, read.command.value.operator)
         write.status.state = State.EXECUTING
@@ -72,7 +88,12 @@ class Lower(Executor):
     def _set(self, command: Message) -> None:
         if command.what == Operation.MODIFY:
             self.step = 2 if command.goal == Goal.ON else 1
+        elif command.what == Operation.SET:
+            self.given, why = set_live(self.given, command.name)
+            if why:
+                self.orders.refuse(why)
 
     def self_test(self) -> None:
         """Begin without orders."""
+        self.given = read_params(CountParams, self.context.params)
         self.orders = Orders(self.commands)

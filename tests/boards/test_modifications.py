@@ -78,6 +78,9 @@ SWITCHED = commands(
 )
 
 
+TUNED = commands("level='shoulder', what='set', name='bandwidth=90', tick=300")
+
+
 class Ran(NamedTuple):
     """A run: its digest, its events, and the statuses of the board of the shoulder by tick."""
 
@@ -156,6 +159,18 @@ def test_a_run_with_switches_repeats_and_equals_that_without_modifications_up_to
         tick for tick in range(100, 400) if (without.torque(tick) != switched.torque(tick)).any()
     ]
     assert differs[0] == 301
+
+
+@pytest.mark.slow
+def test_gains_of_some_joints_are_set_live_from_the_cycle_after_their_tick(
+    run: Callable[..., Ran], without: Ran
+) -> None:
+    tuned = run(TUNED, "board.shoulder.params.modifications={}")
+    differs = [
+        tick for tick in range(100, 400) if (without.torque(tick) != tuned.torque(tick)).any()
+    ]
+    assert differs[0] == 301
+    assert "set bandwidth=90, before 60.0 (command 1)" in [event.text for event in tuned.events]
 
 
 @pytest.mark.slow

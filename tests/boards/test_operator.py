@@ -97,6 +97,64 @@ def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., Ra
     assert digests[0] == digests[1] != digests[2]
 
 
+SET = commands(
+    "level='lower', what='set', name='by=3', tick=101",
+    "level='lower', what='set', name='by=2', tick=200",
+)
+
+
+@pytest.mark.slow
+def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_values(
+    commanded: Callable[..., RackConfig],
+) -> None:
+    runs = [run(commanded(setting)) for setting in (SET, SET, "seed=0")]
+    assert runs[0][0].digest == runs[1][0].digest != runs[2][0].digest
+    _, events, boxes = runs[0]
+    rows = boxes["lower.status"]
+    steps = dict(zip(rows["tick"][1:].tolist(), np.diff(rows["message"]["count"]), strict=True))
+    assert [steps[tick] for tick in (101, 102, 200, 201)] == [1, 3, 3, 2]
+    seen = [event for event in events if event.kind == "command"]
+    assert [(e.tick, e.code, e.board, e.text) for e in seen] == [
+        (101, "set", "lower", "set by=3, before 1 (command 1)"),
+        (200, "set", "lower", "set by=2, before 3 (command 2)"),
+    ]
+
+
+@pytest.mark.slow
+def test_a_restarted_board_has_its_live_params_as_they_were_set(
+    commanded: Callable[..., RackConfig],
+) -> None:
+    config = commanded(SET)
+    config = config.model_copy(
+        update={"fault": (FaultConfig(kind="kill", board="lower", tick=250),)}
+    )
+    outcome, events, boxes = run(config, 2.0)
+    assert outcome.worked
+    assert [event.board for event in events if event.code == "rejoined"] == ["lower"]
+    assert np.diff(boxes["lower.status"]["message"]["count"])[-50:].tolist() == [2] * 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("table", "line"),
+    {
+        "level='lower', what='set', name='by=0'": "command[0].name.by = 0: should be greater than"
+        " or equal to 1; counts in a cycle",
+        "level='lower', what='set', name='label=1'": "command[0].name.label = 1: read at the launch"
+        " alone; live: by",
+        "level='lower', what='set'": "command[0].name: must be key=value, as in bandwidth=80",
+        "level='upper', what='set', name='by=1'": "command[0].what = \"set\": 'upper' does not take"
+        " set; it takes: hold, resume, goto home",
+    }.items(),
+)
+def test_a_setting_that_cannot_be_is_one_line(
+    commanded: Callable[..., RackConfig], table: str, line: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        wire(commanded(commands(table)))
+    assert str(caught.value) == line
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
 def test_commands_reach_their_level_under_any_protocol(

@@ -318,6 +318,13 @@ class Operator:
         self._rack.write(f"{level}.operator", message)
         return self.serial
 
+    def set(self, level: str, setting: str) -> int:
+        """Set a live parameter now; return the serial."""
+        message = self._message(level, Operation.SET, Goal.NONE)
+        message.name = setting
+        self._rack.write(f"{level}.operator", message)
+        return self.serial
+
     def _message(self, level: str, what: Operation, goal: Goal) -> Message:
         self.serial += 1
         message = self._rack.message(f"{level}.operator")

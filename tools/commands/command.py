@@ -20,7 +20,7 @@ from rack.tools.console.parameters import (
 )
 
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
-DONE_AT_ONCE = ("resume", "modify", "table", "enable", "disable", "reset", "release")
+DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
 """Commands that leave none in force."""
 
 Level = Annotated[
@@ -39,7 +39,7 @@ Goals = Annotated[
         metavar="GOAL",
         help=(
             "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify:"
-            " NAME on|off; for table: NAME; for do: the level's command"
+            " NAME on|off; for table: NAME; for do: the level's command; for set: KEY=VALUE"
         ),
     ),
 ]
@@ -84,6 +84,7 @@ def command(
               between two samples and without a step in the torque
     table     decide by another state table from now on
     do        do one of the level's own commands, in place of the level above
+    set       set a live parameter of the level, as 'rack set' does
     enable    ask the arm's drives for torque; the arm goes on from where it is
     disable   brake the arm, and take the torque from its drives
     reset     clear a fault of the arm's drives, which are then disabled
@@ -146,7 +147,7 @@ def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
                 f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2
             )
         return {"name": words[0], "on": words[1] == "on"}
-    if what in ("table", "do"):
+    if what in ("table", "do", "set"):
         return {"name": " ".join(words)}
     goal: dict[str, Any] = {}
     for word in words:

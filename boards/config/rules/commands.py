@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 
+from pydantic import ValidationError
+
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.boards.classes import find_class
 from rack.boards.config.cell import built_cell
-from rack.boards.config.mistakes import at_key
-from rack.boards.config.schema import CommandConfig, RackConfig
+from rack.boards.config.mistakes import at_key, mistakes_of
+from rack.boards.config.schema import BoardConfig, CommandConfig, RackConfig
 from rack.boards.config.wiring import commandable
 from rack.boards.errors import Mistake
 from rack.levels.errors import LevelError, RobotError
 from rack.levels.level import Executor
-from rack.levels.operator import NAMED, Commands, Goal, goal_names, listed
+from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names, listed
+from rack.levels.tables import live_keys, read_setting
 
 
 def command_mistakes(
@@ -52,7 +55,10 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         yield Mistake(at("what"), command.what, why)
         return
     yield from _goal(at, command, known)
-    yield from _name(at("name"), command, config)
+    if command.said is Operation.SET:
+        yield from _setting(place, command, config.board[command.level])
+    else:
+        yield from _name(at("name"), command, config)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
         yield from _joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
@@ -108,6 +114,28 @@ def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mi
             command.name,
             f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}",
         )
+
+
+def _setting(place: str, command: CommandConfig, board: BoardConfig) -> Iterator[Mistake]:
+    """Check that a command sets a live parameter of its level to a valid value."""
+    name = at_key(place, "name")
+    kind = find_class(board.executor, Executor).params
+    try:
+        key, value = read_setting(command.name or "")
+    except LevelError as error:
+        yield Mistake(name, command.name, str(error))
+        return
+    params = name if place else f"board.{command.level}.params"
+    live = live_keys(kind)
+    if kind is None or (key not in live and key in kind.model_fields):
+        why = f"read at the launch alone; live: {', '.join(live) or 'none'}"
+        yield Mistake(f"{params}.{key}", value, why)
+        return
+    given = {**board.params, key: value}
+    try:
+        kind.model_validate(given)
+    except ValidationError as error:
+        yield from mistakes_of(error, kind, given, params)
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:

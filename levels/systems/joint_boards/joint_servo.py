@@ -33,7 +33,7 @@ from rack.levels.systems.joint_boards.messages import (
     JOINT_STATUS,
     JOINT_TORQUE,
 )
-from rack.levels.tables import read_params
+from rack.levels.tables import read_params, set_live
 
 ARM_LOST = "no status from the board of the arm: waiting for it"
 
@@ -67,19 +67,19 @@ class JointServo(Executor):
         Operation.RESUME: (),
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
+        Operation.SET: (),
     }
     params = JointServoParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(JointServoParams, context.params)
+        self._given = params = read_params(JointServoParams, context.params)
         robot = context.robot
         cell = build_cell(robot, context.scene, context.clock_ns)
         names = robot.joints if params.joints is None else params.joints
         self._driven = np.array([name in names for name in robot.joints])
-        constants = np.zeros((5, len(robot.joints)))  # in the rows of `servo_joints`
-        constants[0] = params.bandwidth**2
-        constants[1] = 2.0 * params.damping * params.bandwidth
+        self._constants = constants = np.zeros((5, len(robot.joints)))  # rows of `servo_joints`
+        params.fill(constants)
         constants[2] = cell.model.dof_frictionloss[cell.dof]
         constants[3] = cell.bounds.torque
         constants[4] = self._driven
@@ -87,9 +87,8 @@ class JointServo(Executor):
         self.loads = JointLoads(cell)
         self._servo = partial(servo_joints.load(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
-        modify = self._modified.obey
         self.operator = OperatorControl(
-            self.commands, robot.joints, cell.limits.position, self._driven, obey=modify
+            self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey
         )
         # What the law sets for its modifications.
         self._unmodified: Array = np.zeros(7 * len(robot.joints))
@@ -172,6 +171,14 @@ class JointServo(Executor):
         torque.operator = operator.orders.rests_on(self._rests_on)
         self._report(write.status, arm, away, stopped)
         operator.orders.report(write.status, self._rests_on)
+
+    def _obey(self, command: Message) -> str:
+        """Modify the law, or set a live parameter; return why not, empty: it is done."""
+        if command.what == Operation.MODIFY:
+            return self._modified.obey(command)
+        self._given, why = set_live(self._given, command.name)
+        self._given.fill(self._constants)
+        return why
 
     def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
         """Replace the torques just set by those of the modified law."""

@@ -207,7 +207,8 @@ def test_a_refused_set_point_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("interface", SET_POINTS)
 def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
     cell: Cell = build_cell(pendulum(tmp_path, interface=interface), SceneConfig(), CLOCK_NS)
-    law = SetPointLaw(cell, LoopGains(bandwidth=60.0, damping=1.5), TICK_S)
+    law = SetPointLaw(cell, LoopGains(), TICK_S)
+    law.tune(LoopGains(bandwidth=60.0, damping=1.5))
     now, later = (np.array([[0.1, 0.2], [1.0, -1.0], [4.0, 8.0]]) for _ in range(2))
     later[1] += TICK_S * now[2]
     later[0] += TICK_S * 0.5 * (now[1] + later[1])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.operator_table import OperatorTable
-from rack.backplane.segment import Segment
+from rack.backplane.segment import Segment, racks
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import load
@@ -22,7 +22,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.live import desk
 from rack.tools.live.desk import LiveDesk, Replies
 from rack.tools.live.watched import LocalRack
-from tests.boards.commanded_racks import COMMANDED
+from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
@@ -121,7 +121,7 @@ def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
         row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)
     }
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
-    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off"
+    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off, set by"
 
 
 @pytest.mark.slow
@@ -169,6 +169,52 @@ def test_a_rack_in_real_time_without_one_highest_level_cannot_be_paused(
     done = rack("pause", running)
     assert done.returncode == 1
     assert done.stderr.endswith(f"highest: {', '.join(levels) or 'none'}\n")
+
+
+@pytest.mark.slow
+def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
+    done = rack("set", running, "board.lower.params.by=2", "--json")
+    answer = json.loads(done.stdout)
+    assert (done.returncode, answer["text"], answer["fate"]) == (0, "set by=2", "done")
+    for setting, line in {
+        "board.lower.params.by=0": "board.lower.params.by = 0: should be greater than or equal to"
+        " 1; counts in a cycle",
+        "board.lower.params.bye=1": "board.lower.params.bye = 1: unknown key; did you mean 'by'?",
+        "board.lower.params.label='x'": 'board.lower.params.label = "x": read at the launch alone;'
+        " live: by",
+        "board.lower.params.by": 'name = "by": must be key=value, as in bandwidth=80',
+        "clock.speed=2": "clock.speed=2: no level reads it while it runs; live:"
+        " board.lower.params.by",
+    }.items():
+        done = rack("set", running, setting)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.rstrip().endswith(line)
+        assert len(done.stderr.splitlines()) == 1
+    assert rack("set", running, "board.lower.params.by=1").returncode == 0
+
+
+@pytest.mark.slow
+def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
+    rack_name: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "told.toml"
+    path.write_text(COMMANDED)
+    run = ("run", path, "--no-record", "--json", "--seconds", "1", "--set", f"name={rack_name}")
+    held = subprocess.Popen(
+        [*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    wait_until(lambda: rack_name in racks() and Segment.attach(rack_name).words[System.HELD])
+    given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")
+    assert (given.returncode, " set by=3: waits: the rack is held before" in given.stdout) == (
+        0,
+        True,
+    )
+    assert rack("resume", rack_name).returncode == 0
+    answer, _ = held.communicate(timeout=BOUND_S)
+    command = commands("level='lower', what='set', name='by=3', tick=101")
+    repeated = rack(*run, "--set", command).stdout
+    digests = [json.loads(text)["digest"] for text in (answer, repeated, rack(*run).stdout)]
+    assert digests[0] == digests[1] != digests[2]
 
 
 REFUSED = {

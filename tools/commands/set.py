@@ -1,0 +1,55 @@
+"""`rack set`: set a live parameter of a running rack."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rack.boards.config import loads
+from rack.boards.config.commands import live_params
+from rack.tools.commands.command import At, Tick
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import Json, RackName
+from rack.tools.live.desk import LiveDesk
+from rack.tools.live.watched import LocalRack
+
+Setting = Annotated[
+    str,
+    typer.Argument(metavar="KEY=VALUE", help="as in board.servo.params.bandwidth=80"),
+]
+
+
+def set_param(
+    rack: RackName, setting: Setting, tick: Tick = None, at: At = None, as_json: Json = False
+) -> None:
+    """Set a live parameter of a running rack, between two cycles of its level.
+
+    'rack schema' marks those that a level declares as live; all others are read at the launch
+    alone. This is an operator's command: the level sets it again when its board is restarted, and a
+    run in lockstep repeats with the same command, what = "set", in its config.
+
+    Exit status: 0 the parameter is set; 1 the level refused it, or did not answer in time; 2 it is
+    not live, or the value is not valid.
+
+    \b
+    Examples:
+      rack set nasrem board.servo.params.bandwidth=80
+      rack set nasrem board.servo.params.damping=0.8 --at 12.5
+    """
+    place, _, _ = setting.partition("=")[0].rpartition(".")
+    with INTERRUPT.raising(), LocalRack(rack) as one:
+        live = live_params(loads(one.segment.config))
+        level = next((level for level in live if place == f"board.{level}.params"), None)
+        if level is None:
+            known = [f"board.{board}.params.{key}" for board, keys in live.items() for key in keys]
+            raise Failure(
+                f"{setting}: no level reads it while it runs; live: {', '.join(known) or 'none'}", 2
+            )
+        name = setting.removeprefix(f"{place}.")
+        given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
+        reply = LiveDesk(one).give(given, wait=False)
+    print_answer(reply.document(), reply.line, as_json)
+    if not reply.worked:
+        raise typer.Exit(1)
