@@ -213,25 +213,23 @@ def _cell(column: str, value: Any) -> str:
 
 
 def line_of(snapshot: Snapshot) -> str:
-    """Return the rack as one plain line, for where there is no terminal."""
-    missed = sum(row.missed for row in snapshot.tasks)
-    skipped = sum(row.skipped for row in snapshot.tasks)
-    line = (
-        f"{snapshot.rack} {snapshot.time_s:8.2f} s  tick {snapshot.tick}  missed {missed}  skipped"
-        f" {skipped}"
-    )
-    if snapshot.run in (DEAD, GONE):
-        line += f"  {snapshot.run}"
+    """Return the rack as one short line, for where there is no terminal: what holds it and its
+    faults are counted."""
+    counts = {
+        "missed": sum(row.missed for row in snapshot.tasks),
+        "skipped": sum(row.skipped for row in snapshot.tasks),
+        "lost": sum(row.state == LOST for row in snapshot.tasks),
+        "holds": len(snapshot.holds),
+        "faults": len(snapshot.faults),
+    }
+    parts = [f"{snapshot.rack} {snapshot.time_s:.2f} s", f"tick {snapshot.tick}"]
+    parts += [snapshot.run] if snapshot.run in (DEAD, GONE) else []
+    parts += [f"{name} {n}" for name, n in counts.items() if n or name in ("missed", "skipped")]
     at = snapshot.progress
-    if at is not None:
-        line += (
-            f"  task {at.state}, action {at.actions_done}/{at.actions}, move"
-            f" {at.moves_done}/{at.moves}"
-        )
-    lost = [f"{row.task} {LOST}" for row in snapshot.tasks if row.state == LOST]
-    holds = [hold.line for hold in snapshot.holds]
+    parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
+    # What follows a colon is in the table.
     return "  ".join(
-        [line, *snapshot.lines, *_demanded(snapshot), *lost, *_reasons(snapshot), *holds]
+        [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_demanded(snapshot)]
     )
 
 
