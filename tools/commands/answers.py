@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING
 from rack.tools.console.answer import Failure, print_answer, print_json
 
 if TYPE_CHECKING:
-    from rack.backplane.segment import Segment
     from rack.tools.console.address import Asker
-    from rack.tools.live.snapshot import Snapshot
 
 
 def list_racks(as_json: bool) -> None:
@@ -61,15 +59,11 @@ def describe(name: str) -> dict[str, str | int | float]:
 def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
     one."""
-    from rack.backplane.segment import Segment
+    from rack.tools.live.snapshot import RackMonitor
+    from rack.tools.live.watched import watched
 
-    if rack is not None and "/" in rack:
-        from rack.tools.live.watched import watched
-
-        with watched(rack, asker) as far:
-            found = _looked_at(far.segment)
-    else:
-        found = _looked_at(Segment.attach(rack or _only_rack()))
+    with watched(rack or only_rack(), asker) as one:
+        found = RackMonitor(one.segment).look()
     if as_json:
         print_json(asdict(found))
         return
@@ -79,13 +73,8 @@ def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> 
     console().print(RackView(found))
 
 
-def _looked_at(segment: Segment) -> Snapshot:
-    from rack.tools.live.snapshot import RackMonitor
-
-    return RackMonitor(segment).look()
-
-
-def _only_rack() -> str:
+def only_rack() -> str:
+    """Return the only rack on this machine. Raises `Failure` if there is not exactly one."""
     from rack.backplane.segment import racks
 
     running = racks()

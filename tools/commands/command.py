@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -19,7 +18,6 @@ from rack.tools.console.parameters import (
     check_timeout,
 )
 
-GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
 """Commands that leave none in force."""
 
@@ -112,7 +110,7 @@ def command(
       rack command 192.168.1.5/cell task hold --certificates ~/cell
     """
     from rack.tools.console.tables import terminal_width
-    from rack.tools.live.desk import LiveDesk
+    from rack.tools.live.desk import LiveDesk, goal_of
     from rack.tools.live.holds import resume_command
     from rack.tools.live.watched import watched
 
@@ -134,42 +132,3 @@ def command(
         raise typer.Exit(1)
     if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
-
-
-def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
-    """Return what follows the verb, as in a `[[command]]` table.
-
-    Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
-    """
-    if what == "modify":
-        if len(words) != 2 or words[1] not in ("on", "off"):
-            raise Failure(
-                f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2
-            )
-        return {"name": words[0], "on": words[1] == "on"}
-    if what in ("table", "do", "set"):
-        return {"name": " ".join(words)}
-    goal: dict[str, Any] = {}
-    for word in words:
-        key, is_given, values = word.partition("=")
-        if word == "home":
-            goal["home"] = True
-        elif not is_given or key not in GOAL_KEYS:
-            permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
-            raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
-        elif key in goal:
-            raise Failure(f"'{word}': {key} is given twice", 2)
-        else:
-            goal[key] = [_number(value, word) for value in values.split(",")]
-    return goal
-
-
-def _number(text: str, word: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        why = (
-            f"'{text}' is not a number; permitted: numbers separated by commas, as in"
-            " joints=0,0.5,1"
-        )
-        raise Failure(f"'{word}': {why}", 2) from None

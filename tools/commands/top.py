@@ -2,33 +2,63 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+from importlib.util import find_spec
 
+from rack.tools.commands.answers import only_rack
+from rack.tools.commands.status import OnlyRack
 from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import AnyRackName, AskAs, Certificates
+from rack.tools.console.parameters import AskAs, Certificates
 
 LOOK_S = 0.2
 """Time from look to look: short, so that the end of a run on another machine is still seen."""
 
 
-def top(rack: AnyRackName, certificates: Certificates = "", name: AskAs = OPERATOR) -> None:
+def top(rack: OnlyRack = None, certificates: Certificates = "", name: AskAs = OPERATOR) -> None:
     """Watch a running rack until its run is over, or until Ctrl-C.
 
-    On a terminal the table of `rack status` changes in place; elsewhere one line a second is
-    printed. Watching costs the rack no deadline, and ending it does not end the run.
+    On a terminal it fills the screen, if textual is there (pip install 'nasrem-rack[live]'), and
+    keys command the rack; a rack of another machine, HOST/RACK, has the table of `rack status`,
+    which changes in place. Elsewhere one line a second is printed. Watching costs the rack no
+    deadline, and ending it does not end the run.
+
+    \b
+    1 2 3 4  boards, mailboxes, events, lateness
+    l        the level that keys command, shown in reverse
+    h r      hold it, let it resume
+    c        type a command, as in: task goto home
+    i        choose a fault, change it, inject it
+    e E      set the emergency stop, reset it
+    w q      forget the worst times, leave
 
     \b
     Examples:
+      rack top
       rack top nasrem
       rack top 192.168.1.5/cell --certificates ~/cell
     """
+    from rack.tools.console.tables import console
     from rack.tools.live.display import display_for
     from rack.tools.live.snapshot import RackMonitor
-    from rack.tools.live.watched import watched
+    from rack.tools.live.watched import LocalRack, watched
 
     ended = threading.Event()
-    with INTERRUPT.orderly(ended.set), watched(rack, Asker.of(name, certificates)) as one:
+    with (
+        INTERRUPT.orderly(ended.set),
+        watched(rack or only_rack(), Asker.of(name, certificates)) as one,
+    ):
+        if isinstance(one, LocalRack) and console().is_terminal and sys.stdin.isatty():
+            if find_spec("textual") is not None:
+                from rack.tools.live.full_screen import RackScreen
+
+                screen = RackScreen(one, ended.is_set)
+                screen.run()
+                sys.exit(screen.return_code)
+            print(
+                "no full screen without textual: pip install 'nasrem-rack[live]'", file=sys.stderr
+            )
         monitor = RackMonitor(one.segment)
         with display_for(silent=False) as display:
             display.show(monitor.look())

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -37,6 +37,7 @@ SILENT_S = 5.0
 """Time without a tick after which a wait is given up."""
 NOTE_S = 1.5
 """Time after which a wait is explained on stderr."""
+GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
 Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 
@@ -211,6 +212,45 @@ class LiveDesk:
         if seen is None or not seen.is_there or not seen.value.standing:
             return ""
         return Operation(seen.value.standing).name.lower()
+
+
+def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return what follows the verb, as in a `[[command]]` table.
+
+    Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
+    """
+    if what == "modify":
+        if len(words) != 2 or words[1] not in ("on", "off"):
+            raise Failure(
+                f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2
+            )
+        return {"name": words[0], "on": words[1] == "on"}
+    if what in ("table", "do", "set"):
+        return {"name": " ".join(words)}
+    goal: dict[str, Any] = {}
+    for word in words:
+        key, is_given, values = word.partition("=")
+        if word == "home":
+            goal["home"] = True
+        elif not is_given or key not in GOAL_KEYS:
+            permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
+            raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
+        elif key in goal:
+            raise Failure(f"'{word}': {key} is given twice", 2)
+        else:
+            goal[key] = [_number(value, word) for value in values.split(",")]
+    return goal
+
+
+def _number(text: str, word: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        why = (
+            f"'{text}' is not a number; permitted: numbers separated by commas, as in"
+            " joints=0,0.5,1"
+        )
+        raise Failure(f"'{word}': {why}", 2) from None
 
 
 def _answering(segment: Segment, level: str) -> MailboxSpec | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -112,11 +112,11 @@ class LiveDisplay(Display):
 
     def show_event(self, event: Event) -> None:
         """Print the event above the table."""
-        if _is_shown(event):
+        if is_shown(event):
             style = EVENTS.get(event.kind, OTHER_EVENTS)
             # The terminal wraps it, not rich: a command in it can still be copied.
             self._live.console.print(
-                _line(event), style=style, highlight=False, markup=False, soft_wrap=True
+                event_line(event), style=style, highlight=False, markup=False, soft_wrap=True
             )
 
 
@@ -137,8 +137,8 @@ class PlainDisplay(Display):
 
     def show_event(self, event: Event) -> None:
         """Print the event."""
-        if _is_shown(event):
-            print(_line(event), flush=True)
+        if is_shown(event):
+            print(event_line(event), flush=True)
 
 
 @contextmanager
@@ -159,9 +159,11 @@ def display_for(silent: bool) -> Iterator[Display]:
 @dataclass(frozen=True)
 class RackView:
     """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults,
-    holds, progress."""
+    holds, progress. A narrow terminal leaves out the columns `dropped`, in that order."""
 
     snapshot: Snapshot
+    columns: Mapping[str, Callable[[TaskRow], str]] = field(default_factory=lambda: COLUMNS)
+    dropped: Sequence[str] = DROPPED
 
     def __rich_console__(
         self, terminal: Console, options: ConsoleOptions
@@ -170,8 +172,8 @@ class RackView:
         snapshot = self.snapshot
         width = options.max_width
         yield _head(snapshot)
-        cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
-        yield grid(list(COLUMNS), cells, width, DROPPED, _style)
+        cells = [[cell(row) for cell in self.columns.values()] for row in snapshot.tasks]
+        yield grid(list(self.columns), cells, width, self.dropped, _style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         for rows in (
             snapshot.hosts,
@@ -295,11 +297,13 @@ def _bar(progress: TaskProgress, width: int) -> RenderableType:
     return row
 
 
-def _is_shown(event: Event) -> bool:
+def is_shown(event: Event) -> bool:
+    """Return whether an event is more than the table shows."""
     is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
     return event.kind not in QUIET and not is_brief
 
 
-def _line(event: Event) -> str:
+def event_line(event: Event) -> str:
+    """Return an event as one line."""
     board = f"{event.board}: " if event.board else ""
     return f"{f'tick {event.tick} ' if event.code else ''}{event.kind}: {board}{event.text}"

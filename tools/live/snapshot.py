@@ -7,6 +7,8 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
@@ -119,6 +121,8 @@ class RackMonitor:
         self._network = Network(segment)
         self._joints = joint_names(segment.config)
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+        self.cycles: dict[str, np.ndarray] = {}
+        """Trace records of each task that the last look took."""
         self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(
             self._traces, (None, None)
         )
@@ -241,7 +245,7 @@ class RackMonitor:
     def _times_ms(self, task: str) -> tuple[float | None, float | None]:
         """Return the longest execution and lateness of the cycles since the last look that saw
         any."""
-        cycles = self._traces[task].drain().rows
+        self.cycles[task] = cycles = self._traces[task].drain().rows
         if len(cycles):
             self._times[task] = (
                 float(execution_ns(cycles).max()) * 1e-6,

@@ -8,10 +8,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 from rack.backplane.segment import Segment
-from rack.tools.console.address import Asker, RackAddress, needing_zenoh
 
 if TYPE_CHECKING:
     from rack.backplane.operator_table import Request, RequestEntry
+    from rack.tools.console.address import Asker
 
 LOOK_S = 0.001
 
@@ -86,6 +86,9 @@ def watched(rack: str, asker: Asker | None = None) -> WatchedRack:
     """
     if "/" not in rack:
         return LocalRack(rack)
+    # Here, not above: `rack status` of a rack on this machine does without a parser.
+    from rack.tools.console.address import Asker, RackAddress, needing_zenoh
+
     address = RackAddress.of(rack)
     with needing_zenoh():
         from rack.tools.network.remote import RemoteRack

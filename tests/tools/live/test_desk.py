@@ -17,10 +17,9 @@ from rack.backplane.segment import Segment, racks
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.commands.command import goal_of
 from rack.tools.console.answer import Failure
 from rack.tools.live import desk
-from rack.tools.live.desk import LiveDesk, Replies
+from rack.tools.live.desk import LiveDesk, Replies, goal_of
 from rack.tools.live.watched import LocalRack
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, wait_until

@@ -1,0 +1,181 @@
+"""The full screen of `rack top`, on a rack in lockstep: what it shows, and what its keys do."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+from collections.abc import Awaitable, Callable, Iterator
+from html import unescape
+from pathlib import Path
+
+import pytest
+from textual.pilot import Pilot
+from textual.widgets import Input
+
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import System
+from rack.tools.live.full_screen import RackScreen
+from rack.tools.live.watched import LocalRack
+from tests.boards.commanded_racks import COMMANDED
+from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def running(rack_name: str, tmp_path: Path) -> Iterator[str]:
+    """The name of a rack that runs until it is stopped."""
+    path = tmp_path / "commanded.toml"
+    path.write_text(COMMANDED)
+    command = [*RACK, "run", str(path), "--no-record", "--set", f"name={rack_name}"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(rack_name) and "tick 0 " not in line:
+            break
+    yield rack_name
+    rack("stop", rack_name)
+    process.kill()
+    process.communicate()
+
+
+def on_screen(
+    name: str, act: Callable[[Pilot[None]], Awaitable[None]], size: tuple[int, int] = (80, 24)
+) -> None:
+    """Do something at the screen of a rack."""
+
+    async def attached() -> None:
+        with LocalRack(name) as one:
+            async with RackScreen(one, lambda: False).run_test(size=size) as pilot:
+                await act(pilot)
+
+    asyncio.run(asyncio.wait_for(attached(), 3 * BOUND_S))
+
+
+def seen(pilot: Pilot[None]) -> str:
+    """Return what the screen shows."""
+    return unescape(pilot.app.export_screenshot()).replace("\N{NO-BREAK SPACE}", " ")
+
+
+async def shows(pilot: Pilot[None], *words: str) -> None:
+    """Wait until the screen shows all of these."""
+    async with asyncio.timeout(BOUND_S):
+        while not all(word in seen(pilot) for word in words):
+            await pilot.pause(0.05)
+
+
+async def write(pilot: Pilot[None], text: str) -> None:
+    """Write a command, and send it."""
+    await pilot.press("c")
+    pilot.app.query_one(Input).value = text
+    await pilot.press("enter")
+
+
+def test_the_panes_show_boards_mailboxes_events_and_lateness(running: str) -> None:
+    async def act(pilot: Pilot[None]) -> None:
+        await shows(pilot, running, "upper", "lower", "missed", "slice", "executing")
+        await pilot.press("2")
+        await shows(pilot, "upper.command", "readers", "50.", "400.")
+        await pilot.press("4")
+        await shows(pilot, "late us", "upper", "█")
+        await pilot.press("l")
+        await shows(pilot, "lower")
+        await write(pilot, "lower modify twice on")
+        await pilot.press("3")
+        await shows(pilot, "command: lower: modify twice on")
+
+    on_screen(running, act)
+
+
+def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
+    async def act(pilot: Pilot[None]) -> None:
+        await pilot.press("h")
+        await shows(pilot, "upper held by the operator", f"rack command {running} upper resume")
+        await pilot.press("r")
+        async with asyncio.timeout(BOUND_S):
+            while "held by the operator" in seen(pilot):
+                await pilot.pause(0.05)
+        await pilot.press("l", "h")
+        await shows(pilot, "lower held by the operator")
+
+    on_screen(running, act, (100, 30))
+
+
+def test_a_fault_of_the_menu_strikes_the_chosen_level(running: str) -> None:
+    async def act(pilot: Pilot[None]) -> None:
+        await pilot.press("i")
+        await shows(pilot, "kill")
+        await pilot.press("enter")
+        assert pilot.app.query_one(Input).value == "inject upper kill"
+        pilot.app.query_one(Input).value = "inject upper mute for=100s"
+        await pilot.press("enter")
+        await shows(pilot, "fault: mute of upper")
+        await pilot.press("3")
+        await shows(pilot, "fault: upper: mute begins, for 40000 ticks")
+
+    on_screen(running, act, (100, 30))
+
+
+def test_keys_set_the_emergency_stop_and_reset_it(running: str) -> None:
+    segment = Segment.attach(running)
+    stop = UtilityLines(segment)
+
+    async def act(pilot: Pilot[None]) -> None:
+        await pilot.press("e")
+        assert stop.emergency_stop
+        await shows(pilot, "EMERGENCY STOP")
+        await pilot.press("E")
+        assert not stop.emergency_stop
+
+    on_screen(running, act)
+
+
+def test_what_cannot_be_done_is_answered(running: str) -> None:
+    segment = Segment.attach(running)
+    answers = {
+        "upper": "'upper': permitted: LEVEL WHAT",
+        "nobody hold": "nobody",
+        "upper goto nowhere": "'nowhere': not a goal",
+        "upper fly": "fly",
+        "inject upper flop": "flop",
+        "inject upper mute for=ages": "ages",
+    }
+
+    async def act(pilot: Pilot[None]) -> None:
+        await pilot.press("3")
+        for text, answer in answers.items():
+            await write(pilot, text)
+            await shows(pilot, answer)
+
+    on_screen(running, act, (100, 40))
+    assert segment.words[System.COMMANDED] == segment.words[System.INJECTED] == 0
+
+
+def test_a_screen_of_twenty_by_five_loses_nothing_and_the_rack_runs_on(running: str) -> None:
+    segment = Segment.attach(running)
+
+    async def act(pilot: Pilot[None]) -> None:
+        for pane in "1234":
+            await pilot.press(pane, "i", "escape", "c", "escape")
+            await pilot.resize_terminal(20, 5)
+            await pilot.pause(0.3)
+            await pilot.resize_terminal(120, 40)
+        before = segment.words[System.TICK]
+        await pilot.press("1")
+        await shows(pilot, "upper", "lower", "executing")
+        assert segment.words[System.TICK] > before
+
+    on_screen(running, act)
+
+
+def test_the_screen_ends_with_the_run(running: str) -> None:
+    async def act(pilot: Pilot[None]) -> None:
+        assert rack("stop", running).returncode == 0
+        async with asyncio.timeout(BOUND_S):
+            while pilot.app.is_running:
+                await pilot.pause(0.05)
+
+    on_screen(running, act)
+    wait_until(lambda: running not in racks(), BOUND_S)

@@ -1,0 +1,257 @@
+"""The full screen of `rack top`: boards, mailboxes, events and lateness of a rack, and keys that
+command it. It needs textual.
+
+It reads rings and words, five times a second. Commands that wait for an answer run in a thread.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import ceil
+
+from rich.console import RenderableType
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import Binding
+from textual.containers import VerticalScroll
+from textual.widget import Widget
+from textual.widgets import Footer, Input, OptionList, Static, TabbedContent, TabPane
+from textual.widgets.option_list import Option
+
+from rack.backplane.errors import BackplaneError
+from rack.backplane.lines import UtilityLines
+from rack.boards.config import loads
+from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.errors import BoardError
+from rack.boards.faults import KINDS
+from rack.levels.errors import LevelError
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import GAP, decimal, grid
+from rack.tools.faults.live import LiveRack
+from rack.tools.live import display
+from rack.tools.live.desk import LiveDesk, goal_of
+from rack.tools.live.gauges import LATE_US, Gauges
+from rack.tools.live.snapshot import RackMonitor, Snapshot
+from rack.tools.live.watched import LocalRack
+
+LOOK_S = 0.2
+DROPPED = (*display.DROPPED[:-2], "command")
+"""Columns of the boards that a narrow terminal leaves out, in this order."""
+HISTOGRAM = 16
+"""Longest bar of the lateness histogram, in characters."""
+INJECT = "inject"
+"""First word of a fault on the command line; with any other it is a command to that level."""
+OWN_PROCESS = [kind.name for kind in KINDS if kind.where == "core"]
+"""Kinds whose process takes a core: it must not be this one."""
+
+
+class RackScreen(App[None]):
+    """Shows one rack until its run is over, or `has_ended`."""
+
+    CSS = """
+    Screen { overflow: hidden; }
+    #head, #levels { height: 1; }
+    TabbedContent { height: 1fr; }
+    TabPane { padding: 0; }
+    Input, OptionList { display: none; max-height: 50%; }
+    .open { display: block; }
+    """
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS = [
+        Binding("h", "give('hold')", "hold"),
+        Binding("r", "give('resume')", "resume"),
+        Binding("l", "level", "level"),
+        Binding("c", "write('')", "command"),
+        Binding("i", "kinds", INJECT),
+        Binding("e", "stop", "estop"),
+        Binding("E", "carry_out(['reset'])", "reset"),
+        Binding("w", "worst", "worst"),
+        Binding("q", "quit", "quit"),
+        Binding("escape", "close", show=False),
+        Binding("ctrl+c", "interrupt", show=False, priority=True),
+        *(Binding(str(number), f"pane({number})", show=False) for number in (1, 2, 3, 4)),
+    ]
+
+    def __init__(self, rack: LocalRack, has_ended: Callable[[], bool]) -> None:
+        super().__init__()
+        segment = rack.segment
+        self._rack = rack
+        self._has_ended = has_ended
+        self._looks = RackMonitor(segment)
+        self._gauges = Gauges(segment)
+        self._alarms = AlarmWatch(segment, loads(segment.config))
+        self._lines = UtilityLines(segment)
+        self._events: deque[Text] = deque(maxlen=500)  # newest first
+        self._levels = deque(self._gauges.levels)
+        self._panes: dict[str, Callable[[Snapshot], RenderableType]] = {
+            "boards": self._boards,
+            "mailboxes": self._mailboxes,
+            "events": lambda snapshot: Text("\n").join(list(self._events)),
+            "lateness": self._lateness,
+        }
+
+    def compose(self) -> ComposeResult:
+        """Yield the parts of the screen."""
+        yield Static(id="head")
+        yield Static(id="levels")
+        with TabbedContent():
+            for number, name in enumerate(self._panes, 1):
+                with TabPane(f"{number} {name}", id=name), VerticalScroll():
+                    yield Static()
+        yield OptionList()
+        yield Input(placeholder="LEVEL WHAT [GOAL], as in: task goto home", compact=True)
+        yield Footer(compact=True)
+
+    def on_mount(self) -> None:
+        """Look at once, and again and again."""
+        self._look()
+        self.set_interval(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        """Show the rack as it is now."""
+        if self._rack.segment.run_is_over or self._has_ended():
+            self.exit()
+            return
+        snapshot = self._looks.look()
+        self._gauges.take(self._looks.cycles)
+        for event in (alarm.event for alarm in self._alarms.drain()):
+            if display.is_shown(event):
+                style = display.EVENTS.get(event.kind, display.OTHER_EVENTS)
+                self._events.appendleft(Text(display.event_line(event), style))
+        self.query_one("#head", Static).update(Text(display.line_of(snapshot)))
+        self.query_one("#levels", Static).update(self._hierarchy(snapshot))
+        pane = self.query_one(TabbedContent).active
+        self.query_one(f"#{pane} Static", Static).update(self._panes[pane](snapshot))
+
+    def _hierarchy(self, snapshot: Snapshot) -> Text:
+        """Return the levels coloured by state; the one that keys command is reversed."""
+        states = {row.task: row.state for row in snapshot.tasks}
+        chosen = {self._levels[0]: "reverse"}
+        levels = [
+            Text(name, f"{display.STATES.get(states[name], '')} {chosen.get(name, '')}")
+            for name in self._gauges.levels
+        ]
+        return Text(" > ").join(levels)
+
+    def _boards(self, snapshot: Snapshot) -> RenderableType:
+        gauges = self._gauges
+        # Short names: eighty characters hold what matters.
+        columns = {
+            **display.COLUMNS,
+            "task": lambda row: row.task.replace(".planner", "*"),
+            "exec ms": lambda row: decimal(gauges.worst_ms[row.task][1], 2),
+            "late ms": lambda row: decimal(gauges.worst_ms[row.task][0], 2),
+            "slice": lambda row: gauges.bar(row.task),
+            "plan s": lambda row: decimal(gauges.age_s(f"{row.task}.plan"), 2),
+            "command": lambda row: gauges.work(row.task),
+        }
+        return display.RackView(snapshot, columns, DROPPED)
+
+    def _mailboxes(self, snapshot: Snapshot) -> RenderableType:
+        head = ("mailbox", "writer", "readers", "age s", "mean Hz")
+        return grid(head, [*self._gauges.traffic()], self.size.width - GAP, ("writer",))
+
+    def _lateness(self, snapshot: Snapshot) -> RenderableType:
+        counts = self._gauges.late[self._levels[0]]
+        bars = [
+            [f"< {border:g}", str(count), "█" * ceil(HISTOGRAM * count / counts.max())]
+            for border, count in zip(LATE_US[1:], counts.tolist(), strict=True)
+            if count
+        ]
+        return grid(("late us", "cycles", self._levels[0]), bars, self.size.width)
+
+    def action_pane(self, number: int) -> None:
+        """Show one pane."""
+        self.query_one(TabbedContent).active = [*self._panes][number - 1]
+
+    def action_level(self) -> None:
+        """Let keys command the next level."""
+        self._levels.rotate(-1)
+
+    def action_worst(self) -> None:
+        """Forget the worst times and the lateness so far."""
+        self._gauges.reset()
+
+    def action_interrupt(self) -> None:
+        """End as Ctrl-C ends every command."""
+        signal.raise_signal(signal.SIGINT)
+
+    def action_stop(self) -> None:
+        """Set the emergency stop; the first line shows it."""
+        self._lines.latch_emergency_stop()
+
+    def action_give(self, what: str) -> None:
+        """Give a command without a goal to the level."""
+        self.action_carry_out([self._levels[0], what])
+
+    def action_kinds(self) -> None:
+        """Open the menu of faults."""
+        options = self.query_one(OptionList)
+        options.clear_options()
+        for kind in KINDS:
+            words = [INJECT, self._levels[0], kind.name]
+            words += [f"{p.name}=" for p in kind.parameters if p.default is None]
+            words += [] if kind.once else ["for=1s"]
+            options.add_option(Option(Text(f"{kind.name:18}{kind.means}"), " ".join(words)))
+        options.highlighted = 0
+        self._open(options)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        """Write the fault on the command line, where it can be changed before it is sent."""
+        self.action_write(event.option_id or "")
+
+    def action_write(self, text: str) -> None:
+        """Open the command line."""
+        line = self.query_one(Input)
+        self._open(line)
+        line.value = text
+        line.action_end()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Carry out what is written."""
+        self.action_close()
+        self.action_carry_out(event.value.split())
+
+    def action_close(self) -> None:
+        """Close menu and command line."""
+        self.query(".open").remove_class("open")
+        self.set_focus(None)
+
+    def _open(self, widget: Widget) -> None:
+        self.action_close()
+        widget.add_class("open")
+        widget.focus()
+
+    def action_carry_out(self, words: Sequence[str]) -> None:
+        """Carry out a command, and show its answer when it has come."""
+        self.run_worker(partial(self._answer, words), thread=True)
+
+    def _answer(self, words: Sequence[str]) -> None:
+        """Carry out a command, in a thread: its level may take seconds to answer."""
+        try:
+            answer = self._result(words)
+        except (Failure, BackplaneError, BoardError, LevelError) as error:
+            answer = str(error)
+        self._events.appendleft(Text(answer))
+        self.notify(answer, markup=False)
+
+    def _result(self, words: Sequence[str]) -> str:
+        """Return the answer to a command."""
+        match words:
+            case ["reset"]:
+                self._lines.reset_emergency_stop()
+                return "the emergency stop is reset"
+            case [first, board, kind, *given] if first == INJECT:
+                if kind in OWN_PROCESS:
+                    raise Failure(f"{kind}: needs a process of its own: rack inject")
+                values = dict(word.partition("=")[::2] for word in given)
+                live = LiveRack(self._rack.segment.rack)
+                fault = {"board": board, "kind": kind, **values}
+                return str(live.inject(fault, wait=False)["message"])
+            case [level, what, *goal]:
+                command = {"level": level, "what": what, **goal_of(what, goal)}
+                return LiveDesk(self._rack).give(command, wait=False).line
+        raise Failure(f"'{' '.join(words)}': permitted: LEVEL WHAT [GOAL], {INJECT} BOARD KIND ...")
