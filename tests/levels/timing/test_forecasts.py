@@ -45,7 +45,8 @@ def budgets(rack: RackTiming, share: float) -> dict[str, Budget]:
 
 def model(rack: RackTiming) -> Iterable[object]:
     """Return all that the model says."""
-    until_ns = PERIODS * max(task.every_ns * task.within_cycles for task in rack.tasks)
+    cycles_ns = [task.every_ns * task.within_cycles for task in rack.tasks]
+    until_ns = PERIODS * max(cycles_ns, default=rack.clock_ns)
     chart = simulate(rack.tasks, min(until_ns, 2_000_000_000), rack.context_switch_ns)
     return [
         Forecast.of(rack).document(),
