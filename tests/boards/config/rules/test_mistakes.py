@@ -330,6 +330,14 @@ def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place
     assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
 
 
+def test_an_encoder_is_described_for_all_joints_or_for_each() -> None:
+    six = "[1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]"
+    resolve(load("nasrem", [f"robot.sensors.resolution={six}"]))
+    (mistake,) = mistakes("nasrem", "robot.sensors.resolution=[1e-4, 1e-4]")
+    assert mistake.place == "robot.sensors.resolution"
+    assert mistake.why == "2 values; permitted: one for all joints, or 6, one per joint"
+
+
 def test_lists_of_another_length_than_the_joints_are_reported_together() -> None:
     found = mistakes("nasrem", "robot.home=[0, 0]", "robot.jerk=[1]", "robot.model=none.xml")
     assert {mistake.place for mistake in found} == {"robot.home", "robot.jerk", "robot.model"}
