@@ -15,7 +15,7 @@ from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner, in_m
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import SceneConfig
-from rack.levels.task.grasps import goals, grasps, standing
+from rack.levels.task.grasps import goals, grasps, slip_room, standing
 from rack.levels.task.program import DOWN, Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal
 
@@ -102,18 +102,24 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
     place."""
     handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"pick {action.object}"
-    place = f"place {action.object} at {list(action.to)}"
+    place = f"place {action.object} at [{', '.join(f'{value:.4g}' for value in action.to)}]"
     with _naming(k, place):
         situation = rehearsal.situation
         row = handling.row
         standing_goals = [
-            standing(rehearsal.motion.cell, situation, row, goal)
-            for goal in goals(action, situation.object_pose(row), rehearsal.motion.cell)
+            [standing(rehearsal.motion.cell, situation, row, goal) for goal in group]
+            for group in goals(action, situation.object_pose(row), rehearsal.motion.cell)
         ]
-    with _naming(k, pick):
-        takes = handling.takes()
-    with _naming(k, place):
-        ways = handling.ways(takes, standing_goals)
+
+    def choices() -> Iterator[tuple[list[Spot], list[Pose]]]:
+        with _naming(k, pick):
+            for takes in handling.takes():
+                yield from ((takes, group) for group in standing_goals)
+
+    def chosen(choice: tuple[list[Spot], list[Pose]]) -> Rehearsal:
+        with _naming(k, place):
+            ways = handling.ways(*choice)
+        return _first(ways[:MAX_WAYS], transferred)
 
     def transferred(way: Way) -> Rehearsal:
         with _naming(k, pick):
@@ -121,7 +127,7 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
         with _naming(k, place):
             return handling.moved(taken, k, way.put, Verb.RELEASE)
 
-    return _first(ways[:MAX_WAYS], transferred)
+    return _first(choices(), chosen)
 
 
 class Handling(NamedTuple):
@@ -132,20 +138,27 @@ class Handling(NamedTuple):
     row: int  # of the object
     lift: float  # height of the straight motions, m
 
-    def takes(self) -> list[Spot]:
-        """Return the spots to take and hold the object, at the lowest possible height. Raises
-        `Refused`."""
+    def takes(self) -> Iterator[list[Spot]]:
+        """Yield the spots to take and hold the object, at the lowest possible height first. Raises
+        the first `Refused` when there are none."""
         start = self.start
         refusal: Refused | None = None
+        is_taken = False
         for tools in grasps(start.motion.cell, start.situation, self.row):
             takes = [
                 spot for tool in tools for spot in self._spots(tool, start.situation, grasps=True)
             ]
-            if takes:
-                return self._held(takes)
-            refusal = refusal or self._nothing_at(tools)
-        assert refusal is not None, "there is at least one height"
-        raise refusal
+            try:
+                if takes:
+                    yield self._held(takes)
+                    is_taken = True
+                elif refusal is None:
+                    refusal = self._nothing_at(tools)
+            except Refused as refused:
+                refusal = refusal or refused
+        if not is_taken:
+            assert refusal is not None, "there is at least one height"
+            raise refusal
 
     def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
         """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there
@@ -156,8 +169,9 @@ class Handling(NamedTuple):
         puts: list[tuple[Pose, list[Spot]]] = []
         for take in takes:
             grip = take.tool.inverse() @ situation.object_pose(self.row)
+            room = slip_room(take.tool)
             for goal in standing_goals:
-                tool = goal @ grip.inverse()
+                tool = goal.raised(room) @ grip.inverse()
                 same = next((spots for known, spots in puts if known.is_near(tool)), None)
                 if same is None:
                     same = self._spots(tool, situation.holding(self.row, grip))

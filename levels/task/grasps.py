@@ -21,7 +21,7 @@ from rack.levels.task.program import DOWN, Transfer
 UP = np.array([0.0, 0.0, 1.0])
 QUARTERS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
-TILTS = (np.pi / 4.0, np.pi / 2.0)
+TILTS_DEG = range(10, 91, 10)
 """Angles from straight down at which the tool may take an object that it cannot take so."""
 FULL_ORIENTATION = 6
 """Joints that bring the tool to a place in every orientation; one of fewer leans away from its
@@ -31,6 +31,11 @@ HEIGHT_STEP_M = 0.01
 stays clear."""
 SET_DOWN_M = 0.0005
 """Gap between an object and its support when the gripper opens."""
+SLIP_M = 0.006
+"""What is added to it for a tool that leans: swung round, an object slips in the fingers by some
+mm, and would then be pressed on its support."""
+LEAST_LEAN = 0.01
+"""1 - cosine of the least angle from straight down at which a tool leans."""
 MAX_DISTANCE_M = 10.0
 """Range in which distances between geoms are measured."""
 SKIN_M = 1e-6
@@ -55,8 +60,8 @@ def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
         height += HEIGHT_STEP_M
     if len(cell.qpos) < FULL_ORIENTATION:
         yaws = [bearing(cell, seen.position)]
-    for tilt in TILTS:
-        for height in heights:
+    for tilt in map(math.radians, TILTS_DEG):
+        for height in heights[::2]:
             yield [Pose(seen.raised(height).position, leaning(yaw, tilt)) for yaw in yaws]
 
 
@@ -67,27 +72,40 @@ def leaning(yaw: float, tilt: float) -> Array:
     return pointing((across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw)
 
 
+def slip_room(tool: Pose) -> float:
+    """Return the additional height, m, at which a tool lets go of an object that it took in this
+    pose."""
+    along = np.zeros(3)
+    mujoco.mju_rotVecQuat(along, UP, tool.quaternion)
+    return SLIP_M if 1.0 + along[2] > LEAST_LEAN else 0.0
+
+
 def bearing(cell: Cell, position: Array) -> float:
     """Return the direction, rad, in which the arm's first joint sees a position."""
     base = cell.start().xanchor[cell.model.dof_jntid[cell.dof[0]]]
     return math.atan2(position[1] - base[1], position[0] - base[0])
 
 
-def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[Pose]:
-    """Yield poses in which the object may be put down: upright as it is now, turned about the
-    vertical."""
+def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
+    """Yield the poses in which the object may be put down, in the order of trying: upright as it is
+    now, turned about the vertical by quarters, then by what lies between."""
     yaw = yaw_of(at.quaternion)
-    turns = (
-        [action.yaw - yaw]
-        if action.yaw is not None
-        else [quarter * np.pi / 2.0 for quarter in QUARTERS]
-    )
-    if action.yaw is None and len(cell.qpos) < FULL_ORIENTATION:
+    if action.yaw is not None:
+        yield [_turned(action, at, action.yaw - yaw)]
+        return
+    turns = [quarter * np.pi / 2.0 for quarter in QUARTERS]
+    between = [turn + part * np.pi / 8.0 for part in (2, 1, 3) for turn in turns]
+    if len(cell.qpos) < FULL_ORIENTATION:
         turns.append(bearing(cell, np.array(action.to)) - bearing(cell, at.position))
-    for turn in turns:
-        quaternion = np.zeros(4)
-        mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
-        yield pose(action.to, quaternion)
+    for group in (turns, between):
+        yield [_turned(action, at, turn) for turn in group]
+
+
+def _turned(action: Transfer, at: Pose, turn: float) -> Pose:
+    """Return the pose of an object at its goal, turned by `turn`, rad, from how it is now."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
+    return pose(action.to, quaternion)
 
 
 def standing(cell: Cell, situation: Situation, row: int, goal: Pose) -> Pose:

@@ -76,7 +76,7 @@ def lowest_grasp(folder: Path, length: float) -> float:
     poses = made.start().qpos[made.object_qpos[:, None] + np.arange(7)]
     situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
     rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
-    takes = Handling(rehearsal, 0, 0.1).takes()
+    takes = next(Handling(rehearsal, 0, 0.1).takes())
     return float(takes[0].tool.position[2] - situation.positions[0, 2])
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.errors import Refused
+from rack.levels.messages import Verb
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
@@ -18,7 +19,7 @@ from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from rack.levels.task.actions import goto, rehearse
 from rack.levels.task.program import Goto, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
-from tests.levels.arms import CLOCK_NS
+from tests.levels.arms import CLOCK_NS, config
 from tests.levels.whole_rack import WholeRack
 
 FIVE = """
@@ -125,7 +126,7 @@ def leaning_of(end: Rehearsal) -> float:
     return float(np.arccos(np.clip(-down[2], -1.0, 1.0)))
 
 
-@pytest.mark.parametrize(("bend", "lean"), [(2.0, 0.0), (0.9, np.pi / 4)])
+@pytest.mark.parametrize(("bend", "lean"), [(2.0, 0.0), (0.9, np.pi / 18)])
 def test_a_grasp_leans_where_it_cannot_be_straight_down(
     tmp_path: Path, bend: float, lean: float
 ) -> None:
@@ -143,3 +144,32 @@ def test_five_joints_transfer_a_can(tmp_path: Path, bend: float) -> None:
     assert status.state == State.DONE, status.reason
     assert rack.read("servo.status").touches == 0
     assert rack.read("world.model").position[0] == pytest.approx(to, abs=0.01)
+
+
+def moved(to: tuple[float, float, float]) -> Rehearsal:
+    """Return the rehearsal of the PUMA's block1 moved to `to`, m."""
+    robot, scene = config("puma560")
+    cell = build_cell(robot, scene, CLOCK_NS)
+    poses = cell.start().qpos[cell.object_qpos[:, None] + np.arange(7)]
+    situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
+    program = TaskConfig.model_validate(
+        {"action": [{"do": "transfer", "object": "block1", "to": to}]}
+    )
+    return rehearse(program, scene, Rehearsal(MotionPlanner(cell, scene, 1), cell.home, situation))
+
+
+def test_a_block_is_taken_otherwise_where_its_goal_cannot_be_reached_so() -> None:
+    done = moved((0.793, -0.149, 0.475))
+    grasp = next(step.move for step in done.moves if step.move.verb is Verb.GRASP)
+    along = np.zeros(3)
+    mujoco.mju_rotVecQuat(along, np.array([0.0, 0.0, 1.0]), grasp.tool.quaternion)
+    assert np.degrees(np.arccos(-along[2])) > 9.0
+    assert done.situation.object_pose(0).position[:2] == pytest.approx((0.793, -0.149), abs=1e-6)
+
+
+def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
+    with pytest.raises(
+        Refused,
+        match=r"place block1 at \[0.62, 0, 0.475\]: 'forearm' and 'wall' are -\d+.\d mm apart",
+    ):
+        moved((0.62, 0.0, 0.475))

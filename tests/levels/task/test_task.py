@@ -123,7 +123,9 @@ def test_what_cannot_be_done_is_refused_with_what_can(
 def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Rehearsal) -> None:
     on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
     buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
-    assert "pick block1: '" in str(refusal(buried, TRANSFER))
+    refused = str(refusal(buried, TRANSFER))
+    assert "pick block1: " in refused
+    assert "'block2' are" in refused
     taken = replace(
         start,
         situation=start.situation.with_body(BLOCK2, Pose(np.array(TRANSFER["to"]), on_block1[1])),
