@@ -48,8 +48,10 @@ TABLE = "table"
 """Names; a model that has them gets others."""
 MOST_BLOCK_M = 0.05
 DENSITY = 400.0  # kg/m3
-CLEAR_M = 0.005
+CLEAR_M = 0.008
 """Between fingers and table when a block is taken."""
+LOOSE_M = 0.004
+"""More, where it is a guess how fingers follow: with less Robotiq's 140 touches the table."""
 
 
 class TableSpot(NamedTuple):
@@ -85,7 +87,8 @@ def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
     cell = made.cell()
     width = min(0.5 * jaws.width, MOST_BLOCK_M)
     # The tool is in the middle of a block that stands, its fingers clear of the table.
-    half = 0.5 * np.array([width, width, max(width, 2.0 * (jaws.below + CLEAR_M))])
+    clear = CLEAR_M + LOOSE_M * bool(made.table["gripper"].follow)
+    half = 0.5 * np.array([width, width, max(width, 2.0 * (jaws.below + clear))])
     reach = _reach(cell)
     lift = round(min(0.1, 0.12 * reach), 3)
     why = "no table on which the tool comes down to blocks"

@@ -18,7 +18,7 @@ from rack.levels.errors import RobotError
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import sampling_range
 from rack.levels.robot.abilities import Statics
-from rack.levels.robot.cell import Cell, unchecked_cell
+from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -187,21 +187,28 @@ def _add_gripper(made: Draft) -> None:
             f"--gripper: no joint '{wanted}' beyond the arm; {listed(list(arm.fingers))}, none"
         )
     try:
-        config, is_known = fit_fingers(made.spec, compile_spec(made.spec, made.model), arm, wanted)
+        config, guess = fit_fingers(made.spec, compile_spec(made.spec, made.model), arm, wanted)
         made.table["gripper"] = config
         made.write_model()
         jaws = find_fingertips(made.cell(), arm.tip)
-        if jaws is None:
-            raise RobotError("no two fingers that close on a block between them")
+        config = config.model_copy(update={"open": round(jaws.opening, 5)})
+        made.table["gripper"] = config
+        cell = made.cell()
+        if cell.gripper is not None and cell.gripper.linkage.yields:
+            # Where home is, is not known yet: the fingers settle as if they were alone.
+            alone = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
+            cell.model.geom_contype *= alone
+            cell.model.geom_conaffinity *= alone
+            check_fingers(cell, cell.gripper, config)
     except RobotError as error:
         made.notes.append(f"no gripper: {error}")
         made.table.pop("gripper", None)
         made.write_model()
         made.hold(arm.joints)
         return
-    made.guessed["gripper"] = "stiffness and damping" + ("" if is_known else ", force")
+    if guess:
+        made.guessed["gripper"] = guess
     made.jaws = jaws
-    made.table["gripper"] = config.model_copy(update={"open": round(jaws.opening, 5)})
     if not made.wanted.tool:
         made.table |= {"tool": arm.tip, "tool_offset": jaws.tool}
         made.guessed["tool"] = "between the fingers, z out of the hand, y across"

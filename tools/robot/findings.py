@@ -10,17 +10,16 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from rack.levels.errors import RobotError
 from rack.levels.robot.abilities import Abilities, Statics, abilities
-from rack.levels.robot.cell import Cell, unchecked_cell
+from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
 from rack.levels.robot.model import load_spec
-from rack.levels.tables import RobotConfig, SceneConfig
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from rack.levels.task.program import DOWN
 from rack.tools.robot.draft import touching
 
 MOST_TURN = 0.5
 """Angle of the fastest vibration in one step, rad, at which its simulation is sound."""
-MOST_RESIDUAL = 1e-3
-"""Of an equality in the gripper's linkage, m or rad."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +91,9 @@ def _findings(cell: Cell, robot: RobotConfig, able: Abilities) -> Iterator[Obser
     yield Observation(
         "actuators", ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "none", False
     )
-    if cell.gripper is not None:
-        residual = _residual(cell)
-        text = f"equalities {1e3 * residual:.2g} mm or mrad off at most"
-        yield Observation("coupling", text, residual > MOST_RESIDUAL)
+    if robot.gripper is not None:
+        why = _elsewhere(cell, robot.gripper)
+        yield Observation("coupling", why or "fingers settle where planning poses them", bool(why))
     turn, spring = _fastest(cell)
     needed = int(np.ceil(robot.substeps * turn / MOST_TURN)) or 1
     text = f"{spring:.3g} Hz at most; {needed} of {robot.substeps} substeps are enough"
@@ -115,18 +113,14 @@ def _kind(actuator: mujoco.MjsActuator) -> str:
     return "position" if actuator.biasprm[1] else "velocity"
 
 
-def _residual(cell: Cell) -> float:
-    """Return the largest error of an equality while the gripper closes, m or rad."""
-    gripper = cell.gripper
-    assert gripper is not None, "there is one"
-    data = cell.start()
-    worst = 0.0
-    for opening in gripper.linkage.openings:
-        gripper.linkage.set(data.qpos, float(opening))
-        mujoco.mj_fwdPosition(cell.model, data)
-        equal = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-        worst = max(worst, float(np.max(np.abs(data.efc_pos[equal]), initial=0.0)))
-    return worst
+def _elsewhere(cell: Cell, config: GripperConfig) -> str:
+    """Return why the fingers do not settle where planning poses them; empty: they do."""
+    try:
+        if cell.gripper is not None and cell.gripper.linkage.yields:
+            check_fingers(cell, cell.gripper, config)
+    except RobotError as error:
+        return str(error)
+    return ""
 
 
 def _fastest(cell: Cell) -> tuple[float, float]:

@@ -35,7 +35,12 @@ def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
     yield from _keys({k: v for k, v in table.items() if k not in inner}, made.guessed)
     for key, value in inner.items():
         yield f"\n[robot.{key}]" + _comment(made.guessed.get(key))
-        yield from _keys(value.model_dump(), {})
+        inside = value.model_dump(exclude_none=True)
+        follow = inside.pop("follow", ())
+        yield from _keys(inside, {})
+        for one in follow:
+            yield f"[[robot.{key}.follow]]"
+            yield from _keys(one, {})
     yield "\n[scene]"
     yield from _keys({"objects": layout.scene.objects, "supports": layout.scene.supports}, {})
     yield f"\n[task]  # {layout.kind}"

@@ -12,20 +12,21 @@ from rack.levels.algebra import Array, norm
 from rack.levels.errors import RobotError
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
-from rack.levels.robot.model import JOINT_DRIVES, add_motor, remove, stated_torque
-from rack.levels.tables import GripperConfig, ToolConfig
+from rack.levels.robot.model import JOINT_DRIVES, add_motor, listed, remove, stated_torque
+from rack.levels.tables import FollowConfig, GripperConfig, ToolConfig
 from rack.tools.robot.arm import ArmParts
 
 MOTOR = "gripper"
 """Name of the motor of a gripper that has none."""
 FORCE_N = 20.0
 """Of a gripper whose model says nothing, at its fingers."""
-STIFFNESS = 2000.0
-DAMPING = 60.0
-"""Of the position loop at the fingers, N/m and N s/m; a rotary joint has a lever."""
-DRIVE_KG = 0.1
-"""Drive inertia at the fingers, at least: the loop is closed once in a servo cycle."""
+MOST_FORCE_N = 40.0
+"""At the fingers; of more, which pushes a light block out, no use is made."""
 LEAST_LEVER_M = 0.02
+SIDEWAYS = 0.5
+"""Cosine between a finger's motion and the way to the others below which it does not close."""
+ROUNDING = 1e-9
+"""In the Jacobian of an equality."""
 STEP_M = 0.0025
 """Spacing of the places between the fingers that are tried."""
 FROM_TIP_M = 0.012
@@ -35,6 +36,10 @@ LEAST_GAP_M = 0.012
 NEARLY = 0.6
 """Part of the way to closed, near enough to tell where the fingers will meet."""
 LEAST_WAY_M = 1e-4
+SEEN = np.array([0, 1, 0, 0, 0, 0], dtype=np.uint8)
+"""Groups of geoms, for rays: the second."""
+ASIDE_M = (0.0, 0.01, -0.01, 0.02, -0.02)
+"""Where a ray between the fingers starts, besides the middle: the two of three leave a gap."""
 ALIGNED = 0.98
 """Cosine above which a direction is that of the body's axis."""
 
@@ -43,14 +48,15 @@ class _Finger(NamedTuple):
     open: float
     closed: float
     lever: float  # m; 1 for a slide
+    sideways: bool  # spreads the fingers, rather than closes them
 
 
 def fit_fingers(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, wanted: str
-) -> tuple[GripperConfig, bool]:
-    """Give the gripper one drive, at the joint `wanted` if that is named, and what nothing couples
-    a coupling; return its table, and whether the force is known. Raises `RobotError`."""
-    fingers = {name: _finger(model, arm, name) for name in arm.fingers}
+) -> tuple[GripperConfig, str]:
+    """Give the gripper one drive, at the joint `wanted` if that is named, which all that nothing
+    couples to it follows; return its table, and what of it is guessed. Raises `RobotError`."""
+    fingers = {name: _finger(spec, model, arm, name) for name in arm.fingers}
     tendons = {
         tendon.name: [wrap.target.name for wrap in tendon.path if wrap.target.name in fingers]
         for tendon in spec.tendons
@@ -64,37 +70,54 @@ def fit_fingers(
             else tendons.get(actuator.target, [])
         )
     ]
-    drives.sort(key=lambda drive: drive[1] != wanted)
+    drives.sort(key=lambda drive: (drive[1] != wanted, fingers[drive[1]].sideways))
     driven = drives[0][1] if drives else wanted or arm.fingers[0]
     own = fingers[driven]
-    stated = stated_torque(spec, driven, [actuator for actuator, _ in drives])
-    force = stated or FORCE_N * own.lever
-    remove(spec, [actuator for actuator, _ in drives[1:]])
+    first = [joint for _, joint in drives] + list(arm.fingers)
+    groups = [group for group in _groups(model, arm) if driven not in group]
+    leaders = [min(group, key=first.index) for group in groups]
+    follow = tuple(
+        FollowConfig(joint=name, ratio=_ratio(model, (driven, own), (name, fingers[name])))
+        for name in leaders
+        if name in first[: len(drives)] or not model.jnt_stiffness[model.joint(name).id]
+    )
+    # One drive gives what all those gave that it stands for.
+    moving = [driven, *(one.joint for one in follow if one.ratio)]
+    actuators = [actuator for actuator, _ in drives]
+    stated = [stated_torque(spec, name, actuators) for name in moving]
+    levers = [fingers[name].lever for name in moving]
+    used = [
+        min(known or FORCE_N * lever, MOST_FORCE_N * lever)
+        for known, lever in zip(stated, levers, strict=True)
+    ]
+    force = sum(used)
+    remove(spec, actuators[1:])
     if not drives:
         add_motor(spec, MOTOR, mujoco.mjtTrn.mjTRN_JOINT, driven, force)
-    joint = spec.joint(driven)
-    joint.armature = max(float(joint.armature), DRIVE_KG * own.lever**2)
-    for name in set(fingers) - {driven} - _coupled(spec, model, arm):
-        _couple(spec, model, (name, fingers[name]), (driven, own))
     config = GripperConfig(
         actuator=drives[0][0].name if drives else MOTOR,
         joint=driven,
         open=round(own.open, 5),
         closed=round(own.closed, 5),
         force=round(force, 3),
-        stiffness=round(STIFFNESS * own.lever**2, 3),
-        damping=round(DAMPING * own.lever**2, 4),
+        follow=follow,
     )
-    return config, stated > 0
+    guesses = [] if used == stated else ["force"]
+    guesses += [f"that {listed([one.joint for one in follow])} follow"] if follow else []
+    return config, ", ".join(guesses)
 
 
-def _finger(model: mujoco.MjModel, arm: ArmParts, name: str) -> _Finger:
+def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str) -> _Finger:
     """Return the ends of a joint of the gripper: it closes where it moves to the middle of all
     fingers, or to the hand. Raises `RobotError`."""
     joint = model.joint(name).id
     low, high = model.jnt_range[joint]
     if not model.jnt_limited[joint]:
         raise RobotError(f"joint '{name}' of the gripper has no range")
+    for actuator in spec.actuators:
+        # The set points of a servo may leave a part of the range out.
+        if actuator.target == name and actuator.biastype and np.ptp(actuator.ctrlrange) > 0.0:
+            low, high = np.clip(actuator.ctrlrange, low, high)
     data = mujoco.MjData(model)
     ids = [model.joint(finger).id for finger in arm.fingers]
     data.qpos[model.jnt_qposadr[ids]] = model.jnt_range[ids].mean(axis=1)
@@ -109,10 +132,12 @@ def _finger(model: mujoco.MjModel, arm: ArmParts, name: str) -> _Finger:
     centre = _centre(model, data, moved)
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, centre, moved)
-    closes = float(jacobian[:, model.jnt_dofadr[joint]] @ (middle - centre)) > 0.0
+    motion = jacobian[:, model.jnt_dofadr[joint]]
+    inward = float(motion @ (middle - centre))
     is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
     lever = 1.0 if is_slide else max(LEAST_LEVER_M, norm(centre - data.xanchor[joint]))
-    return _Finger(*((low, high) if closes else (high, low)), lever)
+    sideways = abs(inward) < SIDEWAYS * norm(motion) * norm(middle - centre)
+    return _Finger(*((low, high) if inward > 0.0 else (high, low)), lever, sideways)
 
 
 def _above(model: mujoco.MjModel, body: int, hand: int) -> set[int]:
@@ -128,38 +153,34 @@ def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
     return np.asarray(data.geom_xpos[geoms].mean(axis=0) if len(geoms) else data.xipos[body])
 
 
-def _coupled(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts) -> set[str]:
-    """Return the joints of the gripper that an equality or a spring determines."""
-    named = {name for e in spec.equalities for name in (e.name1, e.name2)}
-    for tendon in spec.tendons:
-        named |= {w.target.name for w in tendon.path} if tendon.name in named else set()
-    found = set()
-    for name in arm.fingers:
-        joint = model.joint(name).id
-        beyond = np.flatnonzero(below(model, model.jnt_bodyid[[joint]]))
-        loops = {model.body(body).name for body in beyond} & named
-        if name in named or loops or model.jnt_stiffness[joint] > 0:
-            found.add(name)
-    return found
+def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
+    """Return the joints of the gripper, those together that equalities tie to each other."""
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    rows = data.efc_J.reshape(-1, model.nv)[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
+    columns = {name: model.joint(name).dofadr[0] for name in arm.fingers}
+    groups = [{name} for name in arm.fingers]
+    for row in rows:
+        tied = {name for name, column in columns.items() if abs(row[column]) > ROUNDING}
+        together = [group for group in groups if group & tied]
+        groups = [group for group in groups if not group & tied]
+        if together:
+            groups.append(set.union(*together))
+    return groups
 
 
-def _couple(
-    spec: mujoco.MjSpec,
-    model: mujoco.MjModel,
-    follower: tuple[str, _Finger],
-    leader: tuple[str, _Finger],
-) -> None:
-    """Let a joint close as the driven one does."""
-    name, own = follower
-    driven, lead = leader
-    slope = (own.closed - own.open) / (lead.closed - lead.open)
-    start, first = (model.qpos0[model.joint(j).qposadr[0]] for j in (name, driven))
-    equality = spec.add_equality(name1=name, name2=driven)
-    equality.type = mujoco.mjtEq.mjEQ_JOINT
-    equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
-    equality.data[:2] = [own.open - start - slope * (lead.open - first), slope]
-    equality.solref[:] = [0.002, 1.0]
-    equality.solimp[:3] = [0.99, 0.999, 0.001]
+def _ratio(
+    model: mujoco.MjModel, leader: tuple[str, _Finger], follower: tuple[str, _Finger]
+) -> float:
+    """Return the ratio by which a joint closes as the driven one does: as far, if it is of the
+    same kind, else in its range; 0 if it does not close."""
+    (driven, lead), (name, own) = leader, follower
+    if own.sideways:
+        return 0.0
+    ratio = (own.closed - own.open) / (lead.closed - lead.open)
+    is_same = model.joint(driven).type == model.joint(name).type
+    return float(np.sign(ratio)) if is_same else round(ratio, 5)
 
 
 class Fingertips(NamedTuple):
@@ -171,28 +192,30 @@ class Fingertips(NamedTuple):
     below: float  # how far they reach beyond the tool, m
 
 
-def find_fingertips(cell: Cell, tip: str) -> Fingertips | None:
-    """Return what the gripper can take, by rays between its fingers; None: they do not close on
-    each other, or not on anything."""
+def find_fingertips(cell: Cell, tip: str) -> Fingertips:
+    """Return what the gripper can take, by rays between its fingers. Raises `RobotError` where they
+    do not close on each other, or not on a block."""
     model = cell.model
     data = cell.start()
     gripper = cell.gripper
     assert gripper is not None, "there are fingers"
     solid = (model.geom_contype | model.geom_conaffinity) != 0
     geoms = cell.gripper_geoms[solid[cell.gripper_geoms]]
-    pads = set(geoms.tolist())
+    # Of the gripper, rays see what is solid, of the rest nothing.
+    model.geom_group[:] = 0
+    model.geom_group[geoms] = 1
 
     def closed_to(part: float) -> Array:
         gripper.linkage.set(data.qpos, gripper.open + part * (gripper.closed - gripper.open))
         mujoco.mj_forward(model, data)
         return np.array(data.geom_xpos[geoms])
 
-    ends = closed_to(1.0)
-    ways = closed_to(NEARLY) - ends
+    closed = closed_to(1.0)
+    ways = closed_to(NEARLY) - closed
     moving = np.linalg.norm(ways, axis=1) > LEAST_WAY_M
     ways = ways[moving]
     if not moving.any() or (ways @ ways.T).min() >= 0.0:
-        return None
+        raise RobotError("one finger, or fingers that do not close on each other")
     hand = model.body(tip).id
     axes = data.xmat[hand].reshape(3, 3).T
     across = np.linalg.svd(ways - ways.mean(axis=0))[2][0]
@@ -206,16 +229,16 @@ def find_fingertips(cell: Cell, tip: str) -> Fingertips | None:
     def gap(at: Array) -> tuple[float, float]:
         """Return the distances from a place to the fingers on both sides, m; inf: none."""
         found = []
-        hit = np.full(1, -1, dtype=np.int32)
         for way in (across, -across):
-            distance = mujoco.mj_ray(model, data, at, way, None, 1, -1, hit)
-            found.append(distance if distance >= 0 and int(hit[0]) in pads else np.inf)
+            starts = (at + aside * np.cross(across, out) for aside in ASIDE_M)
+            rays = (mujoco.mj_ray(model, data, one, way, SEEN, 1, -1, None) for one in starts)
+            found.append(next((d for d in rays if d >= 0), np.inf))
         return found[0], found[1]
 
     places = [middle + out * step * STEP_M for step in range(60, -40, -1)]
     between = [place for place in places if np.isfinite(gap(place)).all()]
     if not between:
-        return None
+        raise RobotError("fingers that close past each other")
     origin = between[min(int(FROM_TIP_M / STEP_M), len(between) // 2)]
     left, right = gap(origin)
     origin = origin + 0.5 * (left - right) * across
@@ -225,8 +248,15 @@ def find_fingertips(cell: Cell, tip: str) -> Fingertips | None:
         if np.isfinite(width):
             break
     if not LEAST_GAP_M < width < np.inf:
-        return None
-    below = max(_extent(model, data, int(geom), out) for geom in geoms) - float(origin @ out)
+        raise RobotError(
+            f"fingers that open {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} are needed"
+        )
+    # Fingers that turn reach farther as they close.
+    ends = []
+    for step in np.linspace(part, 1.0, 5):
+        closed_to(step)
+        ends += [_extent(model, data, int(geom), out) for geom in geoms]
+    below = max(ends) - float(origin @ out)
     turned = np.stack((np.cross(across, out), across, out), axis=1)
     opening = gripper.open + float(part) * (gripper.closed - gripper.open)
     return Fingertips(_placed(data, hand, origin, turned), opening, width, below)

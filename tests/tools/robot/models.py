@@ -29,8 +29,9 @@ def joint(
     )
 
 
-def urdf(gripper: bool = True, effort: float = 60.0) -> str:
-    """Return an arm of six joints; with a gripper, of two fingers of which one mimics the other."""
+def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True) -> str:
+    """Return an arm of six joints; with a gripper, of two fingers of which one mimics the other, or
+    does not."""
     parts = [link("base", "0.1 0.1 0.1", "0 0 0")]
     parent = "base"
     below = 0.05
@@ -48,7 +49,7 @@ def urdf(gripper: bool = True, effort: float = 60.0) -> str:
         limit = LIMIT.format(low=0, high=0.04, effort=30)
         for side, name in ((1, "left"), (-1, "right")):
             parts.append(link(name, "0.02 0.01 0.06", f"0 {0.005 * side} 0.03", 0.1, 0.0001))
-            mimic = '<mimic joint="left_finger"/>' if side < 0 else ""
+            mimic = '<mimic joint="left_finger"/>' if side < 0 and mimics else ""
             finger = f"{name}_finger"
             parts.append(
                 joint(finger, "hand", name, "0 0 0.02", f"0 {side} 0", limit=limit,

@@ -55,7 +55,7 @@ def test_what_the_urdf_states_is_taken_and_the_rest_named_as_guessed(small: Path
     assert robot["gripper"]["open"] == pytest.approx(0.04)
     assert robot["gripper"]["force"] == 30.0
     assert robot["tool_offset"]["quaternion"] in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-    assert set(robot["guessed"]) == {"gripper", "tool", "acceleration", "jerk", "home"}
+    assert set(robot["guessed"]) == {"tool", "acceleration", "jerk", "home"}
     assert "velocity = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]\n" in text
     assert "\nhome = " in text
     assert "# guessed: free of contact" in text
