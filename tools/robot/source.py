@@ -62,12 +62,12 @@ def read_source(path: Path) -> Source:
 def _urdf(path: Path, root: ElementTree.Element) -> Source:
     if any("xacro" in element.tag for element in root.iter()):
         raise RobotError(f"model '{path}': holds xacro; expand it first: xacro IN > arm.urdf")
-    links = Counter(link.get("name", "") for link in root.findall("link"))
+    named = Counter((e.tag, e.get("name", "")) for e in root if e.tag in ("link", "joint"))
     children = {child.get("link") for child in root.findall("joint/child")}
-    roots = [name for name in links if name not in children]
-    twice = [name for name, count in links.items() if count > 1]
+    roots = [name for tag, name in named if tag == "link" and name not in children]
+    twice = [f"{tag} '{name}'" for (tag, name), count in named.items() if count > 1]
     if twice or len(roots) != 1:
-        why = f"links named twice: {listed(twice)}" if twice else f"roots: {listed(roots)}"
+        why = f"named twice: {listed(twice)}" if twice else f"roots: {listed(roots)}"
         raise RobotError(f"model '{path}': {why}; one of each is valid")
     notes = []
     if root.find("link/collision") is None:

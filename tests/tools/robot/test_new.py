@@ -20,7 +20,19 @@ BAD = {
     "no inertia": (urdf().replace('"1.0"', '"0"').replace('"0.01"', '"0"'), "inertia"),
     "no mesh": (urdf().replace(BOX, MESH), "no mesh 'package://small/meshes/l2.stl'"),
     "two roots": (urdf().replace(TAIL, f'<link name="top"/>{TAIL}'), "roots: base, top"),
-    "two links": (urdf().replace(TAIL, f'<link name="l2"/>{TAIL}'), "links named twice: l2"),
+    "two links": (urdf().replace(TAIL, f'<link name="l2"/>{TAIL}'), "named twice: link 'l2'"),
+    "two joints": (
+        urdf().replace('joint name="j2"', 'joint name="j1"'),
+        "named twice: joint 'j1'",
+    ),
+    "two joints in MJCF": (
+        DESK_ARM.read_text().replace('name="elbow"', 'name="waist"'),
+        "repeated name 'waist'",
+    ),
+    "no drives in MJCF": (
+        DESK_ARM.read_text().partition("<actuator>")[0] + "</mujoco>",
+        "no actuator and no effort at waist",
+    ),
     "no drives": (urdf(effort=0.0, gripper=False), "no actuator and no effort at j1"),
     "no XML": ("not a model", "malformed XML"),
     "another language": ("<sdf/>", "<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)"),
