@@ -6,7 +6,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +22,7 @@ from rack.tools.console.tables import table, terminal_width
 if TYPE_CHECKING:
     from rack.tools.robot.draft import Wishes
     from rack.tools.robot.findings import Examined
+    from rack.tools.robot.source import Source
 
 app = typer.Typer(
     rich_markup_mode=None, no_args_is_help=True, help="Bring up any arm, from MJCF or URDF."
@@ -89,13 +90,9 @@ def new(
     """
     from rack.tools.robot.draft import Wishes
 
-    if sys.stdin.isatty() and sys.stdout.isatty() and not as_json:
+    asks = sys.stdin.isatty() and sys.stdout.isatty() and not as_json
+    if asks:
         name = name or _asked("name", _plain(model.stem))
-        tip = tip or (
-            "" if joints else _asked("body at the end of the arm, or nothing: the longest")
-        )
-        gripper = gripper or _asked("joint that drives the gripper, none, or nothing: found")
-        home = home or _asked("keyframe for home, positions, or nothing: found")
     name = name or _plain(model.stem)
     folder = out or Path(name)
     if folder.exists():
@@ -106,7 +103,7 @@ def new(
     chain = tuple(filter(None, joints.split(",")))
     wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque, "--torque"))
     with TemporaryDirectory() as draft:
-        made = _made(model, wanted, Path(draft) / name, name)
+        made = _made(model, wanted, Path(draft) / name, name, asks)
         shutil.copytree(Path(draft) / name, folder)
     print_answer(made | {"folder": str(folder)}, _lines(made, folder, name), as_json)
 
@@ -173,7 +170,29 @@ def _report(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _asked(text: str, default: str = "") -> str:
-    return str(typer.prompt(text, default, show_default=bool(default))).strip()
+    """Return what the user answers; nothing, where the default is what is found."""
+    shown = text if default else f"{text} [found]"
+    return str(typer.prompt(shown, default, show_default=bool(default))).strip()
+
+
+def _completed(source: Source, wanted: Wishes) -> Wishes:
+    """Ask on the terminal for what no option says. Raises `RobotError`."""
+    from rack.levels.robot.model import listed
+    from rack.tools.robot.arm import find_arm
+
+    arm = find_arm(source.compiled(), wanted.tip, wanted.joints)
+    if arm.others and not (wanted.tip or wanted.joints):
+        others = listed(list(arm.others))
+        tip = _asked(f"body at the end of the arm; others begin at {others}", arm.tip)
+        if tip != arm.tip:
+            wanted = replace(wanted, tip=tip)
+            arm = find_arm(source.compiled(), tip, ())
+    tool = wanted.tool or _asked(f"tool: a site or body beyond {arm.tip}, z outward")
+    gripper = wanted.gripper
+    if arm.fingers and not gripper:
+        gripper = _asked(f"gripper: none, or the joint that drives it: {listed(list(arm.fingers))}")
+    home = wanted.home or _asked("home: a keyframe, or positions q1,q2,...")
+    return replace(wanted, tool=tool, gripper=gripper, home=home)
 
 
 def _plain(name: str) -> str:
@@ -187,8 +206,9 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
         raise Failure(f"{option} = {text}: not numbers, as in 80,80,12", 2) from None
 
 
-def _made(model: Path, wanted: Wishes, folder: Path, name: str) -> dict[str, Any]:
-    """Write the folder of an arm; return what it is. Raises `Failure`."""
+def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> dict[str, Any]:
+    """Write the folder of an arm, asking for more if `asks`; return what it is. Raises
+    `Failure`."""
     from rack.tools.robot.assignment import lay_out
     from rack.tools.robot.draft import draft
     from rack.tools.robot.folder import config_text, document
@@ -197,7 +217,10 @@ def _made(model: Path, wanted: Wishes, folder: Path, name: str) -> dict[str, Any
 
     folder.mkdir()
     try:
-        made = draft(read_source(model), wanted, folder, name)
+        source = read_source(model)
+        if asks:
+            wanted = _completed(source, wanted)
+        made = draft(source, wanted, folder, name)
         layout = lay_out(made)
     except RobotError as error:
         raise Failure(str(error), 2) from None

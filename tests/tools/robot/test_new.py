@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from rack.boards.config import load
+from tests.processes import RACK
 from tests.tools.command_line import ROOT, rack
 from tests.tools.robot.models import urdf, written
 
@@ -139,3 +143,28 @@ def test_of_two_arms_one_is_held_and_what_flies_is_left_out(tmp_path: Path) -> N
     assert config.robot.joints == ("waist", "shoulder", "elbow", "roll", "pitch", "twist")
     assert "second_waist" not in (tmp_path / "one" / "one.xml").read_text()
     assert 'name="second_turret"' in (tmp_path / "one" / "one.xml").read_text()
+
+
+@pytest.mark.slow
+def test_on_a_terminal_it_asks_for_what_no_option_says(tmp_path: Path) -> None:
+    arm = written(tmp_path, urdf())
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.chdir(tmp_path)
+        os.execv(sys.executable, [*RACK, "robot", "new", str(arm), "--home", "0,0.4,1.6,0,0.7,0"])
+    os.write(terminal, b"asked\n\nnone\n")
+    said = b""
+    try:
+        while chunk := os.read(terminal, 1 << 16):
+            said += chunk
+    except OSError:
+        pass  # the end of a terminal
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0, said
+    assert b"name [small]: " in said
+    assert b"tool: a site or body beyond hand, z outward [found]: " in said
+    assert (
+        b"gripper: none, or the joint that drives it: left_finger, right_finger [found]: " in said
+    )
+    robot = tomllib.loads((tmp_path / "asked" / "asked.toml").read_text())["robot"]
+    assert "gripper" not in robot
+    assert robot["home"] == [0.0, 0.4, 1.6, 0.0, 0.7, 0.0]
