@@ -101,6 +101,14 @@ class ServoRig:
             self.targets.append(self.status.target.copy())
             self.positions.append(self.status.position.copy())
 
+    def torques(self, ticks: int, motion: Callable[[float], tuple[Array, Array]]) -> Array:
+        """Run `ticks` ticks; return the torque of each, (ticks, joints), N m."""
+        found = []
+        for _ in range(ticks):
+            self.run(1, motion)
+            found.append(self.status.torque.copy())
+        return np.array(found)
+
     def step(self) -> None:
         """Run one tick as a board does: collect the findings, and the faults that acted."""
         servo = self.servo

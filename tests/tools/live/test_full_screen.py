@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
 from collections.abc import Awaitable, Callable, Iterator
 from html import unescape
 from pathlib import Path
@@ -17,9 +16,9 @@ from rack.backplane.segment import Segment, racks
 from rack.backplane.words import System
 from rack.tools.live.full_screen import RackScreen
 from rack.tools.live.watched import LocalRack
-from tests.boards.commanded_racks import COMMANDED
-from tests.processes import RACK, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.processes import wait_until
+from tests.tools.command_line import BOUND_S, rack
+from tests.tools.live.test_desk import end, start
 
 pytestmark = pytest.mark.slow
 
@@ -27,18 +26,9 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def running(rack_name: str, tmp_path: Path) -> Iterator[str]:
     """The name of a rack that runs until it is stopped."""
-    path = tmp_path / "commanded.toml"
-    path.write_text(COMMANDED)
-    command = [*RACK, "run", str(path), "--no-record", "--set", f"name={rack_name}"]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith(rack_name) and "tick 0 " not in line:
-            break
+    process = start(tmp_path / "commanded.toml", rack_name)
     yield rack_name
-    rack("stop", rack_name)
-    process.kill()
-    process.communicate()
+    end(process, rack_name)
 
 
 def on_screen(
