@@ -40,6 +40,8 @@ def on_screen(
         with LocalRack(name) as one:
             async with RackScreen(one, lambda: False).run_test(size=size) as pilot:
                 await act(pilot)
+                # As a user leaves: what is taken down without it may be looked at once more.
+                pilot.app.exit()
 
     asyncio.run(asyncio.wait_for(attached(), 3 * BOUND_S))
 
