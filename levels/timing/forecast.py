@@ -8,7 +8,7 @@ from typing import Any
 
 from rack.levels.timing.frames import CoreFrames, core_frames
 from rack.levels.timing.rack import CyclicSchedule, LevelTiming, RackTiming
-from rack.levels.timing.response_time import TaskResponse, task_responses
+from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction, predict
 from rack.levels.timing.verdicts import EquationVerdict, verdicts
 
@@ -43,7 +43,7 @@ class Forecast:
             context_switch_ns=rack.context_switch_ns,
             levels=tuple(rack.levels.values()),
             verdicts=tuple(verdicts(rack)),
-            responses=task_responses(rack.tasks, rack.context_switch_ns),
+            responses=rack.responses,
             loads=rack.loads,
             inboxes=tuple(
                 inbox.document(rack.slice_ticks(name) * rack.clock_ns)

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from rack.backplane.layout import TickGrid
 from rack.levels.timing.equations import communication_ns, grid_wait, residual_ns, response_ticks
 from rack.levels.timing.interrupts import InboxTiming
-from rack.levels.timing.response_time import load_of
+from rack.levels.timing.response_time import TaskResponse, load_of, task_responses
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
 Coupling = Literal["tight", "loose", "none"]
@@ -403,6 +403,11 @@ class RackTiming:
     def cores_of(self, board: str) -> set[int]:
         """Return the cores of a board's tasks."""
         return {core for name, core in self.cores.items() if name.partition(".")[0] == board}
+
+    @cached_property
+    def responses(self) -> tuple[TaskResponse, ...]:
+        """The worst case of every task that has a cost."""
+        return task_responses(self.tasks, self.context_switch_ns)
 
     @cached_property
     def loads(self) -> dict[int, float]:

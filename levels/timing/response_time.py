@@ -20,7 +20,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
-from functools import partial
 from itertools import pairwise
 from math import lcm
 from typing import Any
@@ -51,7 +50,6 @@ def response_time(
     blocking: int = 0,
     jitter: int = 0,
     *,
-    period: int | None = None,
     sharing: Sequence[Load] = (),
     turn: int = TURN_NS,
     horizon: int | None = None,
@@ -62,52 +60,25 @@ def response_time(
     `above` are the tasks of higher or equal priority on the core: each delays the job by whole jobs
     of its own. `blocking` is the longest part of a lower task that cannot be preempted.
 
-    Without a `period`, releases do not queue, as in a rack: a late task takes up the newest release
-    and skips the others, so the job finds its task free, and a response longer than the period is a
-    miss. With a `period`, releases queue, and the result is the longest of all jobs in the busy
-    time (Lehoczky 1990), for any deadline.
+    Releases do not queue: a late task takes up the newest release and skips the others, so the job
+    finds its task free, and a response longer than the task's period is a miss.
 
     `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits,
     none of them computes more than it does, plus one `turn`. That bound assumes fair turns, which
     Linux does not guarantee. The default `horizon` is 100 times the longest time given.
     """
     # Below full load a bound exists; near full load the search for it may take too long.
-    own = Fraction(cost, period) if period else Fraction(0)
-    demand = sum((Fraction(c, t) for c, t, _ in above), own)
-    if cost and (demand > 1 or (demand == 1 and not period)):
+    if cost and sum(Fraction(c, t) for c, t, _ in above) >= 1:
         return None
-    longest = max(
-        [
-            cost,
-            period or 0,
-            blocking,
-            jitter,
-            *(t for _, t, _ in above),
-            *(t for _, t, _ in sharing),
-        ]
-    )
-    horizon = 100 * longest if horizon is None else horizon
+    periods = (period for _, period, _ in (*above, *sharing))
+    longest = max([cost, blocking, jitter, *periods])
 
-    def work(until: int, jobs: int) -> int:
-        turns = sum(min(_released(until, load), jobs * cost + turn) for load in sharing)
-        return blocking + jobs * cost + turns + sum(_released(until, load) for load in above)
+    def work(until: int) -> int:
+        turns = sum(min(_released(until, load), cost + turn) for load in sharing)
+        return blocking + cost + turns + sum(_released(until, load) for load in above)
 
-    worst = 0
-    job = 0
-    end = 0
-    while True:
-        start = max(end, blocking + (job + 1) * cost)
-        found = _fixed_point(partial(work, jobs=job + 1), start, horizon + job * (period or 0))
-        if found is None:
-            return None
-        end = found
-        worst = max(worst, found + jitter - job * (period or 0))
-        job += 1
-        if period is None or end + jitter <= job * period:
-            return worst
-        # At full load the busy time may not end; from here on it repeats.
-        if job * period > lcm(period, *(t for _, t, _ in above)):
-            return worst
+    end = _fixed_point(work, blocking + cost, 100 * longest if horizon is None else horizon)
+    return None if end is None else end + jitter
 
 
 def _fixed_point(work: Callable[[int], int], guess: int, horizon: int) -> int | None:

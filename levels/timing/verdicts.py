@@ -16,7 +16,6 @@ from rack.levels.timing import equations
 from rack.levels.timing.equations import Relation
 from rack.levels.timing.frames import core_frames
 from rack.levels.timing.rack import LevelTiming, ParallelChains, RackTiming
-from rack.levels.timing.response_time import response_times
 
 SYSTEM = "system"
 """The subject of the system's response."""
@@ -184,10 +183,11 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
 
 
 def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
-    periods = {task.name: task.period_ns for task in rack.tasks}
-    for name, found in response_times(rack.tasks, rack.context_switch_ns).items():
-        relation = Relation(inf if found is None else found, "<=", periods[name])
-        yield EquationVerdict.of(RESPONSE_TIME, name, relation, "worst-case response <= deadline")
+    for task in rack.responses:
+        response_ns = inf if task.response_ns is None else task.response_ns
+        relation = Relation(response_ns, "<=", task.deadline_ns)
+        meaning = "worst-case response <= deadline"
+        yield EquationVerdict.of(RESPONSE_TIME, task.task, relation, meaning)
 
 
 def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:

@@ -15,7 +15,7 @@ import numpy as np
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
-from rack.levels.timing.response_time import response_times
+from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.trace_times import (
     Distribution,
     counts,
@@ -202,14 +202,14 @@ def _figures(
 ) -> PartitionFigures:
     layout = wire(config)
     rack = rack_timing(config, layout)
-    responses = response_times(rack.tasks, rack.context_switch_ns)
+    responses = {response.task: response for response in rack.responses}
     return PartitionFigures(
         partition.name, tuple(_level(name, layout, responses, runs) for name in config.board)
     )
 
 
 def _level(
-    board: str, layout: Layout, responses: Mapping[str, int | None], runs: Sequence[Recording]
+    board: str, layout: Layout, responses: Mapping[str, TaskResponse], runs: Sequence[Recording]
 ) -> LevelFigures:
     tasks = {task.name: task for task in layout.tasks}
     planner = tasks.get(f"{board}.planner")
@@ -230,7 +230,7 @@ def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarra
 
 
 def _task(
-    task: TaskSpec, tick_ns: int, responses: Mapping[str, int | None], runs: Sequence[Recording]
+    task: TaskSpec, tick_ns: int, responses: Mapping[str, TaskResponse], runs: Sequence[Recording]
 ) -> TaskFigures:
     cycles = np.concatenate([run.trace(task.name) for run in runs])
     # Releases without a plan are traced only if they were late; of them only the skipped releases
@@ -239,7 +239,8 @@ def _task(
     cycles = plans(cycles) if task.role == "planner" else cycles
     missed, _ = counts(cycles)
     slice_ns = task.every * task.within_cycles * tick_ns
-    predicted_ns = responses.get(task.name)
+    response = responses.get(task.name)
+    predicted_ns = None if response is None else response.response_ns
     return TaskFigures(
         slice_ms=slice_ns * 1e-6,
         cycles=len(cycles),
@@ -247,9 +248,7 @@ def _task(
         skipped=skipped,
         residual_ms=distribution(residual_ns(cycles, slice_ns) * 1e-6),
         predicted_ms=None if predicted_ns is None else predicted_ns * 1e-6,
-        fits=predicted_ns is not None and predicted_ns <= slice_ns
-        if task.name in responses
-        else None,
+        fits=None if response is None else response.holds,
     )
 
 
