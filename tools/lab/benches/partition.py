@@ -20,7 +20,6 @@ from rack.levels.timing.trace_times import (
     Distribution,
     counts,
     distribution,
-    plan_ages,
     plans,
     residual_ns,
 )
@@ -30,6 +29,7 @@ from rack.tools.console.tables import figure, table
 from rack.tools.lab.benches.harness import BenchResult, interleaved
 from rack.tools.lab.benches.observed import record
 from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.report import plan_ages_ms
 
 LAUNCH_S = 3.0
 """About how long launching and recording a run take in addition to its time."""
@@ -214,19 +214,13 @@ def _level(
     tasks = {task.name: task for task in layout.tasks}
     planner = tasks.get(f"{board}.planner")
     plan = f"{board}.plan"
-    ages = [_ages_ms(board, plan, layout, run) for run in runs if plan in run.mailboxes]
+    ages = [plan_ages_ms(run, board) for run in runs if plan in run.mailboxes]
     return LevelFigures(
         level=board,
         executor=_task(tasks[board], layout.clock_ns, responses, runs),
         planner=None if planner is None else _task(planner, layout.clock_ns, responses, runs),
         plan_age_ms=distribution(np.concatenate(ages)) if ages else None,
     )
-
-
-def _ages_ms(board: str, plan: str, layout: Layout, run: Recording) -> np.ndarray:
-    made = run.signal(plan, "tick")
-    visible_at = run.signal(plan, "visible_at")
-    return plan_ages(run.cycles[board]["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
 
 
 def _task(

@@ -186,14 +186,19 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
             task, cycles, layout.clock_ns if is_lockstep else tick_ns(config), is_lockstep
         ),
     }
-    plan = f"{task.board}.plan"
-    if task.role == "executor" and plan in recording.mailboxes:
-        made = recording.signal(plan, "tick")
-        visible_at = recording.signal(plan, "visible_at")
-        entry["plan_age_ms"] = distribution(
-            plan_ages(cycles["tick"], made, visible_at) * (layout.clock_ns * 1e-6)
-        )
+    if task.role == "executor" and f"{task.board}.plan" in recording.mailboxes:
+        entry["plan_age_ms"] = distribution(plan_ages_ms(recording, task.board))
     return entry
+
+
+def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
+    """Return the age of the plan that each cycle of a board's executor could read, simulated time;
+    see `plan_ages`."""
+    plan = f"{board}.plan"
+    made = recording.signal(plan, "tick")
+    visible_at = recording.signal(plan, "visible_at")
+    ticks = recording.trace(board)["tick"]
+    return plan_ages(ticks, made, visible_at) * (recording.layout.clock_ns * 1e-6)
 
 
 def _about(task: TaskSpec, layout: Layout) -> Report:

@@ -186,14 +186,10 @@ NASREM = Experiment(
 
 def _verdicts(analysis: Analysis) -> Iterator[MeasuredVerdict]:
     """Yield every equation on every subject, as measured in the worst cycle."""
-    failing = {_key(pair.measured) for pair in analysis.mostly if pair.measured and pair.fails}
+    failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.fails}
     for pair in analysis.pairs:
         if pair.measured:
-            yield MeasuredVerdict(pair.measured, _key(pair.measured) not in failing)
-
-
-def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
-    return verdict.equation, verdict.subject, verdict.meaning
+            yield MeasuredVerdict(pair.measured, pair.measured.key not in failing)
 
 
 def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
