@@ -49,7 +49,6 @@ REPLAYED_TICKS = 1000
 """Ticks of one replay of physics, at most."""
 ROW = "mj_step, tick after tick"
 PACED = "mj_step, at the servo's rate"
-SHARE = f"{EMPTY}, lockstep, wall-clock time of a tick, a board"
 
 
 class Trace(NamedTuple):
@@ -151,8 +150,6 @@ class Found(NamedTuple):
     (n,)."""
 
     traces: defaultdict[tuple[str, str], list[Trace]]
-    shares_us: defaultdict[str, list[np.ndarray]]
-    """Wall-clock time of a tick of the empty rack in lockstep, divided by its boards."""
     physics_us: defaultdict[str, list[np.ndarray]]
     """Processor time of a tick's bare physics, by the way of their replay."""
 
@@ -183,7 +180,7 @@ class CycleRuns:
     """Runs racks, and collects what is `found` in their traces."""
 
     def __init__(self, seconds: float, folder: Path, share: bool) -> None:
-        self.found = Found(defaultdict(list), defaultdict(list), defaultdict(list))
+        self.found = Found(defaultdict(list), defaultdict(list))
         self._seconds = seconds
         self._folder = folder
         self._share = share
@@ -203,15 +200,9 @@ class CycleRuns:
         options += ["--lockstep"] * kind.lockstep + ["--share"] * self._share
         options += ["--out", folder / "run"]
         command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
-        traces = traces_of(Recording(folder / "run"))
-        for board, trace in traces.items():
+        for board, trace in traces_of(Recording(folder / "run")).items():
             case = f"{EMPTY if kind.config == EMPTY else board}, {kind.mode}"
             self.found.traces[case, command.name].append(trace)
-        if kind.lockstep and kind.config == EMPTY:
-            first = next(iter(traces.values()))
-            self.found.shares_us[command.name].append(
-                np.diff(first.rows["start_ns"]) * 1e-3 / len(traces)
-            )
         if kind.lockstep and kind.config != EMPTY and command.name == THIS:
             for who, pace in ((ROW, ReplayPace()), (PACED, self._pace)):
                 times_us = apart(replay, folder / "run", pace, REPLAYED_TICKS)
@@ -251,10 +242,7 @@ def costs(found: Found, baseline: str | None) -> CycleCosts:
     # A single cycle has no parts: the record of the next one has its bookkeeping.
     long = [one for one in order if any(len(trace.rows) > 1 for trace in found.traces[one])]
     parts = [BoardParts(*one, _medians(found.traces[one])) for one in long]
-    shares = [
-        _sample(SHARE, who, found.shares_us[who]) for who in sorted(found.shares_us, key=_is_other)
-    ]
-    baselines = {sample.case: baseline for sample in (*samples, *shares) if baseline is not None}
+    baselines = {sample.case: baseline for sample in samples if baseline is not None}
     physics: list[Sample] = []
     for case in dict.fromkeys(case for case, _ in order if case.startswith(f"{SERVO},")):
         physics += [
@@ -265,9 +253,7 @@ def costs(found: Found, baseline: str | None) -> CycleCosts:
         ]
         baselines[_with_physics(case)] = _bare(case)
     title = "Processor time of a board's cycle"
-    return CycleCosts(
-        Comparison("cycle", title, (*samples, *shares, *physics), baselines), tuple(parts)
-    )
+    return CycleCosts(Comparison("cycle", title, (*samples, *physics), baselines), tuple(parts))
 
 
 def _ordered(found: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:

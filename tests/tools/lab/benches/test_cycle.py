@@ -55,7 +55,7 @@ def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
 
 
 def given(**others: Trace) -> Found:
-    found = Found(defaultdict(list), defaultdict(list), defaultdict(list))
+    found = Found(defaultdict(list), defaultdict(list))
     found.traces["servo, real time", "this tree"] = [trace(50), trace(50), trace(200)]
     for who, one in others.items():
         found.traces["servo, real time", who] = [one]
@@ -115,8 +115,6 @@ def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> Non
     assert {"servo and its physics, lockstep", "servo and its physics, real time"} <= set(
         found.comparison.baselines
     )
-    share = next(sample for sample in found.comparison.samples if "a board" in sample.case)
-    assert share.count > 100
     assert [path.name for path in found.plot(tmp_path)] == ["cycle.png", "cycle.svg"]
     assert any("servo and its physics" in line for line in found.lines(100))
 
