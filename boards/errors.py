@@ -55,13 +55,11 @@ def shown(value: Any) -> str:
     """Return a config value as in TOML, shortened to one line."""
     value = list(value) if isinstance(value, tuple) else value
     try:
-        text = (
-            str(value).lower()
-            if isinstance(value, bool)
-            else f'"{value}"'
-            if isinstance(value, str)
-            else str(value)
-        )
+        text = str(value)
+        if isinstance(value, bool):
+            text = text.lower()
+        elif isinstance(value, str):
+            text = f'"{value}"'
     except ValueError:  # Python refuses to print integers of thousands of digits
         text = f"an integer of {value.bit_length()} bits"
     return one_line(text, LONGEST_VALUE)

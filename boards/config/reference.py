@@ -67,14 +67,10 @@ class Place(NamedTuple):
     @property
     def heading(self) -> str:
         """The heading of the table in TOML."""
+        if not self.path:
+            return "(top of the file)"
         text = f"[[{self.path}]]" if self.is_list else f"[{self.path}]"
-        return (
-            f"{text} with {self.variant}"
-            if self.variant
-            else text
-            if self.path
-            else "(top of the file)"
-        )
+        return f"{text} with {self.variant}" if self.variant else text
 
 
 def key_tables(config: RackConfig) -> list[KeyTable]:
@@ -162,13 +158,14 @@ def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Pl
 def _key(name: str, entry: Schema, is_required: bool) -> Key:
     description = entry.get("description", "")
     unit = UNIT.search(description)
-    default = entry.get("default")
+    given = entry.get("default")
+    default = "" if given in (None, [], {}) else shown(given)
     return Key(
         name=name,
         type=_type(entry),
         unit=unit[1] if unit else "",
         permitted=_permitted(entry),
-        default=REQUIRED if is_required else "" if default in (None, [], {}) else shown(default),
+        default=REQUIRED if is_required else default,
         meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
     )
 
@@ -223,10 +220,16 @@ def _range(entry: Schema) -> str:
     )
     if low and high:
         return f"{low} to {high}"
-    least = f"{low} or more" if low else f"above {above}" if above else ""
-    return ", ".join(
-        filter(None, (least, f"at most {high}" if high else f"below {below}" if below else ""))
-    )
+    bounds = []
+    if low:
+        bounds.append(f"{low} or more")
+    elif above:
+        bounds.append(f"above {above}")
+    if high:
+        bounds.append(f"at most {high}")
+    elif below:
+        bounds.append(f"below {below}")
+    return ", ".join(bounds)
 
 
 def _number(value: float) -> str:

@@ -41,9 +41,9 @@ Power = Literal["enable", "disable", "reset", "release"]
 
 def _listed(value: Any) -> Any:
     """Return a single name as a list of one, and TOML's list as a tuple."""
-    return (
-        (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
-    )
+    if isinstance(value, str):
+        return (value,)
+    return tuple(value) if isinstance(value, list) else value
 
 
 RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
@@ -463,8 +463,11 @@ class CommandConfig(Table):
         found = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        found += [Goal.HOME] if self.home else []
-        return found if self.on is None else [*found, Goal.ON if self.on else Goal.OFF]
+        if self.home:
+            found.append(Goal.HOME)
+        if self.on is not None:
+            found.append(Goal.ON if self.on else Goal.OFF)
+        return found
 
 
 class TaskPlace(NamedTuple):

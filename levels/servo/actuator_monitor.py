@@ -130,13 +130,11 @@ class ActuatorMonitor:
             np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise)
             < MIN_TURNING_JOINTS
         )
-        part = (
-            MAX_CONTACT_PART
-            if self._pushed
-            else MAX_RESTING_CONTACT_PART
-            if rests and holds
-            else LACKING_PART
-        )
+        part = LACKING_PART
+        if self._pushed:
+            part = MAX_CONTACT_PART
+        elif rests and holds:
+            part = MAX_RESTING_CONTACT_PART
         least = np.maximum(part, self._noise / self._limits)
         joint = (
             self._joint

@@ -427,9 +427,8 @@ class ArmDriver(Executor):
         else:
             resting = State.IDLE if shown.holding else State.EXECUTING
             status.state = State.HOLDING if kept and self.has_work else resting
-            status.error = (
-                Error.LIMIT if shown.violations else Error.TOUCHED if shown.touches else Error.NONE
-            )
+            touched = Error.TOUCHED if shown.touches else Error.NONE
+            status.error = Error.LIMIT if shown.violations else touched
             broken = self.arm.first_violation if shown.violations else self.arm.first_touch
             slow = self.enabling.slow if shown.slowed else ""
             status.reason = kept or broken or slow or shown.note

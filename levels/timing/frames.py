@@ -124,12 +124,17 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
         for task, after in zip(group, [*group[1:], *following, None], strict=False):
             is_last = task is group[-1]
             end, done = _worked(work[task.name, release], task, limit)
+            slack_ns = 0
+            if end is None:
+                slack_ns = done - task.cost_ns
+            elif is_last:
+                slack_ns = limit - end
             yield FramePlace(
                 board=task.name,
                 offset_ns=begins - start,
                 job_ns=task.cost_ns,
                 limit_ns=(limit if is_last or end is None else end) - start,
-                slack_ns=done - task.cost_ns if end is None else limit - end if is_last else 0,
+                slack_ns=slack_ns,
                 until="" if after is None else after.name,
             )
             begins = limit if end is None else end

@@ -140,15 +140,22 @@ def campaign(
         )
     # No faultless time in real time where only lockstep, or only kills, were ordered.
     default_s = 0.0 if lockstep or kills is not None else FAULTLESS_S
+    if sizes is None:
+        sizes = 0 if kills or realtime else SIZES
+    modes: tuple[bool, ...] = (True, False)
+    if lockstep:
+        modes = (True,)
+    elif realtime:
+        modes = (False,)
     order = Order(
         name=config,
         config=found,
         injections=0 if kills else injections,
         seed=seed,
-        modes=(True,) if lockstep else (False,) if realtime else (True, False),
+        modes=modes,
         kinds=kinds,
         kills=kills or 0,
-        sizes=(0 if kills or realtime else SIZES) if sizes is None else sizes,
+        sizes=sizes,
         faultless_s=default_s if faultless is None else faultless,
         loads=(True,) if load else (False, True),
         seconds=seconds,

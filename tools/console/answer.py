@@ -29,7 +29,10 @@ def print_json(document: Any) -> None:
 
 def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> None:
     """Print an answer: as one JSON document, or as text for people, given whole or as lines."""
-    print_json(document) if as_json else print(text if isinstance(text, str) else "\n".join(text))
+    if as_json:
+        print_json(document)
+    else:
+        print(text if isinstance(text, str) else "\n".join(text))
 
 
 def fail(reason: str, status: int) -> NoReturn:

@@ -285,7 +285,9 @@ def _between(ticks: Sequence[int | None]) -> str:
 
 
 def _ends(texts: Sequence[str]) -> str:
-    return "-" if not texts else texts[0] if texts[0] == texts[-1] else f"{texts[0]} .. {texts[-1]}"
+    if not texts:
+        return "-"
+    return texts[0] if texts[0] == texts[-1] else f"{texts[0]} .. {texts[-1]}"
 
 
 def _loads(loads: Mapping[int, float]) -> str:
