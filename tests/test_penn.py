@@ -60,10 +60,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def table(run: Path, mailbox: str, *fields: str) -> list[np.ndarray]:
     """Return the columns of a mailbox: seconds, then `fields`."""
-    names = ["tick", *(f"{mailbox}.{field}" for field in fields)]
-    rows = pq.read_table(
-        run / "signals.parquet", columns=names, filters=[("mailbox", "=", mailbox)]
-    )
+    names = ["tick", *fields]
+    rows = pq.read_table(run / "signals" / f"{mailbox}.parquet", columns=names)
     time_s, *values = [np.array(rows[name].to_pylist()) for name in names]
     return [time_s * 1e-3, *values]
 

@@ -14,7 +14,7 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
 from rack.boards.config import RackConfig, load, wire
 from rack.levels.peer import DRIFT_PPM, Presence, peer_port
-from rack.tools.recording.parquet import CyclesFile, SignalsFile
+from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
 from tests.boards.lan.racks import rack_text
 
@@ -81,16 +81,15 @@ def recorded(
     config = config_of(machine, [other.rack for other in others], folder)
     (folder / "config.toml").write_text(config.text())
     layout = wire(config)
-    cycles = CyclesFile(folder / "cycles.parquet")
+    launch = Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S)
+    cycles = CyclesFile(folder / "cycles.parquet", layout, launch)
     rows = np.zeros(TICKS, RECORD)
     rows["tick"] = np.arange(TICKS)
     for name in ("release_ns", "start_ns", "read_ns", "process_ns", "end_ns"):
         rows[name] = machine.epoch_ns + rows["tick"] * machine.period_ns
     cycles.add("pulse", rows)
     cycles.close({})
-    signals = SignalsFile(
-        folder / "signals.parquet", layout, Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S)
-    )
+    signals = SignalTables(folder / "signals", layout)
     for other in others:
         box = layout.mailbox(f"lan.{peer_port(other.rack)}")
         signals.add(box.name, sightings(machine, other, box, seed))
@@ -104,7 +103,7 @@ def recorded(
             rows["tick"] = rows["basis"] + TICKS - ticks
             rows["message"]["count"] = counts_from + rows["basis"]
             signals.add(name, rows)
-    signals.close({})
+    signals.close()
     return Recording(folder)
 
 

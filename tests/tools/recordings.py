@@ -12,7 +12,7 @@ import numpy as np
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.tools.recording.parquet import CyclesFile, SignalsFile
+from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
 
 MS, US = 1_000_000, 1_000
@@ -66,10 +66,9 @@ def recorded(
     folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(config.text())
     (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
-    cycles, signals = (
-        CyclesFile(folder / "cycles.parquet"),
-        SignalsFile(folder / "signals.parquet", wire(config)),
-    )
+    layout = wire(config)
+    cycles = CyclesFile(folder / "cycles.parquet", layout)
+    signals = SignalTables(folder / "signals", layout)
     for task, trace in traces.items():
         rows = [
             cycle.row(tick_ns(config)) if isinstance(cycle, Cycle) else cycle for cycle in trace
@@ -78,5 +77,5 @@ def recorded(
     for mailbox, rows in (messages or {}).items():
         signals.add(mailbox, rows)
     cycles.close({})
-    signals.close({})
+    signals.close()
     return Recording(folder)

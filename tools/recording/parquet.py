@@ -1,11 +1,11 @@
-"""The two parquet tables of a run.
+"""The parquet tables of a run.
 
-cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks.
-signals.parquet is what the tasks wrote to their mailboxes: one row a message. It is a folder, which
-parquet's readers take for one table: a long run has many parts. Each row group holds rows of one
-mailbox, whose own columns are filled; those of all others are null. The metadata hold when the rack
-was launched, and the checksum of the config.toml next to it: a config that is cut off at the end of
-a table is a valid config.
+cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks. Its metadata
+hold the layout, when the rack was launched, and the checksum of the config.toml next to it: a
+config that is cut off at the end of a table is a valid config.
+
+signals/ has a table for each mailbox that tasks and clock write, one row a message. Each is a
+folder, which parquet's readers take for one table: a long run has many parts.
 """
 
 from __future__ import annotations
@@ -27,19 +27,21 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 
-TRACE_SCHEMA = pa.schema(
-    [pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS)]
-)
+TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
 CONFIG = "config.toml"
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
-"""Columns that the messages of all mailboxes have."""
+"""Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
+TIME = "time_s"
+"""The tick as simulated time, s."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
 """Rows are written in large blocks: a file's footer has an entry for every column of every
 block."""
+SIGNALS = "signals"
+TABLE = "{}.parquet"
 PART = "{:04}.parquet"
-PART_ENTRIES = 1 << 14
+PART_ENTRIES = 1 << 12
 """Entries after which a part is finished: until then they are in memory, 0.7 kB each."""
 
 
@@ -52,11 +54,14 @@ def config_check(folder: Path) -> str:
 class CyclesFile:
     """cycles.parquet, being written."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, layout: Layout, launch: Launch | None = None) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
         self._rows = 0
+        metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
+        metadata |= {} if launch is None else {"launch": json.dumps(launch)}
+        self._schema = pa.schema(TRACE_FIELDS, metadata=metadata)
         self._writer = pq.ParquetWriter(
-            path, TRACE_SCHEMA, compression="zstd", use_dictionary=["task"]
+            path, self._schema, compression="zstd", use_dictionary=["task"]
         )
 
     def add(self, task: str, rows: np.ndarray) -> None:
@@ -76,7 +81,7 @@ class CyclesFile:
         names = np.repeat([task for task, _ in waiting], [len(block) for _, block in waiting])
         arrays = [pa.array(names), *(pa.array(np.ascontiguousarray(rows[name])) for name in FIELDS)]
         self._writer.write_batch(
-            pa.record_batch(arrays, schema=TRACE_SCHEMA), row_group_size=len(rows)
+            pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows)
         )
         self._waiting = []
         self._rows = 0
@@ -87,94 +92,98 @@ class CyclesFile:
         cores: CoreRecord = UNMEASURED,
         gaps: Sequence[tuple[str, int, int]] = (),
     ) -> None:
-        """Finish the file; store as metadata the rows lost by task, what the machine did to its
-        cores, and the gaps."""
+        """Finish the file; store as metadata the rows lost by task and by mailbox, what the machine
+        did to its cores, and the gaps."""
         self._flush()
         metadata = {"lost": json.dumps(lost), "cores": cores.text(), "gaps": json.dumps(gaps)}
         self._writer.add_key_value_metadata(metadata)
         self._writer.close()
 
 
-class SignalsFile:
-    """signals.parquet, being written; one that a killed recorder has left is replaced."""
+class SignalTables:
+    """signals/, being written; what a killed recorder has left there is replaced."""
 
-    def __init__(self, path: Path, layout: Layout, launch: Launch | None = None) -> None:
-        self._columns = {mailbox.name: columns_of(mailbox) for mailbox in layout.mailboxes}
-        self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._columns}
+    def __init__(self, folder: Path, layout: Layout) -> None:
+        if folder.exists():
+            rmtree(folder)
+        self._tables = {
+            mailbox.name: _SignalTable(folder / TABLE.format(mailbox.name), mailbox, layout)
+            for mailbox in layout.timed
+        }
+
+    def add(self, mailbox: str, rows: np.ndarray) -> None:
+        """Add rows of a mailbox's ring, shape (rows,), at least one."""
+        self._tables[mailbox].add(rows)
+
+    def close(self) -> None:
+        """Finish the tables."""
+        for table in self._tables.values():
+            table.close()
+
+
+class _SignalTable:
+    """The table of a mailbox, a folder of parts."""
+
+    def __init__(self, folder: Path, mailbox: MailboxSpec, layout: Layout) -> None:
+        folder.mkdir(parents=True)
+        self._folder = folder
+        self._tick_s = layout.clock_ns * 1e-9
+        self._columns = columns_of(mailbox)
+        self._waiting: list[np.ndarray] = []
         head = [
-            pa.field("mailbox", pa.string()),
+            pa.field(TIME, pa.float64(), metadata={"unit": "s"}),
             *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
         ]
-        fields = head + [column.field for columns in self._columns.values() for column in columns]
-        metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
-        metadata |= {} if launch is None else {"launch": json.dumps(launch)}
-        self._schema = pa.schema(fields, metadata=metadata)
-        self._folder = path
-        if path.exists():
-            rmtree(path)
-        path.mkdir()
+        self._schema = pa.schema([*head, *(column.field for column in self._columns)])
         self._parts = 0
         self._begin_part()
 
     def _begin_part(self) -> None:
         self._parts += 1
         self._entries = 0
-        texts = [
-            column.name
-            for columns in self._columns.values()
-            for column in columns
-            if column.kind[1] == "S"
-        ]
         self._writer = pq.ParquetWriter(
             self._folder / PART.format(self._parts),
             self._schema,
             compression="zstd",
-            use_dictionary=["mailbox", *texts],
-            write_statistics=["mailbox", "tick"],
+            use_dictionary=[column.label for column in self._columns if column.kind[1] == "S"],
+            write_statistics=["tick"],
         )
 
-    def add(self, mailbox: str, rows: np.ndarray) -> None:
-        """Add rows of a mailbox's ring, shape (rows,), at least one."""
-        waiting = self._waiting[mailbox]
-        waiting.append(rows)
+    def add(self, rows: np.ndarray) -> None:
+        """Add rows of the mailbox's ring."""
+        self._waiting.append(rows)
         if (
-            sum(map(len, waiting)) >= MESSAGE_ROWS
-            or sum(block.nbytes for block in waiting) >= MESSAGE_BYTES
+            sum(map(len, self._waiting)) >= MESSAGE_ROWS
+            or sum(block.nbytes for block in self._waiting) >= MESSAGE_BYTES
         ):
-            self._flush(mailbox)
+            self._flush()
 
-    def _flush(self, mailbox: str) -> None:
-        blocks = self._waiting[mailbox]
-        self._waiting[mailbox] = []
-        if not blocks:
+    def _flush(self) -> None:
+        if not self._waiting:
             return
-        rows = np.concatenate(blocks)
-        filled = {"mailbox": pa.array([mailbox] * len(rows))}
-        filled |= {name: pa.array(np.ascontiguousarray(rows[name])) for name in HEAD}
-        filled |= {column.name: column.array(rows["message"]) for column in self._columns[mailbox]}
-        arrays = [
-            filled[f.name] if f.name in filled else pa.nulls(len(rows), f.type)
-            for f in self._schema
-        ]
+        rows = np.concatenate(self._waiting)
+        self._waiting = []
+        head = [np.ascontiguousarray(rows[name]) for name in HEAD]
+        time_s = pa.array(rows["tick"] * self._tick_s)
+        arrays = [column.array(rows["message"]) for column in self._columns]
         self._writer.write_batch(
-            pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows)
+            pa.record_batch([time_s, *map(pa.array, head), *arrays], schema=self._schema),
+            row_group_size=len(rows),
         )
-        self._entries += len(arrays)
+        self._entries += len(self._schema)
         if self._entries >= PART_ENTRIES:
             self._writer.close()
             self._begin_part()
 
-    def close(self, lost: Mapping[str, int]) -> None:
-        """Finish the last part; store the rows lost by mailbox in its metadata."""
-        for mailbox in self._waiting:
-            self._flush(mailbox)
-        self._writer.add_key_value_metadata({"lost": json.dumps(lost)})
+    def close(self) -> None:
+        """Finish the last part."""
+        self._flush()
         self._writer.close()
 
 
 @dataclass(frozen=True)
 class Column:
-    """One field of a mailbox: its path in a message, and its column `<mailbox>.<path>`.
+    """One field of a mailbox, a column of its table: `name` is `<mailbox>.<path>`.
 
     `shape` is () for a single value, otherwise that of one row's list.
     """
@@ -187,14 +196,18 @@ class Column:
     values: tuple[tuple[str, int], ...] = ()  # names and numbers of an enum
 
     @property
+    def label(self) -> str:
+        """Its name in the table; that of a field named like a column of the head differs."""
+        name = ".".join(self.path)
+        return f"message.{name}" if name in (TIME, *HEAD) else name
+
+    @property
     def field(self) -> pa.Field:
         """The column's Arrow field; shape and unit are in its metadata."""
         element = pa.string() if self.kind[1] == "S" else pa.from_numpy_dtype(np.dtype(self.kind))
-        # All rows have the same length, but the nulls of a fixed-size list, in the rows of all
-        # other mailboxes, would cost as much memory as values.
-        arrow = pa.list_(element) if self.shape else element
+        arrow = pa.list_(element, prod(self.shape)) if self.shape else element
         return pa.field(
-            self.name, arrow, metadata={"shape": json.dumps(self.shape), "unit": self.unit}
+            self.label, arrow, metadata={"shape": json.dumps(self.shape), "unit": self.unit}
         )
 
     def of(self, messages: np.ndarray) -> np.ndarray:
@@ -211,8 +224,7 @@ class Column:
         )
         if not self.shape:
             return values
-        offsets = np.arange(len(messages) + 1, dtype=np.int32) * prod(self.shape)
-        return pa.ListArray.from_arrays(offsets, values)
+        return pa.FixedSizeListArray.from_arrays(values, prod(self.shape))
 
 
 def columns_of(mailbox: MailboxSpec) -> list[Column]:

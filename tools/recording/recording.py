@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import MailboxSpec, TaskSpec
 from rack.backplane.mailbox.history import row_dtype
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.segment import Launch, Segment, layout_of
@@ -25,7 +24,15 @@ from rack.boards.errors import ConfigError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CONFIG, HEAD, PART, columns_of, config_check
+from rack.tools.recording.parquet import (
+    CONFIG,
+    HEAD,
+    PART,
+    SIGNALS,
+    TABLE,
+    columns_of,
+    config_check,
+)
 from rack.tools.recording.spool import mend, rings
 
 
@@ -73,17 +80,24 @@ class Recording:
             if mend(folder):
                 _note(
                     f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
-                    " signals.parquet"
+                    " signals"
                 )
-        (self._cycles,) = self._open("cycles.parquet", ("task", "tick"))
-        self._signals = self._open("signals.parquet", ("mailbox", *HEAD))
-        self._schema = self._signals[0].schema_arrow
-        # Earlier versions stored no checksum.
-        recorded = (self._schema.metadata or {}).get(b"config", b"").decode()
-        if recorded and recorded != config_check(folder):
+        path = self._there("cycles.parquet")
+        self._cycles = _opened(path, ("task", "tick"))
+        if (folder / "signals.parquet").exists():
+            why = "recorded by an earlier version, its signals in one table"
+            raise Failure(f"{folder}: {why}, signals.parquet; run the rack again", 2)
+        with _naming(path):
+            self._metadata = self._cycles.metadata.metadata
+            recorded = self._metadata[b"config"].decode()
+            self.layout = layout_of(json.loads(self._metadata[b"layout"]))
+            """The rack's layout."""
+        if recorded != config_check(folder):
             raise Failure(
                 f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2
             )
+        self._columns = {box.name: columns_of(box) for box in self.layout.mailboxes}
+        self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
 
     @cached_property
     def rack_config(self) -> RackConfig:
@@ -94,24 +108,16 @@ class Recording:
             mistakes = "; ".join(str(error).splitlines())
             raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
-    def _open(self, name: str, columns: Sequence[str]) -> list[pq.ParquetFile]:
-        """Return the files of a table: one, or the parts in a folder, oldest first."""
-        path = self._there(name)
-        parts = [path]
-        if path.is_dir():
-            numbers = range(1, max(len([*path.iterdir()]), 1) + 1)
-            parts = [path / PART.format(number) for number in numbers]
-            if absent := [part.name for part in parts if not part.is_file()]:
-                raise Failure(f"{path}: {absent[0]} is missing", 2)
-        files = []
-        for part in parts:
-            with _naming(part):
-                files.append(pq.ParquetFile(part))
-            names = files[-1].schema_arrow.names
-            if absent := [column for column in columns if column not in names]:
-                why = f"not a recording of a rack: it has no column '{absent[0]}'"
-                raise Failure(f"{part}: {why}", 2)
-        return files
+    def _parts(self, mailbox: str) -> list[pq.ParquetFile]:
+        """Return the parts of a mailbox's table, oldest first."""
+        path = self._there(f"{SIGNALS}/{TABLE.format(mailbox)}")
+        with _naming(path):
+            count = max(len([*path.iterdir()]), 1)
+        parts = [path / PART.format(number) for number in range(1, count + 1)]
+        if absent := [part.name for part in parts if not part.is_file()]:
+            raise Failure(f"{path}: {absent[0]} is missing", 2)
+        names = (*HEAD, *(column.label for column in self._columns[mailbox]))
+        return [_opened(part, names) for part in parts]
 
     def _text(self, name: str) -> str:
         path = self._there(name)
@@ -148,18 +154,11 @@ class Recording:
         are not recorded."""
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
-    @cached_property
-    def layout(self) -> Layout:
-        """The rack's layout."""
-        with _naming(self.folder / "signals.parquet"):
-            # Earlier versions recorded no host boards.
-            return layout_of({"hosts": (), **json.loads(self._schema.metadata[b"layout"])})
-
     @property
     def launch(self) -> Launch:
         """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do
         not hold it."""
-        text = (self._schema.metadata or {}).get(b"launch")
+        text = self._metadata.get(b"launch")
         if text is None:
             why = (
                 "does not say when the rack was launched: it was recorded by an earlier version;"
@@ -177,11 +176,8 @@ class Recording:
 
     @cached_property
     def _lost_before_the_end(self) -> dict[str, int]:
-        with _naming(self.folder):
-            # The last part says what was lost of all.
-            files = (self._cycles, self._signals[-1])
-            texts = [file.metadata.metadata[b"lost"] for file in files]
-            return {name: count for text in texts for name, count in json.loads(text).items()}
+        with _naming(self.folder / "cycles.parquet"):
+            return dict(json.loads(self._metadata[b"lost"]))
 
     def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
         """Return where rows are missing, in order; gaps that overlap are one.
@@ -192,7 +188,7 @@ class Recording:
         lost = self.lost if lost is None else lost
         ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
         with _naming(self.folder / "cycles.parquet"):
-            found = json.loads(self._cycles.metadata.metadata.get(b"gaps", b"[]"))
+            found = json.loads(self._metadata.get(b"gaps", b"[]"))
         for name, count in lost.items():
             if count > self._lost_before_the_end.get(name, 0):
                 found.append((name, self._last_tick(name) + 1, ticks - 1))
@@ -251,7 +247,7 @@ class Recording:
         """What the machine did to its cores; empty if the recorder did not measure it, or was
         killed."""
         with _naming(self.folder / "cycles.parquet"):
-            text = self._cycles.metadata.metadata.get(b"cores")
+            text = self._metadata.get(b"cores")
             return UNMEASURED if text is None else CoreRecord.of(text)
 
     def need_all_columns(self) -> None:
@@ -290,20 +286,20 @@ class Recording:
         """Return one field of every message of a mailbox, oldest first, shape (messages, *shape of
         the field).
 
-        "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox.
-        Raises `KeyError`.
+        "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox;
+        a field of its own with such a name is "message.<name>". Raises `KeyError`.
         """
-        schema = self._schema
-        name = field if field in schema.names else f"{mailbox}.{field}"
-        column = schema.field(name)
-        with _naming(self.folder / "signals.parquet"):
-            read = [
-                file.read_row_group(group, columns=[name]).column(0).combine_chunks()
-                for file, group in self._groups_of.get(mailbox, ())
-            ]
-        shape = tuple(json.loads(column.metadata[b"shape"])) if column.metadata else ()
+        shape: tuple[int, ...] = ()
+        if field not in HEAD:
+            shape = {column.label: column.shape for column in self._columns[mailbox]}[field]
+        read = []
+        for file in self._tables.get(mailbox, ()):
+            with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
+                read.append(file.read(columns=[field]).column(0).combine_chunks())
         values = [
-            (block.flatten() if shape else block).to_numpy(zero_copy_only=False) for block in read
+            (block.flatten() if shape else block).to_numpy(zero_copy_only=False)
+            for block in read
+            if len(block)
         ]
         if not values:
             return np.empty((0, *shape))
@@ -317,7 +313,7 @@ class Recording:
             part = found
             for key in column.path[:-1]:
                 part = part[key]
-            part[column.path[-1]] = self.signal(box.name, column.name.removeprefix(f"{box.name}."))
+            part[column.path[-1]] = self.signal(box.name, column.label)
         return found
 
     def rows(self, name: str) -> np.ndarray:
@@ -334,24 +330,23 @@ class Recording:
 
     def fields(self, mailbox: str) -> set[str]:
         """Return the fields of a mailbox's messages."""
-        names = [name for name in self._schema.names if name.startswith(f"{mailbox}.")]
-        return {name.removeprefix(f"{mailbox}.") for name in names}
+        return {column.label for column in self._columns[mailbox]}
 
     @property
     def mailboxes(self) -> list[str]:
         """The mailboxes that hold messages."""
-        return list(self._groups_of)
+        tables = self._tables.items()
+        return [name for name, parts in tables if any(part.metadata.num_rows for part in parts)]
 
-    @cached_property
-    def _groups_of(self) -> dict[str, list[tuple[pq.ParquetFile, int]]]:
-        """The row groups of each mailbox, oldest first: files and numbers."""
-        groups = defaultdict(list)
-        for file in self._signals:
-            for number in range(file.num_row_groups):
-                # A row group holds rows of one mailbox only: its smallest name is its only one.
-                name = str(file.metadata.row_group(number).column(0).statistics.min)
-                groups[name].append((file, number))
-        return dict(groups)
+
+def _opened(path: Path, columns: Iterable[str]) -> pq.ParquetFile:
+    """Return a parquet file that has these columns. Raises `Failure`."""
+    with _naming(path):
+        file = pq.ParquetFile(path)
+    names = file.schema_arrow.names
+    if absent := [column for column in columns if column not in names]:
+        raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
+    return file
 
 
 @contextmanager

@@ -31,10 +31,9 @@ from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import RECORD, trace_ring
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CyclesFile, SignalsFile
+from rack.tools.recording.parquet import SIGNALS, CyclesFile, SignalTables
 
 CYCLES = "cycles.parquet"
-SIGNALS = "signals.parquet"
 SPOOL = "recorder.spool"
 MENDED = "-mended"
 MAGIC = b"RACKSPL2"
@@ -54,7 +53,7 @@ class Frame(NamedTuple):
 
 
 class RunFiles:
-    """cycles.parquet and signals.parquet of a folder, being written.
+    """cycles.parquet and signals/ of a folder, being written.
 
     By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far.
     `gaps` holds where they were lost: ring, first and last tick without rows.
@@ -67,8 +66,8 @@ class RunFiles:
         self.gaps: list[tuple[str, int, int]] = []
         self._reached = dict.fromkeys(self.lost, (-1, 0))
         """Of each ring the newest tick, and the rows lost by then."""
-        self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}")
-        self._signals = SignalsFile(folder / f"{SIGNALS}{suffix}", layout, launch)
+        self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
+        self._signals = SignalTables(folder / f"{SIGNALS}{suffix}", layout)
 
     def add(self, frame: Frame) -> None:
         """Add rows of a ring."""
@@ -88,16 +87,13 @@ class RunFiles:
             self.taken[name] = int(rows["serial"][-1])
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
-        """Finish both files; the trace keeps what the machine did to its cores."""
-        tasks = set(self.tasks)
-        self._cycles.close(
-            {name: count for name, count in self.lost.items() if name in tasks}, cores, self.gaps
-        )
-        self._signals.close({name: count for name, count in self.lost.items() if name not in tasks})
+        """Finish all files; the trace keeps what the machine did to its cores."""
+        self._signals.close()
+        self._cycles.close(self.lost, cores, self.gaps)
 
 
 def mend(folder: Path) -> bool:
-    """Make both files from the spool of a killed recorder; return False where there is none.
+    """Make the files from the spool of a killed recorder; return False where there is none.
 
     Raises `Failure` when that recorder is still running, or its spool cannot be read.
     """

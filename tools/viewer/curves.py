@@ -14,7 +14,7 @@ from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
 
 SIGNALS = "signals"
 MAX_CURVES = 16
-"""Fields with more numbers than this are tables, not curves; they are in signals.parquet."""
+"""Fields with more numbers than this are tables, not curves; they are in signals/."""
 JOINTS = "joints"
 ERROR = "tracking_error"
 GRIPPER = "gripper"

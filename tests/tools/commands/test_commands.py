@@ -147,7 +147,7 @@ def test_run_prints_one_json_document_and_nothing_else(
         "report.json",
         "report.md",
         "run.rrd",
-        "signals.parquet",
+        "signals",
     ]
     again = rack("report", tmp_path / "run", "--json")
     assert json.loads(again.stdout) == report

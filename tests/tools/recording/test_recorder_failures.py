@@ -470,7 +470,7 @@ def test_what_a_killed_recorder_took_is_readable(
     assert notes_of(Recording(tmp_path / "run")) == [
         "the recorder ended with status -9; the run continues, unrecorded"
     ]
-    ticks = pq.read_table(tmp_path / "run" / "signals.parquet", columns=["tick"])["tick"].to_numpy()
+    ticks = pq.read_table(tmp_path / "run" / "signals" / "lower.status.parquet")["tick"].to_numpy()
     assert ticks.max() > FIRST_BLOCK / 2
     repaired = tmp_path / "repaired.rrd"
     for command in (
@@ -525,7 +525,8 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
         folder.mkdir()
         (folder / SPOOL).write_bytes(whole[:size])
         assert mend(folder)
-        found.append(pq.read_table(folder / "signals.parquet").num_rows)
+        tables = (folder / "signals").iterdir()
+        found.append(sum(pq.read_table(table).num_rows for table in tables))
     assert found == sorted(found, reverse=True)
     assert found[0] > 200 > found[-1]
 

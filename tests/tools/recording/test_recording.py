@@ -8,25 +8,27 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
-from rack.tools.recording.parquet import SignalsFile
+from rack.tools.recording.parquet import HEAD, SignalTables
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.charts.gantt import subject_of
-from tests.shared_runs import small_run
+from tests.shared_runs import nasrem_run, small_run
 
 READERS: tuple[Callable[[Path], object], ...] = (
     write_report,
     lambda folder: Analysis.of(Recording(folder), 100.0, lambda done: None),
     lambda folder: subject_of(str(folder), [], None),
 )
-PARQUET = ("cycles.parquet", "signals.parquet/0001.parquet")
+TABLE = "signals/lower.status.parquet"
+PARQUET = ("cycles.parquet", f"{TABLE}/0001.parquet")
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda data: b"",
     "cut": lambda data: data[: len(data) // 2],
@@ -73,8 +75,7 @@ def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
 @pytest.mark.parametrize("name", ["config.toml", *PARQUET])
 def test_a_file_that_is_not_there_is_named(damaged: Path, name: str) -> None:
     (damaged / name).unlink()
-    # Of a folder without its only part, the folder.
-    refused(damaged, name.partition("/")[0])
+    refused(damaged, Path(name).name)
 
 
 def test_a_part_is_missing_where_its_number_is(damaged: Path) -> None:
@@ -89,23 +90,54 @@ def test_a_parquet_file_of_something_else_is_named(damaged: Path, name: str) -> 
     refused(damaged, name)
 
 
-def test_signals_without_their_layout_are_named(damaged: Path) -> None:
-    path = damaged / PARQUET[1]
+def test_a_table_that_is_not_there_is_named(damaged: Path) -> None:
+    shutil.rmtree(damaged / TABLE)
+    refused(damaged, TABLE)
+
+
+def test_a_trace_without_its_layout_is_named(damaged: Path) -> None:
+    path = damaged / PARQUET[0]
     pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
-    refused(damaged, path.parent.name)
+    refused(damaged, path.name)
 
 
 def messages(recording: Recording) -> dict[str, list[bytes]]:
     return {box.name: recording.rows(box.name).tolist() for box in recording.layout.timed}
 
 
-def test_the_one_file_of_an_earlier_version_is_read(damaged: Path) -> None:
-    parts = messages(Recording(damaged))
-    assert any(parts.values())
-    part = (damaged / PARQUET[1]).rename(damaged / "part")
-    (damaged / "signals.parquet").rmdir()
-    part.rename(damaged / "signals.parquet")
-    assert messages(Recording(damaged)) == parts
+def test_the_one_table_of_an_earlier_version_is_refused(damaged: Path) -> None:
+    shutil.rmtree(damaged / "signals")
+    (damaged / "signals.parquet").mkdir()
+    refused(damaged, "recorded by an earlier version")
+
+
+def test_a_table_holds_the_columns_of_its_mailbox_and_their_units(run: Path) -> None:
+    recording = Recording(run)
+    table = pq.read_table(run / TABLE)
+    fields = recording.fields("lower.status")
+    assert table.column_names[:7] == ["time_s", *HEAD]
+    assert set(table.column_names[7:]) == fields
+    assert table["tick"].to_pylist() == recording.signal("lower.status", "tick").tolist()
+    assert table["time_s"].to_pylist() == pytest.approx(0.0025 * table["tick"].to_numpy())
+    assert table.schema.field("time_s").metadata == {b"unit": b"s"}
+
+
+@pytest.mark.slow
+def test_a_field_named_like_a_column_of_every_mailbox_keeps_its_own_values(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    recording = Recording(nasrem_run(tmp_path_factory))
+    box = recording.layout.mailbox("servo.state")
+    rows = recording.rows(box.name)
+    rows["message"]["tick"] += 7
+    tables = SignalTables(recording.folder / "signals", recording.layout)
+    tables.add(box.name, rows)
+    tables.close()
+    again = Recording(recording.folder)
+    assert np.array_equal(again.messages(box), rows["message"])
+    assert np.array_equal(
+        again.signal(box.name, "tick") + 7, again.signal(box.name, "message.tick")
+    )
 
 
 @pytest.mark.slow
@@ -121,20 +153,17 @@ def test_a_long_run_has_many_parts_which_are_one_table(
         shutil.copy(damaged / name, folder / name)
     # What a killed recorder has left is replaced.
     for _ in range(2):
-        signals = SignalsFile(folder / "signals.parquet", recording.layout)
+        signals = SignalTables(folder / "signals", recording.layout)
         for box in recording.layout.timed:
             rows = recording.rows(box.name)
             for begin in range(0, len(rows), 16):
                 signals.add(box.name, rows[begin : begin + 16])
-        signals.close({"upper.status": 3})
-    assert len([*(folder / "signals.parquet").iterdir()]) > 10
+        signals.close()
+    assert len([*(folder / TABLE).iterdir()]) > 10
     again = Recording(folder)
     assert messages(again) == messages(recording)
-    assert again.lost["upper.status"] == 3
-    ticks = [
-        pq.read_table(each / "signals.parquet")["tick"].to_pylist() for each in (damaged, folder)
-    ]
-    assert sorted(ticks[0]) == sorted(ticks[1])
+    ticks = [pq.read_table(each / TABLE)["tick"].to_pylist() for each in (damaged, folder)]
+    assert ticks[0] == ticks[1]
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ class Recorder:
         self._is_stopped = True
 
     def close(self) -> None:
-        """Finish both files; the rack continues without a follower."""
+        """Finish the files; the rack continues without a follower."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         self._spool.flush(now=True)

@@ -13,7 +13,7 @@ from typing import Any
 from rack.tools.console.answer import print_json
 
 FILES = ("report.json", "report.md")
-RECORDED = ("config.toml", "cycles.parquet", "signals.parquet", "events.jsonl")
+RECORDED = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
 SPOOL = "recorder.spool"
 PROGRAM = Path(__file__).resolve().parents[3]
 
