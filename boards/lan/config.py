@@ -95,7 +95,7 @@ class LanTable(Table):
     )
     insecure: bool = Field(False, description="permit endpoints beyond loopback without TLS")
     lease_ms: float = Field(
-        200.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms"
+        500.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms"
     )
     on_peer_loss: OnPeerLoss = Field(
         "hold",

@@ -24,7 +24,7 @@ from rack.backplane.segment import VERSION
 from rack.boards.lan.config import LanTable, Right
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Flaw
-from rack.boards.lan.keys import ALL_ALIVE
+from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle
 from rack.boards.lan.link import LanLink
 from rack.boards.lan.questions import NEEDED, Code, DeskAnswer, What, answer_key, question_key
 from rack.levels.errors import LevelError
@@ -101,9 +101,12 @@ class Questioner:
 
     def _note(self, sample: Any) -> None:
         """Note who comes and goes; a token that is not one of a rack's adapter is nobody's."""
-        _, rack, _, number = str(sample.key_expr).split("/")
-        with self._changed, suppress(ValueError):
-            launch = int(number, 16)
+        key = str(sample.key_expr)
+        if (found := launch_and_cycle(key)) is None:
+            return
+        rack = key.split("/")[1]
+        launch, _ = found
+        with self._changed:
             if sample.kind == zenoh.SampleKind.PUT:
                 self._launches[rack] = launch
             elif self._launches.get(rack) == launch:

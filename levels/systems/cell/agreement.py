@@ -52,6 +52,8 @@ class Agreement:
         self.attempt = 0
         self.error = Error.NONE
         self.reason = ""
+        # When every arm was there: the origin of the program's times, simulated time; 0: not yet
+        self.begun_s = 0.0
         self.ending_s = 0.0  # since when the arms are ended, simulated time; 0: not yet
 
     def recall(self, last: Message) -> None:
@@ -62,6 +64,7 @@ class Agreement:
         self.error = Error(last.error)
         self.reason = last.reason
         self.ending_s = last.ending
+        self.begun_s = last.begun
 
     def write_to(self, progress: Message) -> None:
         """Fill a `CELL_PROGRESS`, but for the count of moves."""
@@ -71,6 +74,7 @@ class Agreement:
         progress.error = self.error
         progress.reason = self.reason
         progress.ending = self.ending_s
+        progress.begun = self.begun_s
 
     @property
     def order(self) -> int:
@@ -135,6 +139,7 @@ class Agreement:
         if ended:
             self.end(Error(ended[0].error), ended[0].reason)
         elif self._are_there(self._arms):
+            self.begun_s = self._now_s
             self._go_on()
         if self.phase is Phase.ASKING:
             # At once: an arm that has forgotten its promise must not be asked for it again.

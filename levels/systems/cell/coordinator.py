@@ -52,8 +52,8 @@ class CoordinatorParams(Table):
 class Coordinator(Executor):
     """Has each step of its program carried out by all its arms, or by none.
 
-    While an arm is lost, or an operator holds this level, the arms rest on their paths. `by` is the
-    simulated time of this rack: it begins anew with each launch.
+    While an arm is lost, or an operator holds this level, the arms rest on their paths. `by` counts
+    from when every arm has reported: anew with each launch of this rack.
     """
 
     inputs = {
@@ -196,6 +196,8 @@ class Coordinator(Executor):
         what = agreement.verb(arm)
         if what in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
             write_action(self._steps[agreement.step][arm], order)
+            if order.by:
+                order.by += agreement.begun_s
         is_spoken_to = what is not OrderVerb.NONE
         order.id = agreement.order if is_spoken_to else 0
         order.program = agreement.program if is_spoken_to else 0

@@ -145,7 +145,7 @@ CELL_REQUEST = MessageType(
 
 CELL_PROGRESS = MessageType(
     "cell_progress",
-    1,
+    2,
     (
         Field("phase", "u1", Phase, "of the present step"),
         Field("step", "u2", "1", "steps done"),
@@ -153,6 +153,7 @@ CELL_PROGRESS = MessageType(
         Field("error", "u2", Error, "why the program ends early; 0: it does not"),
         Field("reason", "S120", "ASCII", "the error, readable"),
         real("ending", "s", "simulated time since when the arms are ended; 0: not yet"),
+        real("begun", "s", "simulated time from which `by` counts; 0: not yet"),
         Field("moves", "u2", "1", "elemental moves of the steps done"),
     ),
 )

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ OF_LAN = """
 slot = 5
 rate_hz = 100
 listen = ["tcp/127.0.0.1:{port}"]
-peers = ["elsewhere"]
+peers = ["{peer}"]
 
 [adapter.lan.permit]
 operator = ["watch", "command", "stop"]
@@ -42,12 +42,13 @@ NOT_PERMITTED = "rack '{}' does not permit '{}' to {}; its config: adapter.lan.p
 
 
 class Far(NamedTuple):
-    """A rack that runs: its name here, its address from afar, and the events that its launcher has
-    printed."""
+    """A rack that runs: its name here, its address from afar, the events that its launcher has
+    printed, and the rack that it works with, with where that is."""
 
     name: str
     address: str
     log: Path
+    peer: list[str]
 
     @property
     def port(self) -> str:
@@ -79,28 +80,44 @@ def afar(*commands: str, certificates: str = "") -> list[Ended]:
     return [Ended(*ended) for ended in json.loads(client.stdout)]
 
 
-def started(folder: Path, mode: str, *settings: str) -> Iterator[Far]:
+def started(folder: Path, mode: str) -> Iterator[Far]:
     """Start a rack that runs until it is stopped, and stop it at the end."""
     name, port = f"test-afar-{mode}-{os.getpid()}", free_port()
+    peer = f"{name}-peer"
     config, log = folder / "far.toml", folder / "log"
-    config.write_text(COMMANDED + OF_LAN.format(port=port))
+    config.write_text(COMMANDED + OF_LAN.format(port=port, peer=peer))
     given = [
-        word
-        for setting in (f"name={name}", f"clock.mode={mode}", *settings)
-        for word in ("--set", setting)
+        word for setting in (f"name={name}", f"clock.mode={mode}") for word in ("--set", setting)
     ]
-    with log.open("w") as out:
+    with log.open("w") as out, ExitStack() as stack:
         process = subprocess.Popen(
             [*RACK, "run", str(config), "--no-record", *given], cwd=ROOT, stdout=out, stderr=out
         )
-    try:
-        wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
-        assert process.poll() is None, log.read_text()
-        yield Far(name, f"127.0.0.1:{port}/{name}", log)
-    finally:
-        rack("stop", name)
-        process.kill()
-        process.communicate()
+        try:
+            if is_lockstep := mode == "lockstep":
+                # It steps with its peer, and waits for that.
+                stack.enter_context(partner(config, peer, name, port))
+            wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
+            assert process.poll() is None, log.read_text()
+            seen = [peer, "there" if is_lockstep else "awaited"]
+            yield Far(name, f"127.0.0.1:{port}/{name}", log, seen)
+        finally:
+            rack("stop", name)
+            process.kill()
+            process.communicate()
+
+
+@contextmanager
+def partner(config: Path, name: str, other: str, port: int) -> Iterator[None]:
+    """Run a rack that steps with the other one."""
+    lan = (f'connect=["tcp/127.0.0.1:{port}"]', "listen=[]", f'peers=["{other}"]')
+    settings = (f"name={name}", *(f"adapter.lan.{setting}" for setting in lan))
+    given = [word for setting in settings for word in ("--set", setting)]
+    with client("run", str(config), "--lockstep", "--no-record", *given):
+        try:
+            yield
+        finally:
+            rack("stop", name)
 
 
 @contextmanager
@@ -121,9 +138,7 @@ IN_BOTH = pytest.mark.parametrize("far", ["realtime", "lockstep"], indirect=True
 @pytest.fixture(scope="module")
 def far(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
     """A rack on this machine, to be reached by its address."""
-    # In lockstep it would wait for its peer.
-    settings = ("adapter.lan.peers=[]",) if request.param == "lockstep" else ()
-    yield from started(tmp_path_factory.mktemp("far"), request.param, *settings)
+    yield from started(tmp_path_factory.mktemp("far"), request.param)
 
 
 def shape(document: Any) -> Any:
@@ -201,7 +216,7 @@ def test_nobody_does_what_the_config_does_not_permit(far: Far) -> None:
 
 
 @pytest.mark.slow
-@REALTIME
+@IN_BOTH
 def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far) -> None:
     shown, closed = afar(
         f"list --lan {far.port} --json", f"list --lan {far.port} --as nobody --json"
@@ -210,7 +225,7 @@ def test_the_racks_at_a_host_are_listed_with_the_peers_that_they_await(far: Far)
     assert (found["rack"], found["state"], found["peers"]) == (
         far.name,
         "running",
-        [["elsewhere", "awaited"]],
+        [far.peer],
     )
     assert found["age_s"] > 0
     hidden = next(row for row in json.loads(closed.out) if row["host"] == far.port)

@@ -108,12 +108,7 @@ def test_orders_hold_what_the_program_says() -> None:
     bench = CellBench([TRANSFER, REACH], [BENT, AWAY])
     bench.both(Response.NONE)
     puma, k1607 = bench.order("puma"), bench.order("k1607")
-    assert (puma.action, puma.object, puma.yaw, puma.by) == (
-        OrderAction.TRANSFER,
-        "part",
-        0.5,
-        20.0,
-    )
+    assert (puma.action, puma.object, puma.yaw) == (OrderAction.TRANSFER, "part", 0.5)
     assert (k1607.goal, k1607.direction.tolist()) == (Goal.DIRECTION, [0.0, 0.0, -1.0])
     assert puma.id == k1607.id == 1000
     bench.both(Response.POSSIBLE)
@@ -121,6 +116,19 @@ def test_orders_hold_what_the_program_says() -> None:
     puma, k1607 = bench.order("puma"), bench.order("k1607")
     assert (puma.action, puma.object, puma.by) == (OrderAction.HOME, "", 0.0)
     assert (k1607.goal, k1607.joints[: k1607.count].tolist()) == (Goal.JOINTS, BENT["joints"])
+
+
+def test_times_of_the_program_count_from_when_every_arm_reports() -> None:
+    bench = CellBench([TRANSFER, REACH])
+    bench.say("puma")
+    bench.cycles(40)
+    bench.both(Response.NONE)
+    begun = bench.read("cell.progress").begun
+    assert 10.0 < begun <= bench.seconds
+    assert [bench.order(arm).by for arm in ARMS] == [20.0 + begun, 15.0 + begun]
+    bench.restart("cell")
+    bench.cycles(5)
+    assert [bench.order(arm).by for arm in ARMS] == [20.0 + begun, 15.0 + begun]
 
 
 def test_refusal_of_one_arm_ends_the_program_for_all_with_its_reason() -> None:
