@@ -274,3 +274,11 @@ def test_order_that_was_never_promised_fails() -> None:
         Response.FAILED,
         "told to do what it has not promised: its rack was launched anew",
     )
+
+
+def test_order_that_is_to_be_done_before_it_was_promised_fails() -> None:
+    taken = TakenOrder()
+    taken.hear(PROGRAM, 3000, OrderVerb.ASK)
+    taken.hear(PROGRAM, 3000, OrderVerb.DO)
+    assert (taken.response, taken.error) == (Response.FAILED, Error.GIVEN_UP)
+    assert taken.reason.startswith("told to do what it has not promised")

@@ -34,6 +34,8 @@ class PlayedMoves(Executor):
     inputs = {"command": Input(TASK_COMMAND, "above.command")}
     outputs = {"status": MOVE_STATUS}
     spent = 0
+    stray_rad = 0.0
+    """How far the first joint has been moved by somebody else."""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         command, status = read.command.value, write.status
@@ -47,6 +49,7 @@ class PlayedMoves(Executor):
         status.current = status.done + 1 if self.spent else 0
         status.progress, status.resting = self.spent / MOVE_CYCLES, not moves
         status.operator = command.operator
+        status.start[0] = self.stray_rad
 
 
 class OrderBench(Lockstep):
@@ -173,15 +176,20 @@ def test_time_of_a_rack_whose_clock_is_not_compared_is_waited_for() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("changes", "plans"), [(False, 1), (True, 2)])
-def test_promised_plan_is_made_anew_only_if_the_world_has_changed(
-    changes: bool, plans: int
+@pytest.mark.parametrize(
+    ("changes", "stray_rad", "plans"),
+    [(False, 0.0, 1), (True, 0.0, 2), (False, 0.004, 1), (False, 0.006, 2)],
+)
+def test_promised_plan_is_made_anew_only_if_the_world_has_changed_or_the_arm_has_moved(
+    changes: bool, stray_rad: float, plans: int
 ) -> None:
     bench = OrderBench()
     bench.order(OrderVerb.ASK, TRANSFER)
     bench.until(Response.POSSIBLE)
     if changes:
         bench.see()
+    bench.tasks["elemental_move"].level.stray_rad = stray_rad
+    bench.run(0.1)
     bench.order(OrderVerb.DO, TRANSFER)
     assert bench.until(Response.DONE).moves_done == 8
     assert bench.read("task.plan").id == bench.boxes["task.plan"].at(bench.tick)[0] == plans

@@ -1,0 +1,107 @@
+"""The page of the cell is true: its commands run as they stand there, each rack to the end of the
+hand-over."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.config import CONFIGS
+from rack.tools.lab.benches.network import Lab
+from tests import golden
+from tests.machine import needs_fifo, needs_lab
+from tests.processes import BOUND_S, RACK
+from tests.snapshots import Snapshots
+
+pytestmark = [pytest.mark.slow, pytest.mark.thorough, pytest.mark.timeout(300), needs_lab]
+
+SNAPSHOTS = Snapshots(__file__)
+PAGE = (CONFIGS / "cell" / "README.md").read_text().replace("\\\n", "")
+BLOCKS = [
+    [shlex.split(line, comments=True)[1:] for line in block.splitlines()]
+    for block in re.findall(r"(?m)(?:^    rack .*\n)+", PAGE)
+]
+"""The words of the commands of each block, after `rack`."""
+OWN_MEMORY = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs none /dev/shm; exec "$@"', "sh")
+"""Runs a command as on a machine of its own: the racks of the page have their own names."""
+ONE_MACHINE = ("unshare", "--net", "--pid", "--fork", "--kill-child", "--mount-proc")
+LOSS = 0.01
+MOST_S = 240.0
+
+
+def test_the_page_of_the_boards_has_the_same_commands() -> None:
+    page = (CONFIGS.parent / "boards" / "README.md").read_text()
+    lines = re.findall(r"(?m)^rack (run cell.*)$", page)
+    assert [shlex.split(line, comments=True) for line in lines] == BLOCKS[0]
+
+
+def file_name(words: list[str]) -> str:
+    """Return the name of the files of a rack."""
+    return words[1].replace("/", "-")
+
+
+def outcomes(folder: Path, racks: Iterable[list[str]]) -> dict[str, dict[str, Any]]:
+    """Return the reports of racks that have ended, each with its task done."""
+    names = [file_name(words) for words in racks]
+    said = {name: (folder / f"{name}.err").read_text()[-1000:] for name in names}
+    texts = {name: (folder / f"{name}.json").read_text() for name in names}
+    assert all(texts.values()), said
+    found = {name: json.loads(text) for name, text in texts.items()}
+    causes = {name: report["outcome"]["cause"] for name, report in found.items()}
+    assert causes == dict.fromkeys(names, "task done"), said
+    return found
+
+
+def test_on_one_machine_in_lockstep_the_hand_over_is_the_same_everywhere(tmp_path: Path) -> None:
+    racks, _ = BLOCKS
+    script = ["ip link set lo up"]
+    for words in racks:
+        command = shlex.join([*RACK, *words, "--lockstep", "--no-record", "--json"])
+        script.append(f"{command} >{file_name(words)}.json 2>{file_name(words)}.err &")
+    command = "\n".join([*script, "wait"])
+    subprocess.run(
+        [*ONE_MACHINE, *OWN_MEMORY, "bash", "-c", command], cwd=tmp_path, timeout=MOST_S, check=True
+    )
+    found = outcomes(tmp_path, racks)
+    if golden.machine()["libm"] == golden.read()["machine"]["libm"]:
+        SNAPSHOTS.check("lockstep", {name: report["digest"] for name, report in found.items()})
+
+
+@pytest.mark.alone
+@needs_fifo
+def test_on_three_machines_over_tls_the_part_is_handed_over_though_packets_get_lost(
+    tmp_path: Path,
+) -> None:
+    _, (certificates, *racks) = BLOCKS
+    with Lab(3) as lab:
+
+        def here(words: list[str]) -> list[str]:
+            """Return a command with the addresses of the lab."""
+            found = [*RACK, *words]
+            for machine in range(len(lab)):
+                address = rf"10\.0\.0\.{machine + 1}\b"
+                found = [re.sub(address, lab.address(machine), word) for word in found]
+            return found
+
+        made = lab.popen(0, here(certificates), cwd=tmp_path, stdout=subprocess.DEVNULL)
+        assert made.wait(BOUND_S) == 0
+        for machine in range(len(lab)):
+            lab.lose(machine, LOSS)
+        processes = []
+        for machine, words in enumerate(racks):
+            command = [*OWN_MEMORY, *here(words), "--no-record", "--json"]
+            with (
+                (tmp_path / f"{file_name(words)}.json").open("w") as out,
+                (tmp_path / f"{file_name(words)}.err").open("w") as err,
+            ):
+                processes.append(lab.popen(machine, command, cwd=tmp_path, stdout=out, stderr=err))
+        for process in processes:
+            process.wait(MOST_S)
+    outcomes(tmp_path, racks)
