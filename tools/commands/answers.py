@@ -59,18 +59,27 @@ def describe(name: str) -> dict[str, str | int | float]:
 def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
     one."""
+    from rack.backplane.words import System
     from rack.tools.live.snapshot import RackMonitor
     from rack.tools.live.watched import watched
+    from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
 
     with watched(rack or only_rack(), asker) as one:
-        found = RackMonitor(one.segment).look()
+        segment = one.segment
+        found = RackMonitor(segment).look()
+        # A process of another machine has a number of this one.
+        run = None if segment.is_mirror else recorded_by(segment.words[System.FOLLOWER_PID])
+    size = 0 if run is None else size_of(run)
     if as_json:
-        print_json(asdict(found))
+        recording = None if run is None else {"folder": str(run), "bytes": size}
+        print_json({**asdict(found), "recording": recording})
         return
     from rack.tools.console.tables import console
     from rack.tools.live.display import RackView
 
     console().print(RackView(found))
+    if run is not None:
+        print(f"recorded into {run}: {size_text(size, found.time_s)}")
 
 
 def only_rack() -> str:

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from rack.backplane.words import System
 from rack.tools.commands.replay import merge
 from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.answer import Failure, print_answer
@@ -20,6 +21,9 @@ from rack.tools.live.folder import folder_of
 from rack.tools.live.watched import WatchedRack, watched
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
+from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.spool import save as save_run
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
@@ -39,6 +43,12 @@ With = Annotated[
         ),
     ),
 ]
+Save = Annotated[
+    bool,
+    typer.Option(
+        "--save", help="save what the recorder of its run has taken so far; the run is untouched"
+    ),
+]
 
 
 def record(
@@ -46,6 +56,7 @@ def record(
     others: With = [],  # noqa: B006  typer copies it
     out: Out = None,
     view: View = False,
+    save: Save = False,
     certificates: Certificates = "",
     name: AskAs = OPERATOR,
     as_json: Json = False,
@@ -60,10 +71,14 @@ def record(
     of all are over, DIR/run.rrd shows them on one time line, that of the first. A rack on another
     machine has to permit `watch`.
 
+    --save writes what the recorder of `rack run` has taken so far into a folder that opens as a run
+    does, and ends; run and recording go on.
+
     \b
     Examples:
       rack record nasrem
       rack record nasrem --view --out runs/look
+      rack record --save nasrem
       rack record cell-puma --with 192.168.1.5/cell-k1607 --with 192.168.1.6/cell
     """
     racks = [rack, *others]
@@ -71,16 +86,46 @@ def record(
         raise Failure(
             "--view, --with: give one of them: the racks have a common time line only in the end", 2
         )
+    if save and (others or view):
+        raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
     asker = Asker.of(name, certificates)
     with ExitStack() as stack:
         found = [stack.enter_context(watched(each, asker)) for each in racks]
         folder = folder_of(out, rack)
+        if save:
+            print_answer(*_saved(found[0], folder), as_json)
+            return
         notes = _record_together(found, folder) if others else _record(found[0], folder, view)
     for text in notes:
         print(text, file=sys.stderr)
     print_answer(
         {"rack": rack, "folder": str(folder), "notes": notes}, f"recorded into {folder}", as_json
     )
+
+
+def _saved(rack: WatchedRack, folder: Path) -> tuple[dict[str, Any], str]:
+    """Save what is recorded of a running rack; return the answer, as data and as a line."""
+    segment = rack.segment
+    name = segment.layout.rack
+    if segment.is_mirror:
+        raise Failure(f"--save {name}: the rack is on another machine; save it there", 2)
+    run = recorded_by(segment.words[System.FOLLOWER_PID])
+    if run is None:
+        raise Failure(f"--save {name}: nothing records it; 'rack record {name}' begins to")
+    with INTERRUPT.raising():
+        save_run(run, folder)
+        traces = [rows["tick"] for rows in Recording(folder).cycles.values()]
+        if not traces:
+            raise Failure(f"--save {name}: nothing is recorded yet")
+        merge([folder], folder / FILE)
+    first, last = min(ticks[0] for ticks in traces), max(ticks[-1] for ticks in traces)
+    tick_s = segment.layout.clock_ns * 1e-9
+    since_s, until_s = float(first * tick_s), float(last * tick_s)
+    size = size_of(folder)
+    much = size_text(size, until_s - since_s)
+    line = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {much}"
+    times = {"since_s": since_s, "until_s": until_s}
+    return {"rack": name, "folder": str(folder), **times, "bytes": size}, line
 
 
 def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None = None) -> Recorder:

@@ -18,6 +18,8 @@ from rack.tools.console.answer import Failure
 
 VIEW = "rack.tools.viewer.sink:ViewSink"
 """What shows a recording, by name: recording itself needs none of it."""
+SPOOL = "recorder.spool"
+"""Name of the file that a recorder has open in the folder of its run."""
 BEGUN = "recording"
 """Printed by the recorder when it has attached."""
 ATTACH_S = 30.0
@@ -202,3 +204,25 @@ class RecorderProcess:
         self._has_begun |= BEGUN in texts
         self._lines += [line for line in texts if line != BEGUN]
         return bool(block)
+
+
+def recorded_by(pid: int) -> Path | None:
+    """Return the folder into which a process records; None if it does not."""
+    with suppress(OSError):
+        for file in Path(f"/proc/{pid}/fd").iterdir():
+            # Descriptors come and go.
+            with suppress(OSError):
+                if (path := file.readlink()).name == SPOOL:
+                    return path.parent
+    return None
+
+
+def size_of(folder: Path) -> int:
+    """Return the bytes of a run's files."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+def size_text(size: int, lasted_s: float) -> str:
+    """Return the bytes of a recording, and of a second of it, as text."""
+    rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
+    return f"{size * 1e-6:.1f} MB{rate}"

@@ -18,7 +18,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from shutil import rmtree
+from shutil import copyfile, rmtree
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -31,10 +31,11 @@ from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import RECORD, trace_ring
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import SIGNALS, CyclesFile, SignalTables
+from rack.tools.recording.parquet import CONFIG, SIGNALS, CyclesFile, SignalTables
+from rack.tools.recording.recorder_process import SPOOL
 
 CYCLES = "cycles.parquet"
-SPOOL = "recorder.spool"
+EVENTS = "events.jsonl"
 MENDED = "-mended"
 MAGIC = b"RACKSPL2"
 FLUSH_S = 0.25
@@ -112,6 +113,16 @@ def mend(folder: Path) -> bool:
         (folder / f"{name}{MENDED}").replace(folder / name)
     path.unlink()
     return True
+
+
+def save(folder: Path, into: Path) -> None:
+    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
+    on."""
+    into.mkdir(parents=True, exist_ok=True)
+    for name in (CONFIG, EVENTS, SPOOL):
+        if (folder / name).is_file():
+            copyfile(folder / name, into / name)
+    mend(into)
 
 
 class Spool:

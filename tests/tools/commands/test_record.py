@@ -4,6 +4,7 @@ recording."""
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import time
@@ -16,6 +17,7 @@ import pytest
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.crate.line import CrateLine
+from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
@@ -65,6 +67,58 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
         read(tmp_path / "run" / "run.rrd", "/signals/lower.status/count").ticks.tolist()
         == ticks.tolist()
     )
+
+
+@pytest.mark.slow
+def test_what_a_run_has_recorded_is_saved_while_it_goes_on(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    run, saved = tmp_path / "run", tmp_path / "saved"
+    settings = ["--set", f"name={rack_name}", "--set", "clock.mode=realtime", "--out", str(run)]
+    with subprocess.Popen(
+        [*RACK, "run", str(small), "--seconds", "60", "--json", *settings],
+        stdout=subprocess.DEVNULL,
+    ) as process:
+        try:
+            wait_until(lambda: (run / "run.rrd").is_file(), WATCHDOG_S)
+            command = [*RACK, "record", "--save", rack_name, "--out", str(saved), "--json"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=WATCHDOG_S)
+            status = subprocess.run(
+                [*RACK, "status", rack_name], capture_output=True, text=True, timeout=WATCHDOG_S
+            )
+            assert process.poll() is None
+        finally:
+            # Not by a signal, which ends it in a hurry.
+            subprocess.run([*RACK, "stop", rack_name], capture_output=True, timeout=WATCHDOG_S)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(rf"recorded into {run}: [0-9.]+ MB, [0-9.]+ MB/s", status.stdout)
+    answer = json.loads(done.stdout)
+    files = [path for path in saved.rglob("*") if path.is_file()]
+    assert answer["bytes"] == sum(path.stat().st_size for path in files)
+    part, whole = Recording(saved), Recording(run)
+    assert not any(whole.lost.values())
+    ticks = part.signal("lower.status", "tick")
+    traced = np.concatenate([rows["tick"] for rows in part.cycles.values()]) * 0.0025
+    assert answer["since_s"] == pytest.approx(traced.min())
+    assert answer["until_s"] == pytest.approx(traced.max())
+    assert 0 < answer["until_s"] < 0.0025 * whole.ended["outcome"]["ticks"]
+    for name in ("lower", *part.mailboxes):
+        rows = part.rows(name)
+        assert np.array_equal(whole.rows(name)[: len(rows)], rows)
+    shown = read(saved / "run.rrd", "/signals/lower.status/count")
+    assert shown.ticks.tolist() == ticks.tolist()
+    report, _ = write_report(saved)
+    assert report["recording"] == "without the end of the run"
+
+
+def test_a_rack_that_nothing_records_has_nothing_to_save(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    with Rack(load(small, [f"name={rack_name}"])):
+        with pytest.raises(Failure, match=f"--save {rack_name}: nothing records it"):
+            record(rack_name, out=tmp_path / "saved", save=True)
+        with pytest.raises(Failure, match="--save, --view: give one of them"):
+            record(rack_name, view=True, save=True)
 
 
 @pytest.mark.slow

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from rack.tools.console.answer import print_json
+from rack.tools.recording.recorder_process import SPOOL
 
 FILES = ("report.json", "report.md")
 RECORDED = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
-SPOOL = "recorder.spool"
 PROGRAM = Path(__file__).resolve().parents[3]
 
 
