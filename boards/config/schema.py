@@ -463,11 +463,8 @@ class CommandConfig(Table):
         found = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        if self.home:
-            found.append(Goal.HOME)
-        if self.on is not None:
-            found.append(Goal.ON if self.on else Goal.OFF)
-        return found
+        found += [Goal.HOME] if self.home else []
+        return found if self.on is None else [*found, Goal.ON if self.on else Goal.OFF]
 
 
 class TaskPlace(NamedTuple):
