@@ -172,7 +172,7 @@ def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
     from rack.backplane.process import refusal
     from rack.boards.errors import shown
-    from rack.tools.console.answer import Failure, fail
+    from rack.tools.console.answer import Failure, exit_status, fail
 
     arguments = sys.argv[1:]
     try:
@@ -195,7 +195,7 @@ def run_commands() -> None:
         if hasattr(error, "show"):
             error.show(usage := StringIO())
             fail(usage.getvalue().rstrip(), 2)
-        status = _status(error)
+        status = exit_status(error)
         if status is None:
             raise
         fail(str(error), status)
@@ -360,17 +360,6 @@ def _check_arguments(arguments: list[str]) -> None:
             )
         if any("\ud800" <= c <= "\udfff" for c in argument):
             raise Failure(f"argument {at} = {shown(argument)}: not UTF-8", 2)
-
-
-def _status(error: Exception) -> int | None:
-    """Return the exit status of an error that the project raises on purpose; None for any other."""
-    from rack.backplane.errors import BackplaneError
-    from rack.boards.errors import BoardError, ConfigError
-    from rack.levels.errors import LevelError
-
-    if isinstance(error, ConfigError):
-        return 2
-    return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
 
 
 if __name__ == "__main__":

@@ -109,9 +109,10 @@ def inject(
             "RACK, BOARD and KIND are needed, as in: rack inject nasrem servo kill; or --list", 2
         )
     check_timeout(timeout, wait)
+    from rack.backplane.segment import Segment
     from rack.tools.faults.live import LiveRack
 
-    live = LiveRack(rack)
+    live = LiveRack(Segment.attach(rack))
     if is_list:
         print_answer(live.faults(), live.text(terminal_width()), as_json)
         return

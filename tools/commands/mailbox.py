@@ -20,8 +20,8 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console, table, terminal_width
 from rack.tools.live.signals import cell
-from rack.tools.recording.parquet import HEAD, columns_of
-from rack.tools.recording.signal import Signal
+from rack.tools.recording.parquet import HEAD
+from rack.tools.recording.signal import Signal, mailbox_of
 
 LOOK_S = 0.1
 PLAIN_S = 1.0
@@ -61,10 +61,7 @@ def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Js
         cells = [[str(row[column]) for column in COLUMNS] for row in rows]
         print_answer(rows, table(COLUMNS, cells, terminal_width(), DROPPED), as_json)
         return
-    names = [box.name for box in segment.layout.mailboxes]
-    if name not in names:
-        raise Failure(f"NAME = {name}: no such mailbox; mailboxes: {', '.join(names)}", 2)
-    messages = Messages(segment, name)
+    messages = Messages(segment, mailbox_of(name, segment.layout.mailboxes))
     if watch:
         _watch(segment, messages, as_json)
         return
@@ -114,12 +111,12 @@ def _row(segment: Segment, box: MailboxSpec) -> dict[str, Any]:
 class Messages:
     """The messages of one mailbox, as documents."""
 
-    def __init__(self, segment: Segment, name: str) -> None:
+    def __init__(self, segment: Segment, box: MailboxSpec) -> None:
         self._segment = segment
-        self._box = box = segment.layout.mailbox(name)
-        self._ring = MailboxRing(segment, name)
+        self._box = box
+        self._ring = MailboxRing(segment, box.name)
         self._has_looked = False
-        self._signals = [Signal(column.name, name, column, ()) for column in columns_of(box)]
+        self._signals = [*Signal.all([box]).values()]
 
     def new(self) -> Iterator[dict[str, Any]]:
         """Yield the messages written since the last look; at the first one the newest alone."""

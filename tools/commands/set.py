@@ -6,10 +6,8 @@ from typing import Annotated
 
 import typer
 
-from rack.boards.config import loads
-from rack.boards.config.commands import live_params
 from rack.tools.commands.command import At, Tick
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.desk import LiveDesk
@@ -38,18 +36,8 @@ def set_param(
       rack set nasrem board.servo.params.bandwidth=80
       rack set nasrem board.servo.params.damping=0.8 --at 12.5
     """
-    place, _, _ = setting.partition("=")[0].rpartition(".")
     with INTERRUPT.raising(), LocalRack(rack) as one:
-        live = live_params(loads(one.segment.config))
-        level = next((level for level in live if place == f"board.{level}.params"), None)
-        if level is None:
-            known = [f"board.{board}.params.{key}" for board, keys in live.items() for key in keys]
-            raise Failure(
-                f"{setting}: no level reads it while it runs; live: {', '.join(known) or 'none'}", 2
-            )
-        name = setting.removeprefix(f"{place}.")
-        given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
-        reply = LiveDesk(one).give(given, wait=False)
+        reply = LiveDesk(one).set_param(setting, tick, at)
     print_answer(reply.document(), reply.line, as_json)
     if not reply.worked:
         raise typer.Exit(1)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rack.backplane.segment import Segment
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.stepper import Stepper
@@ -67,7 +68,7 @@ def step(
         )
     if run and any(given is not None for given in (cycles, ticks, until)):
         raise Failure("--run lets the rack run on; leave out the steps", 2)
-    stepper = Stepper(rack)
+    stepper = Stepper(Segment.attach(rack))
     if run:
         stepper.let_go()
         print_answer({"rack": rack, "held": False}, f"rack '{rack}' runs on", as_json)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from rack.boards.errors import one_line
@@ -20,6 +21,29 @@ class Failure(Exception):
     def __init__(self, reason: str, status: int = 1) -> None:
         super().__init__(reason)
         self.status = status
+
+
+def exit_status(error: Exception) -> int | None:
+    """Return the exit status of an error that the project raises on purpose; None for any other."""
+    from rack.backplane.errors import BackplaneError
+    from rack.boards.errors import BoardError, ConfigError
+    from rack.levels.errors import LevelError
+
+    if isinstance(error, ConfigError):
+        return 2
+    return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
+
+
+@contextmanager
+def as_failure() -> Iterator[None]:
+    """Raise as `Failure` what a command would end with, with the same text and status."""
+    try:
+        yield
+    except Exception as error:
+        status = exit_status(error)
+        if status is None:
+            raise
+        raise Failure(str(error), status) from None
 
 
 def print_json(document: Any) -> None:

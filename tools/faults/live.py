@@ -34,11 +34,10 @@ SEEDS = 2**31
 
 
 class LiveRack:
-    """A rack by name, with its config and its fault table. Raises `SegmentError` when there is
-    none."""
+    """A running rack, with its config and its fault table."""
 
-    def __init__(self, rack: str) -> None:
-        self._segment = Segment.attach(rack)
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
         self._config = loads(self._segment.config)
         self._table = FaultTable(self._segment)
         self._joints = self._config.joints

@@ -19,7 +19,7 @@ from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestSt
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
-from rack.boards.config.commands import asked, request, takes
+from rack.boards.config.commands import asked, live_params, request, takes
 from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
@@ -160,6 +160,20 @@ class LiveDesk:
             text = describe(message_of(entry, segment.layout))
             reply = self._await_giving(entry, ticket, command.level, text)
         return self._await_reply(reply, wait, timeout_s)
+
+    def set_param(self, setting: str, tick: int | None = None, at: float | None = None) -> Reply:
+        """Set a live parameter, as in `board.servo.params.bandwidth=80`; raises as `give` does."""
+        place, _, _ = setting.partition("=")[0].rpartition(".")
+        live = live_params(self._config)
+        level = next((level for level in live if place == f"board.{level}.params"), None)
+        if level is None:
+            known = [f"board.{board}.params.{key}" for board, keys in live.items() for key in keys]
+            raise Failure(
+                f"{setting}: no level reads it while it runs; live: {', '.join(known) or 'none'}", 2
+            )
+        name = setting.removeprefix(f"{place}.")
+        given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
+        return self.give(given, wait=False)
 
     def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Reply:
         about = f"'{level}', {text}"

@@ -248,7 +248,7 @@ class RackScreen(App[None]):
                 if kind in OWN_PROCESS:
                     raise Failure(f"{kind}: needs a process of its own: rack inject")
                 values = dict(word.partition("=")[::2] for word in given)
-                live = LiveRack(self._rack.segment.rack)
+                live = LiveRack(self._rack.segment)
                 fault = {"board": board, "kind": kind, **values}
                 return str(live.inject(fault, wait=False)["message"])
             case [level, what, *goal]:

@@ -44,15 +44,14 @@ class Stepped:
 
 
 class Stepper:
-    """Steps one rack. Raises `SegmentError` when there is no such rack, `Failure` when it is not in
-    lockstep."""
+    """Steps one rack. Raises `Failure` when it is not in lockstep."""
 
-    def __init__(self, rack: str) -> None:
-        self._segment = Segment.attach(rack)
-        self._words = self._segment.words
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._words = segment.words
         if not self._words[System.LOCKSTEP]:
-            hint = f"end it, and start it with: rack run {rack} --lockstep --step"
-            raise Failure(f"rack '{rack}' runs in real time, which cannot be held; {hint}")
+            hint = f"end it, and start it with: rack run {segment.rack} --lockstep --step"
+            raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
 
     def let_go(self) -> None:
         """Let the rack run on."""

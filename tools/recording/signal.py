@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -40,23 +40,30 @@ class Signal:
     index: tuple[int, ...]  # of an array field, as far as it is given
 
     @classmethod
+    def all(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
+        """Return every whole field of these mailboxes by its name."""
+        return {
+            column.name: cls(column.name, box.name, column, ())
+            for box in boxes
+            for column in columns_of(box)
+        }
+
+    @classmethod
     def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
         """Return the signal of that name. Raises `Failure` with the nearest names, or the permitted
         indices."""
-        known = {column.name: (box.name, column) for box in boxes for column in columns_of(box)}
+        known = cls.all(boxes)
         found = NAME.fullmatch(text)
         if found is None or found[1] not in known:
-            near = get_close_matches(text.partition("[")[0], known, NEAREST)
-            what = "nearest" if near else "mailboxes"
-            names = near or [box.name for box in boxes]
-            raise Failure(f"{text}: no such signal; {what}: {', '.join(names)}", 2)
-        mailbox, column = known[found[1]]
+            raise _unknown("signal", text, known, boxes)
+        whole = known[found[1]]
+        column = whole.column
         index = tuple(int(number) for number in re.findall(r"\d+", found[2]))
         shape = column.shape[: len(index)]
         if len(shape) < len(index) or any(i >= n for i, n in zip(index, shape, strict=True)):
             ends = "".join(f"[0 to {size - 1}]" for size in column.shape)
             raise Failure(f"{text}: no such index; permitted: {column.name}{ends}", 2)
-        return cls(text, mailbox, column, index)
+        return replace(whole, name=text, index=index)
 
     @property
     def unit(self) -> str:
@@ -84,9 +91,20 @@ class Signal:
 
     def values(self, messages: np.ndarray) -> np.ndarray:
         """Return it in each of these messages, shape (messages, *what is left of its own)."""
+        return self.part(self.column.of(messages))
+
+    def part(self, values: np.ndarray) -> np.ndarray:
+        """Return it out of the values of its whole field, (messages, *shape of the field)."""
         place: Any = (slice(None), *self.index)
-        found: np.ndarray = self.column.of(messages)[place]
+        found: np.ndarray = values[place]
         return found
+
+    def named(self, values: np.ndarray) -> np.ndarray:
+        """Return its values with names in place of the numbers that stand for them."""
+        if not self.column.values:
+            return values
+        names = {number: name for name, number in self.column.values}
+        return np.asarray(np.vectorize(lambda number: names.get(number, number), "O")(values))
 
     def plain(self, messages: np.ndarray) -> list[Any]:
         """Return it in each of these messages as users read it: numbers, names of states, text,
@@ -95,12 +113,27 @@ class Signal:
         if values.dtype.kind == "S":
             values = np.strings.decode(values, "ascii", "replace")
         elif self.column.values:
-            names = {number: name for name, number in self.column.values}
-            values = np.vectorize(lambda number: names.get(number, number), "O")(values)
+            values = self.named(values)
         elif values.dtype.kind == "f" and not np.isfinite(values).all():
             values = np.where(np.isfinite(values), values, np.array(None))
         found: list[Any] = values.tolist()
         return found
+
+
+def mailbox_of(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
+    """Return the mailbox of that name. Raises `Failure` with the nearest names."""
+    known = {box.name: box for box in boxes}
+    if name not in known:
+        raise _unknown("mailbox", name, known, boxes)
+    return known[name]
+
+
+def _unknown(what: str, name: str, known: Collection[str], boxes: Sequence[MailboxSpec]) -> Failure:
+    """Return the failure of a name that is not known: with the nearest, or all mailboxes."""
+    near = get_close_matches(name.partition("[")[0], known, NEAREST)
+    offered = "nearest" if near else "mailboxes"
+    names = near or [box.name for box in boxes]
+    return Failure(f"{name}: no such {what}; {offered}: {', '.join(names)}", 2)
 
 
 @dataclass(frozen=True)

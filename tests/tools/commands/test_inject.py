@@ -209,7 +209,9 @@ def test_a_fault_that_a_running_rack_cannot_have_is_not_added(
 ) -> None:
     injected = Segment.attach(running).words[System.INJECTED]
     with pytest.raises(ConfigError) as error:
-        LiveRack(running).inject({"board": "wave", "kind": kind, **keys}, wait=False)
+        LiveRack(Segment.attach(running)).inject(
+            {"board": "wave", "kind": kind, **keys}, wait=False
+        )
     assert str(error.value).startswith(line)
     assert Segment.attach(running).words[System.INJECTED] == injected
 
@@ -268,6 +270,8 @@ def test_a_clock_that_gives_out_no_tick_begins_no_fault(
         with pytest.raises(
             Failure, match=r"kill of lower: the clock has not begun it within 0.05 s"
         ):
-            LiveRack(rack_name).inject({"board": "lower", "kind": "kill"}, wait=False)
+            LiveRack(Segment.attach(rack_name)).inject(
+                {"board": "lower", "kind": "kill"}, wait=False
+            )
         (entry,) = FaultTable(launched.segment).staged((Stage.WAITING,))
         assert entry[Entry.FROM] == -1

@@ -68,7 +68,7 @@ def test_mailboxes_are_listed_and_their_newest_messages_shown(held: str) -> None
 @pytest.mark.slow
 def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
     cases = {
-        ("mailbox", held, "counter.stat"): "NAME = counter.stat: no such mailbox; mailboxes: coun",
+        ("mailbox", held, "counter.stat"): "counter.stat: no such mailbox; nearest: coun",
         ("mailbox", held, "--watch"): "--watch needs the NAME of a mailbox",
         ("watch", held, "counter.status.rwo"): "counter.status.rwo: no such signal; nearest: count",
         ("watch", held, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
@@ -135,7 +135,7 @@ def test_a_mailbox_is_watched_message_by_message(held: str) -> None:
 def go_on(name: str, until: str, ticks: int = 8000) -> None:
     """Step a rack by 8 ticks until this text was printed, for so many ticks at most; end its
     run."""
-    stepper = Stepper(name)
+    stepper = Stepper(Segment.attach(name))
     tick = stepper.hold()
     for step in range(0, ticks, 8):
         # Before the command begins, stdout is pytest's.

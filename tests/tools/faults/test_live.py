@@ -28,7 +28,7 @@ class Running:
         segment.words[System.STATE] = Run.RUNNING
         segment.words[System.TICK] = TICK
         self.table = FaultTable(segment)
-        self.live = LiveRack(segment.rack)
+        self.live = LiveRack(segment)
 
     def begin(self, number: int, until: int = TICK + 9) -> None:
         """Begin a fault, as the clock does."""

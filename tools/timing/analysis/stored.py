@@ -44,15 +44,20 @@ def _changed_ns() -> Iterator[int]:
             )
 
 
-def show_report(run: str | Path, as_json: bool) -> None:
-    """Print the report of a run: the one in its folder if that is still right, otherwise a new
+def newest_report(folder: Path) -> tuple[dict[str, Any], str]:
+    """Return the report of a run: the one in its folder if that is still right, otherwise a new
     one."""
-    report = stored_report(Path(run))
+    report = stored_report(folder)
     if report is None:
         from rack.tools.timing.analysis.report import write_report
 
-        report = write_report(Path(run))
-    print_report(*report, as_json)
+        report = write_report(folder)
+    return report
+
+
+def show_report(run: str | Path, as_json: bool) -> None:
+    """Print the report of a run."""
+    print_report(*newest_report(Path(run)), as_json)
 
 
 def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
