@@ -47,7 +47,7 @@ dist: $(STAMP) ## build wheel and sdist of the version in pyproject.toml into di
 lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header \
-		--extra can --extra charts --extra dev --extra export --extra lab --extra lan --extra live pyproject.toml --output-file requirements.lock
+		--extra can --extra charts --extra dev --extra export --extra lab --extra lan --extra live --extra notebook pyproject.toml --output-file requirements.lock
 
 clean: ## remove the environment and what tools have left; runs/ stays
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
@@ -66,6 +66,6 @@ $(STAMP): requirements.lock pyproject.toml
 	@# `rack` as a package: type checkers and editors read no import hook, and a folder called rack in front of it, as a
 	@# clone is in the folder that holds it, is none. They follow the links; Python finds the files themselves.
 	@mkdir -p $(VENV)/src/rack && for floor in $(FLOORS); do ln -sfn ../../../$$floor $(VENV)/src/rack/$$floor; done
-	@echo '__path__ = [__file__.removesuffix("/$(VENV)/src/rack/__init__.py")]' > $(VENV)/src/rack/__init__.py
+	@ln -sfn ../../../tools/front/__init__.py $(VENV)/src/rack/__init__.py
 	@for packages in $(VENV)/lib/python3*/site-packages; do echo ../../../src > $$packages/rack.pth; done
 	@touch $(STAMP)

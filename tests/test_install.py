@@ -123,6 +123,8 @@ def test_the_wheel_runs_the_nasrem_rack_from_another_folder(
         "import rack.boards.config.files as f; print(f.__file__)",
     )
     assert place.startswith(str(installed.parent))
+    names = "import rack; print(rack.Rack, rack.attach, rack.open_run, rack.__file__)"
+    assert str(installed.parent) in run(tmp_path, installed / "python", "-c", names)
     name = f"installed-{os.getpid()}"
     words = ("run", "nasrem", "--set", f"name={name}", "--lockstep", "--seconds", "1", "--json")
     report = json.loads(run(tmp_path, installed / "rack", *words))

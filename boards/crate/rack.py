@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 import time
@@ -9,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import wait
 from pathlib import Path
+from threading import Thread
 from typing import Self
 
 from rack.backplane import semaphores
@@ -58,13 +60,16 @@ LEAVE_S = 2.0
 """Time for the boards to end by themselves."""
 STOP_S = 0.8
 """Time for the clock to end the run after a stop request, before the Rack does so."""
+LOOK_S = 0.5
+"""Time between two looks at boards that do not ask for one."""
 
 
 class Rack:
     """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack:
     rack.run(seconds=10)`.
 
-    `on_event` is called with every `Event`, in the caller's process. Without `share`, a launch is
+    `on_event` is called with every `Event`, in the caller's process; of a run in the background, in
+    its thread. Without `share`, a launch is
     refused if another rack's real-time boards occupy a core that this one requests. A `crate` that
     was started earlier saves time. With `entries`, by bus adapter and port, host boards are not
     started: what a recorded run wrote there enters instead.
@@ -92,6 +97,8 @@ class Rack:
         self._cause: Cause | None = None
         self._why_stopped = ""
         self._stop_by: float | None = None
+        self._supervisor: Thread | None = None
+        self._failed: BaseException | None = None
 
     @property
     def events(self) -> list[Event]:
@@ -107,8 +114,11 @@ class Rack:
         self.launch()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         self.close()
+        if kind is None:
+            # It raises what ended the supervision.
+            self.wait(0)
 
     def launch(self) -> None:
         """Power on every board except the clock, and wait until all have passed their self-tests.
@@ -213,9 +223,41 @@ class Rack:
     def run(self, seconds: float | None = None) -> Outcome:
         """Run for `seconds` of simulated time, or until the task ends; return the outcome."""
         self.start(seconds)
-        while self.watch(0.5):
+        while self.watch(LOOK_S):
             continue
         assert self.outcome is not None
+        return self.outcome
+
+    def run_in_background(self, seconds: float | None = None) -> None:
+        """Begin to run as `run` does, and return: a thread supervises the boards until the run is
+        over, or the rack closed.
+
+        Whatever holds the interpreter's lock for long delays restarts, not the boards.
+        """
+        self.start(seconds)
+        # A notebook's rack may never be closed; the interpreter does not wait for a daemon.
+        atexit.register(self.close)
+        self._supervisor = Thread(target=self._supervise, daemon=True)
+        self._supervisor.start()
+
+    def _supervise(self) -> None:
+        try:
+            while self.watch(LOOK_S):
+                continue
+        except BaseException as error:
+            # Nobody watches the boards any more. `wait` and the end of the context show it.
+            self._failed = error
+            self._end_boards()
+
+    def wait(self, timeout_s: float | None = None) -> Outcome | None:
+        """Wait until the run in the background is over; return its outcome, None if it goes on.
+
+        Raises what ended its supervision, such as an error of `on_event`.
+        """
+        if self._supervisor is not None:
+            self._supervisor.join(timeout_s)
+        if self._failed is not None:
+            raise self._failed
         return self.outcome
 
     def watch(self, timeout_s: float) -> bool:
@@ -245,7 +287,7 @@ class Rack:
                 break
         return self.outcome is None
 
-    def stop(self, why: str) -> None:
+    def stop(self, why: str = "stopped by its program") -> None:
         """End the run at the next tick. May be called at any time, even from a signal handler."""
         self._why_stopped = self._why_stopped or why
         self._cause = self._cause or "stopped"
@@ -386,8 +428,12 @@ class Rack:
 
     def close(self) -> None:
         """End everything: no process and no segment of this rack is left."""
+        atexit.unregister(self.close)
         if self._crate is None:
             return
+        if self._supervisor is not None and self.outcome is None:
+            self.stop()
+            self._supervisor.join(STOP_S + LEAVE_S)
         crate = self._crate
         self._crate = None
         try:

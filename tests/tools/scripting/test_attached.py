@@ -1,0 +1,217 @@
+"""A rack that runs in the background of a program, and what attaches to it reads and commands."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rack
+from rack.backplane.segment import racks
+from rack.backplane.words import Block, Demand, System
+from rack.boards import Rack
+from rack.boards.events import Event
+from rack.tools.scripting.attached import AttachedRack
+from tests.boards.commanded_racks import COMMANDED
+from tests.processes import named, wait_until
+
+BOUND_S = 20.0
+SCRIPT = """
+import sys
+from rack import Rack, attach
+
+with Rack.from_file({path!r}, ["name={name}"]) as own, attach({name!r}) as live:
+    own.run_in_background()
+    live.wait_until("lower.status.count > 100", timeout_s=20)
+    print("runs", flush=True)
+    {then}
+"""
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "commanded.toml"
+    path.write_text(COMMANDED)
+    return path
+
+
+@pytest.fixture(params=["lockstep", "realtime"])
+def own(request: pytest.FixtureRequest, path: Path, rack_name: str) -> Iterator[Rack]:
+    """A rack that runs in the background."""
+    with Rack.from_file(path, [f"name={rack_name}", f"clock.mode={request.param}"]) as own:
+        own.run_in_background()
+        yield own
+    assert rack_name not in racks()
+    wait_until(lambda: not named(f"{rack_name}:"))
+
+
+@pytest.fixture
+def live(own: Rack) -> Iterator[AttachedRack]:
+    with rack.attach(own.config.name) as live:
+        yield live
+
+
+@pytest.mark.slow
+def test_a_rack_runs_while_its_program_reads_and_commands(own: Rack, live: AttachedRack) -> None:
+    assert live.status().rack == own.config.name
+    tick = live.wait_until("lower.status.count > 20", BOUND_S)
+    assert tick >= 20
+    reading = live.read("lower.status")
+    assert live["lower.status.count"] >= reading.value.count > 20
+    assert live["lower.status.state"] == "executing"
+    assert live["lower.status.reason"] == ""
+    reply = live.command("upper", "hold", wait_s=BOUND_S)
+    assert (reply.fate, reply.done >= reply.taken_up) == ("done", True)
+    assert live.wait_for("command", BOUND_S).subject == "upper"
+    held = live["lower.status.count"]
+    assert live.command("upper", "resume").worked
+    live.wait_until(f"lower.status.count > {held}", BOUND_S)
+    assert own.wait(0.0) is None
+    own.stop()
+    outcome = own.wait(BOUND_S)
+    assert outcome is not None
+    assert outcome.cause == "stopped"
+
+
+@pytest.mark.slow
+def test_what_goes_wrong_is_the_line_of_the_command(own: Rack, live: AttachedRack) -> None:
+    with pytest.raises(rack.Failure, match=r"refused at tick .*: the way home is closed$"):
+        live.command("upper", "goto", home=True)
+    cases = {
+        "lower.statsu.count: no such signal; nearest: lower.status.count": (
+            lambda: live["lower.statsu.count"]
+        ),
+        "lower.statsu: no such mailbox; nearest: lower.status": (lambda: live.read("lower.statsu")),
+        "detection: not within 0 s$": lambda: live.wait_for("detection", 0.0),
+        "lower.status.count < 0: not within 0 s$": (
+            lambda: live.wait_until("lower.status.count < 0", 0.0)
+        ),
+        "board.upper.params.by=2: no level reads it while it runs": (
+            lambda: live.set("board.upper.params.by", 2)
+        ),
+        '^kind = "kil"': lambda: live.inject("lower", "kil"),
+        "^rack 'no-such-rack' does not exist": lambda: rack.attach("no-such-rack"),
+    }
+    for why, do in cases.items():
+        with pytest.raises(rack.Failure, match=why):
+            do()
+
+
+@pytest.mark.slow
+def test_a_parameter_is_set_and_a_pause_holds_the_rack(own: Rack, live: AttachedRack) -> None:
+    assert live.set("board.lower.params.by", 3).fate in ("taken", "done")
+    pause = live.pause()
+    lockstep = own.config.clock.mode == "lockstep"
+    assert pause.levels == ([] if lockstep else ["upper"])
+    count = live["lower.status.count"]
+    live.resume()
+    live.wait_until(f"lower.status.count > {count}", BOUND_S)
+    live.estop()
+    words = own.segment.words
+    wait_until(lambda: words[System.DEMAND] == Demand.BRAKE)
+    live.estop(reset=True)
+    wait_until(lambda: words[System.DEMAND] != Demand.BRAKE)
+
+
+@pytest.mark.slow
+def test_a_killed_board_is_restarted_while_the_program_computes(
+    own: Rack, live: AttachedRack
+) -> None:
+    first = own.segment.block("lower")[Block.PID]
+    live.inject("lower", "kill")
+
+    def is_back() -> bool:
+        np.linalg.svd(np.ones((60, 60)))
+        return any(event.code == "rejoined" for event in own.events)
+
+    wait_until(is_back)
+    if own.config.clock.mode == "lockstep":
+        # In real time many missed cycles may have overwritten it.
+        assert live.wait_for("rejoined", BOUND_S).board == "lower"
+    assert own.segment.block("lower")[Block.PID] != first
+    assert [event.board for event in own.events if event.code == "died"] == ["lower"]
+    assert live.status().run == "running"
+
+
+@pytest.mark.slow
+def test_an_error_of_a_program_ends_its_rack_and_is_shown(path: Path, rack_name: str) -> None:
+    with (  # noqa: PT012  the run is part of it
+        pytest.raises(ZeroDivisionError),
+        Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]) as own,
+    ):
+        own.run_in_background()
+        _ = 1 / 0
+    assert own.outcome is not None
+    assert own.outcome.cause == "stopped"
+    assert rack_name not in racks()
+
+
+@pytest.mark.slow
+def test_an_error_of_its_supervision_ends_a_rack_and_is_shown(path: Path, rack_name: str) -> None:
+    def fail(event: Event) -> None:
+        if event.kind == "command":
+            raise RuntimeError("no more")
+
+    config = Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]).config
+    with pytest.raises(RuntimeError, match="no more"), Rack(config, fail) as own:  # noqa: PT012
+        own.run_in_background()
+        own.command("upper", "hold")
+        wait_until(lambda: own.segment.run_is_over)
+    assert rack_name not in racks()
+
+
+@pytest.mark.slow
+def test_a_run_in_the_background_ends_by_itself(path: Path, rack_name: str) -> None:
+    with Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]) as own:
+        own.run_in_background(0.1)
+        outcome = own.wait(BOUND_S)
+    assert outcome is not None
+    assert (outcome.cause, outcome.ticks) == ("time over", 40)
+    with Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]) as again:
+        assert again.run(0.1).digest == outcome.digest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("then", "status"), [("sys.stdin.read()", 130), ("own.close = None", 0)])
+def test_a_program_that_is_interrupted_or_ends_leaves_nothing(
+    path: Path, rack_name: str, then: str, status: int
+) -> None:
+    script = SCRIPT.format(path=str(path), name=rack_name, then=then)
+    if status == 0:
+        # As in a notebook: nobody closes it.
+        script = script.replace(
+            f'with Rack.from_file({str(path)!r}, ["name={rack_name}"]) as own,',
+            f'own = Rack.from_file({str(path)!r}, ["name={rack_name}"])\nown.launch()\nwith',
+        ).replace("own.close = None", "pass")
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "runs\n"
+    if status:
+        os.kill(process.pid, signal.SIGINT)
+    process.communicate(timeout=BOUND_S)
+    assert process.returncode == (-signal.SIGINT if status else 0)
+    assert rack_name not in racks()
+    wait_until(lambda: not named(f"{rack_name}:"))
+
+
+def test_a_clock_that_nobody_started_is_waited_for_in_vain(path: Path, rack_name: str) -> None:
+    with (
+        Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]),
+        rack.attach(rack_name) as live,
+        pytest.raises(rack.Failure, match=r"^mailbox 'lower\.status' has no message yet$"),
+    ):
+        live["lower.status.count"]
+
+
+def test_to_import_rack_imports_no_library() -> None:
+    heavy = "{'numpy', 'pandas', 'pyarrow', 'pydantic', 'mujoco', 'typer'}"
+    code = f"import sys, rack; assert not {heavy} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=BOUND_S)

@@ -1,0 +1,89 @@
+"""A run read back by a program: signals, tables, events and report."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rack
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.tools.recording.recording import Recording
+from tests.boards.commanded_racks import COMMANDED
+from tests.shared_runs import nasrem_run, small_run
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_run(tmp_path_factory)
+
+
+def test_a_signal_is_an_array_with_its_ticks_and_unit(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    run = rack.open_run(nasrem_run(tmp_path_factory))
+    position = run.signals["servo.status.position"]
+    assert (position.unit, position.values.shape) == ("rad", (2600, 6))
+    assert position.ticks.tolist() == list(range(2600))
+    assert position.time_s[400] == 1.0
+    third = run.signals["servo.status.position[2]"]
+    np.testing.assert_array_equal(third.values, position.values[:, 2])
+    assert "servo.status.position" in run.signals
+    table = position.to_pandas()
+    assert [*table.columns] == ["tick", *(f"servo.status.position[{i}]" for i in range(6))]
+    assert table["servo.status.position[2]"].loc[1.0] == third.values[400]
+    levels = run.to_pandas("task.status")
+    assert set(levels["task.status.state"]) <= {"idle", "executing", "holding"}
+    assert len(levels) == len(run.signals["task.status.state"].ticks)
+
+
+def test_a_name_with_a_typo_gets_the_nearest(small: Path) -> None:
+    run = rack.open_run(small)
+    with pytest.raises(rack.Failure, match=r"no such signal; nearest: lower\.status\.count"):
+        run.signals["lower.status.cuont"]
+    with pytest.raises(rack.Failure, match=r"lower\.statsu: no such mailbox; nearest: low"):
+        run.to_pandas("lower.statsu")
+    with pytest.raises(rack.Failure, match="no such index"):
+        run.signals["lower.status.count[0]"]
+    with pytest.raises(rack.Failure, match=r"not a run: it has no config\.toml"):
+        rack.open_run(small.parent)
+
+
+def test_events_and_report_are_those_of_the_run(small: Path) -> None:
+    run = rack.open_run(small)
+    assert [event.kind for event in run.events if event.kind in ("start", "end")] == [
+        "start",
+        "end",
+    ]
+    assert run.report["simulated_s"] == 4.0
+    assert (small / "report.json").is_file()
+
+
+def test_without_pandas_one_line_says_what_to_install(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(rack.Failure, match=r"^tables need pandas: pip install 'nasrem-rack\["):
+        rack.open_run(small).to_pandas("lower.status")
+
+
+def test_a_rack_of_a_program_is_recorded(tmp_path: Path, rack_name: str) -> None:
+    path = tmp_path / "commanded.toml"
+    path.write_text(COMMANDED)
+    own = Rack(load(path, [f"name={rack_name}", "clock.mode=lockstep"]))
+    with own, rack.attach(rack_name) as live:
+        live.record(tmp_path / "run")
+        own.run_in_background(1.0)
+        outcome = own.wait(20)
+        with pytest.raises(rack.Failure, match="exists already and is not an empty folder"):
+            live.record(tmp_path / "run")
+    assert outcome is not None
+    run = rack.open_run(tmp_path / "run")
+    assert run.signals["lower.status.count"].ticks.tolist() == list(range(400))
+    assert Recording(tmp_path / "run").gaps() == []
+    assert run.events == []

@@ -1,0 +1,1 @@
+"""A rack from Python: attached while it runs, and read back."""

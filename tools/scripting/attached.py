@@ -1,0 +1,193 @@
+"""A running rack, for a Python program: read, commanded, disturbed, recorded.
+
+Each method does what the command of its name does, by the same library.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.mailbox import Reading
+from rack.backplane.mailbox.protocols import open_observer
+from rack.boards.config import loads
+from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.events import Event
+from rack.tools.console.answer import Failure, as_failure
+from rack.tools.faults.live import LiveRack
+from rack.tools.live import pausing
+from rack.tools.live.desk import LiveDesk, Reply
+from rack.tools.live.folder import folder_of
+from rack.tools.live.signals import SignalTap
+from rack.tools.live.snapshot import RackMonitor, Snapshot
+from rack.tools.live.watched import LocalRack
+from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.recording.signal import Signal, Trigger, mailbox_of
+
+
+def attach(rack: str) -> AttachedRack:
+    """Return the running rack of that name on this machine. Raises `Failure`."""
+    return AttachedRack(rack)
+
+
+class AttachedRack:
+    """A running rack. Use it as a context, or `close` it.
+
+    Whatever goes wrong is a `Failure` with the line that the command would print.
+    """
+
+    @as_failure()
+    def __init__(self, rack: str) -> None:
+        self._rack = LocalRack(rack)
+        segment = self._segment = self._rack.segment
+        self._closing = ExitStack()
+        self._closing.enter_context(self._rack)
+        self._boxes = segment.layout.mailboxes
+        self._desk = LiveDesk(self._rack)
+        self._monitor = RackMonitor(segment)
+        self._alarms = AlarmWatch(segment, loads(segment.config))
+        self._alarms.drain()
+        self._events: list[Event] = []  # since then, without those that were waited for
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the rack, which runs on; finish its recording."""
+        self._closing.close()
+
+    @as_failure()
+    def status(self) -> Snapshot:
+        """Return the rack as it is now."""
+        return self._monitor.look()
+
+    @as_failure()
+    def read(self, mailbox: str) -> Reading:
+        """Return the newest message of a mailbox, a copy; it costs no board anything."""
+        return open_observer(self._segment, mailbox_of(mailbox, self._boxes).name).peek()
+
+    @as_failure()
+    def __getitem__(self, name: str) -> Any:
+        """Return the newest value of a signal, as in `servo.status.position`: an array or a number;
+        a state by its name."""
+        signal = Signal.of(name, self._boxes)
+        reading = self.read(signal.mailbox)
+        if not reading.is_there:
+            raise Failure(f"mailbox '{signal.mailbox}' has no message yet")
+        value = signal.named(signal.values(reading.value.record[None]))[0]
+        return value.decode() if isinstance(value, bytes) else value
+
+    @as_failure()
+    def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:
+        """Command a level, as in `command("servo", "setpoint", joints=(...), wait_s=10)`; return
+        its reply once it has taken the command up, with `wait_s` once it is done, in that time."""
+        plain = {key: v.tolist() if isinstance(v, np.ndarray) else v for key, v in goal.items()}
+        given = {"level": level, "what": what, **plain}
+        return _accepted(self._desk.give(given, wait_s is not None, wait_s))
+
+    @as_failure()
+    def set(self, key: str, value: object) -> Reply:
+        """Set a live parameter, as in `set("board.servo.params.bandwidth", 80)`."""
+        return _accepted(self._desk.set_param(f"{key}={value}"))
+
+    @as_failure()
+    def inject(
+        self, board: str, kind: str, wait_s: float | None = None, **fields: Any
+    ) -> dict[str, Any]:
+        """Inject a fault, as in `inject("servo", "sensor-bias", joint=2, size=0.05, lasts=0.2)`.
+
+        Return it, as the command's JSON, when it has begun; with `wait_s` when it is over.
+        """
+        if "lasts" in fields:
+            fields["for"] = fields.pop("lasts")
+        fault = {"board": board, "kind": kind, **fields}
+        return LiveRack(self._segment).inject(fault, wait_s is not None, wait_s)
+
+    @as_failure()
+    def pause(self) -> pausing.Pause:
+        """Pause the rack: in lockstep between two ticks, in real time with the arm at rest."""
+        return pausing.pause(self._rack)
+
+    @as_failure()
+    def resume(self) -> None:
+        """Let the paused rack go on."""
+        pausing.resume(self._rack)
+
+    @as_failure()
+    def estop(self, reset: bool = False) -> None:
+        """Engage the brakes from the next tick on, or let the arm move again."""
+        lines = UtilityLines(self._segment)
+        lines.reset_emergency_stop() if reset else lines.latch_emergency_stop()
+
+    @as_failure()
+    def wait_until(self, condition: str, timeout_s: float) -> int:
+        """Wait until a condition holds, as in `servo.status.position[2] > 1.2`; return the tick of
+        the first message in which it does, the newest one or a later one."""
+        trigger = Trigger.of(condition, self._boxes)
+        tap = SignalTap(self._segment, [trigger.signal])
+        newest = slice(-1, None)
+        for _ in self._looks(timeout_s):
+            for written in tap.take():
+                held = written.ticks[newest][trigger.holds(written.messages[newest])]
+                if len(held):
+                    return int(held[0])
+            newest = slice(None)
+        raise self._in_vain(condition, timeout_s)
+
+    @as_failure()
+    def wait_for(self, event: str, timeout_s: float) -> Event:
+        """Wait for an event since the rack was attached, by kind or code, as in `detection` or
+        `rejoined`; each is returned once. Those of a rack that misses many cycles are overwritten
+        if nothing waits for seconds; `Rack.events` has all."""
+        for _ in self._looks(timeout_s):
+            self._events += [rung.event for rung in self._alarms.drain()]
+            for found in self._events:
+                if event in (found.kind, found.code):
+                    self._events.remove(found)
+                    return found
+        lost = f" ({self._alarms.lost} events were overwritten)" if self._alarms.lost else ""
+        raise self._in_vain(f"{event}{lost}", timeout_s)
+
+    def _looks(self, timeout_s: float) -> Iterator[None]:
+        """Yield for each look at the rack, until time or run are over."""
+        deadline = time.monotonic() + timeout_s
+        is_last = False
+        while not is_last:
+            # Asked before the look: what is written until the end counts.
+            is_last = self._segment.run_is_over or time.monotonic() > deadline
+            yield
+            self._rack.refresh()
+
+    def _in_vain(self, awaited: str, timeout_s: float) -> Failure:
+        why = "the run is over" if self._segment.run_is_over else f"not within {timeout_s:g} s"
+        return Failure(f"rack '{self._segment.rack}', {awaited}: {why}")
+
+    @as_failure()
+    def record(self, folder: str | Path | None = None) -> Path:
+        """Record the rack, from the two seconds that its rings still hold until this is closed;
+        return the folder, by default runs/<rack>-<time>."""
+        path = folder_of(None if folder is None else Path(folder), self._segment.rack)
+        path.mkdir(parents=True, exist_ok=True)
+        (path / CONFIG).write_text(self._segment.config)
+        recorder = RecorderProcess()
+        self._closing.callback(recorder.finish)
+        if not recorder.attach(self._segment.rack, path, words=self._segment.words):
+            raise Failure(f"{path}: the recorder has not begun")
+        return path
+
+
+def _accepted(reply: Reply) -> Reply:
+    """Return a reply. Raises `Failure` for a refusal."""
+    if not reply.worked:
+        raise Failure(reply.line)
+    return reply
