@@ -43,7 +43,7 @@ def test_example_runs_as_its_readme_says(
 ) -> None:
     monkeypatch.setenv("CAN_CHANNEL", own_can_channel())
     folder = Path(shutil.copytree(EXAMPLES / name, tmp_path / name))
-    for path in (*folder.glob("*.toml"), *folder.glob("*.py")):
+    for path in (path for end in ("toml", "py", "ipynb") for path in folder.glob(f"*.{end}")):
         path.write_text(RACK_NAME.sub(rf"\1\2-{os.getpid()}", path.read_text(), count=1))
     found = commands(folder)
     assert found
