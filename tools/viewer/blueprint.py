@@ -6,36 +6,52 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
+from rack.levels.systems.hand.messages import GRASP_STATUS
 from rack.levels.systems.joint_boards.messages import DRIVING
+from rack.levels.systems.trajectory.messages import MOTION_STATUS
 from rack.tools.viewer import timing
-from rack.tools.viewer.cell import CELL, COLLISION, FRAMES
-from rack.tools.viewer.curves import ERROR, GRIPPER, JOINTS, QUANTITIES, SIGNALS
+from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, extent_of, floor_of
+from rack.tools.viewer.curves import (
+    ERROR,
+    GRIP,
+    GRIPPER,
+    JOINTS,
+    OPENING,
+    QUANTITIES,
+    SIGNALS,
+    gripper_units,
+)
 from rack.tools.viewer.events import EVENTS, RECORDER
 from rack.tools.viewer.forces import AXES, CONTACT, FORCES, TASK
-from rack.tools.viewer.hand import BY_FINGER, HAND, TIPS
+from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
-from rack.tools.viewer.style import lanes_view
-from rack.tools.viewer.timing import BOARDS
+from rack.tools.viewer.style import GRID, LEGEND, lanes_view, legend_view
+from rack.tools.viewer.timing import BOARDS, boards_of
 
 CONFIG = "config"
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
+CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
 """Time before and after the cursor in the Gantt lanes: some cycles of fast and of slower boards."""
 DIRECTION = np.array([0.75, -0.95, 0.55])
 """From the cell to the eye: from the front right, slightly above."""
-DISTANCE = 1.75
-"""In radii of the cell, so that it fills the view, including a raised arm."""
-ENDLESS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+DISTANCE = 2.05
+"""In radii of arm and objects, so that they fill the view, including a raised arm."""
+TITLES = {TENSIONS: "tensions: flexors bright, extensors dim"}
+"""Titles of the curves of fingers that say more than what they are of."""
+ABOVE_M = 0.01
+"""From the floor to the grid on it: at the same height the floor would hide it."""
+GRID_M = 0.25
+"""Between lines of the grid."""
 
 
 def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
@@ -92,7 +108,7 @@ class RackViews:
     def everything(self, name: str | None = None) -> rrb.Container:
         """Return all views."""
         doing = lanes_view("levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)])
-        below = rrb.Horizontal(doing, self._graph(), column_shares=[3, 2])
+        below = rrb.Tabs(doing, self._graph(), active_tab=0)
         left: rrb.Container = below
         if self._cell is not None:
             left = rrb.Vertical(self._scene(self._cell, "cell"), below, row_shares=[11, 9])
@@ -105,8 +121,14 @@ class RackViews:
             curves = self._signals()
         right = rrb.Vertical(
             curves,
-            lanes_view("boards, cycle by cycle", [self.all(BOARDS)], CYCLES_S),
-            rrb.Horizontal(self._load(), self._ages(), self._log(), column_shares=[3, 3, 4]),
+            lanes_view(CYCLES, [self.all(BOARDS)], CYCLES_S),
+            rrb.Horizontal(
+                self._load(),
+                self._ages(),
+                self._legend(timing.LOAD, "tasks", boards_of(self._layout)),
+                self._log(),
+                column_shares=[4, 4, 2, 6],
+            ),
             row_shares=[4, 5, 3],
         )
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
@@ -125,7 +147,7 @@ class RackViews:
             contents=[self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)],
             name=name,
             eye_controls=eye_on(cell),
-            line_grid=False,
+            line_grid=grid_on(cell),
         )
 
     def _arm(self) -> rrb.Container:
@@ -134,20 +156,49 @@ class RackViews:
         views = [
             rrb.Tabs(
                 _curves(
-                    quantity,
+                    f"{quantity}, {unit}",
                     [self.path(JOINTS, name, quantity) for name in self._joints],
-                    legend=quantity == "torque",
                 ),
                 rrb.Grid(
                     *(self._joint(name, quantity) for name in self._joints),
                     name="by joint, with limits",
                 ),
             )
-            for quantity in QUANTITIES
+            for quantity, unit in QUANTITIES.items()
         ]
         error = _curves("tracking error, mrad", [self.path(ERROR)])
-        gripper = _curves("gripper", [self.all(GRIPPER)])
-        return rrb.Grid(*views, rrb.Tabs(*self._forces(), error, gripper), grid_columns=2)
+        own = rrb.Tabs(*self._requests(), *self._forces(), error, *self._gripper(), active_tab=0)
+        legend = self._legend(JOINTS, "joints", self._joints)
+        return rrb.Horizontal(rrb.Grid(*views, own, grid_columns=2), legend, column_shares=[9, 1])
+
+    def _requests(self) -> list[rrb.Container]:
+        """Return the queue of a level that follows motion requests, and its error at a goal that
+        moves."""
+        return [
+            rrb.Horizontal(
+                _curves("taken and done", self._fields(box, "taken", "done")),
+                _curves("from moving goal, m", self._fields(box, "astray")),
+                name="queue and moving goal",
+            )
+            for box in self._layout.mailboxes
+            if box.message == MOTION_STATUS.name
+        ]
+
+    def _gripper(self) -> list[rrb.View]:
+        """Return the views of the gripper's opening and force."""
+        if self._cell is None or self._cell.gripper is None:
+            return []
+        units = zip((OPENING, GRIP), gripper_units(self._cell), strict=True)
+        return [
+            _curves(f"gripper's {name}, {unit}", [self.path(GRIPPER, name)]) for name, unit in units
+        ]
+
+    def _fields(self, mailbox: MailboxSpec, *names: str) -> list[str]:
+        """Return the paths of fields of a mailbox."""
+        return [self.path(SIGNALS, mailbox.name, name) for name in names]
+
+    def _legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
+        return legend_view(self.path(LEGEND, what), name, names)
 
     def _forces(self) -> list[rrb.View]:
         """Return the views of forces, of an arm or hand that senses them."""
@@ -160,7 +211,12 @@ class RackViews:
             )
             for what, unit in (("force", "N"), ("torque", "N m"))
         ]
-        return [*views, _curves("contact, with limits", [self.all(FORCES, CONTACT)])]
+        along = _curves("force along z, wanted and exerted, N", [self.path(FORCES, TASK, "z")])
+        contact = [
+            _curves(f"contact: {what}, with its limit, {unit}", [self.path(FORCES, CONTACT, what)])
+            for what, unit in (("force", "N"), ("torque", "N m"))
+        ]
+        return [along, *views, *contact]
 
     def _fingers(self, hand: Hand) -> rrb.Container:
         """Return a view of every finger for tensions, joints and forces, each kind in a tab, and
@@ -168,31 +224,41 @@ class RackViews:
         tabs = [
             rrb.Grid(
                 *(
-                    _curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)], legend=False)
+                    _curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)])
                     for finger in hand.names
                 ),
                 grid_columns=2,
-                name=kind,
+                name=TITLES.get(kind, kind),
             )
             for kind, unit in BY_FINGER.items()
         ]
+        tips = _curves("force on the tips, N", [self.path(*TIPS)])
+        pulls = [
+            _curves("weight and pull, N", self._fields(box, "load"))
+            for box in self._layout.mailboxes
+            if box.message == GRASP_STATUS.name
+        ]
         return rrb.Horizontal(
-            rrb.Tabs(*tabs, active_tab=0), _curves("force on the tips, N", [self.path(*TIPS)])
+            rrb.Tabs(*tabs, active_tab=0),
+            rrb.Vertical(tips, *pulls),
+            self._legend(HAND, "fingers", hand.names),
+            column_shares=[5, 4, 1],
         )
 
     def _joint(self, name: str, quantity: str) -> rrb.View:
         shown = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
-        return _curves(name, shown, legend=False)
+        return _curves(f"{name}, {QUANTITIES[quantity]}", shown)
 
     def _signals(self) -> rrb.View:
-        return _curves("signals", [self.all(SIGNALS)])
+        """Return the view of all fields; their units are with their names."""
+        return _curves("signals", [self.all(SIGNALS)], True)
 
     def _load(self) -> rrb.Container | rrb.View:
         times = self.all(timing.TIMES)
         if self._config.clock.mode == "lockstep":
-            return _curves("execution, ms; no deadlines in lockstep", [times])
+            return _curves("execution, ms", [times])
         use = _curves("use of the time slice, %", [self.all(timing.LOAD)])
-        return rrb.Tabs(use, _curves("lateness and execution, ms", [times]))
+        return rrb.Tabs(use, _curves("late and execution, ms", [times]))
 
     def _ages(self) -> rrb.Container:
         """Return the ages; plans, which may be old, have their own scale."""
@@ -200,15 +266,17 @@ class RackViews:
         plans = [self.path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
         sampled = [self.all(timing.AGES), *(f"- {plan}" for plan in plans)]
         return rrb.Tabs(
-            _curves("age of messages read, ms", sampled, legend=False),
-            _curves("plans", plans),
+            _curves("age of messages, ms", sampled),
+            _curves("age of plans, ms", plans),
             self._signals(),
         )
 
     def _log(self) -> rrb.Container:
         log = rrb.TextLogView(origin=self.path(LOG), name="log", columns=LOG_COLUMNS)
         config = rrb.TextDocumentView(origin=self.path(CONFIG), name="config")
-        return rrb.Tabs(log, config, _curves("recorder", [self.all(RECORDER)]))
+        load = _curves("recorder, % of a core", [self.path(RECORDER, "load")])
+        lost = _curves("rows lost", [self.path(RECORDER, "rows_lost")])
+        return rrb.Tabs(log, config, load, lost)
 
     def _graph(self) -> rrb.View:
         places = positions(self._layout, rack_timing(self._config, self._layout)).values()
@@ -220,7 +288,7 @@ class RackViews:
         return rrb.GraphView(origin=self.path(HIERARCHY), name="hierarchy", visual_bounds=bounds)
 
 
-def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
+def _curves(name: str, contents: list[str], legend: bool = False) -> rrb.View:
     axis = rrb.TimeAxis(link="LinkToGlobal")
     shown = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(
@@ -228,19 +296,16 @@ def _curves(name: str, contents: list[str], legend: bool = True) -> rrb.View:
     )
 
 
+def grid_on(cell: Cell) -> rrb.LineGrid3D:
+    """Return a grid on the floor of a cell; without a floor, at the height of the world's
+    origin."""
+    plane = rr.components.Plane3D((0.0, 0.0, 1.0), floor_of(cell) + ABOVE_M)
+    return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
+
+
 def eye_on(cell: Cell) -> rrb.EyeControls3D:
-    """Return the place from which the eye sees all of a cell at its start, except the ground."""
-    model = cell.model
-    data = cell.start()
-    geoms = np.flatnonzero(~np.isin(model.geom_type, ENDLESS))
-    radii = model.geom_rbound[geoms, None]
-    low = (data.geom_xpos[geoms] - radii).min(axis=0, initial=np.inf)
-    high = (data.geom_xpos[geoms] + radii).max(axis=0, initial=-np.inf)
-    if not np.isfinite([low, high]).all():
-        low = model.stat.center - model.stat.extent
-        high = model.stat.center + model.stat.extent
-    centre = (low + high) / 2
-    radius = float(np.linalg.norm(high - low)) / 2
+    """Return the place from which the eye sees the arm and its objects, at their start, large."""
+    centre, radius = extent_of(cell)
     position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
     return rrb.EyeControls3D(
         position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)

@@ -10,14 +10,15 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from rack.boards.events import Event
 from rack.levels.algebra import Array
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import STATE, Cell
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw
-from rack.tools.viewer.stream import Changes, RowBlock, Sampled, Stream
-from rack.tools.viewer.style import CURRENT, FORCE, GOAL, PLANNED
+from rack.tools.viewer.stream import Changes, Moment, RowBlock, Sampled, Stream
+from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, packed
 
 CELL = "cell"
 COLLISION = "collision"
@@ -36,6 +37,16 @@ STEP_RAD = 0.03
 length."""
 POINT_M = 0.008
 LINE_M = 0.003
+BRAKES = (CELL, "brakes")
+FAULTS = (CELL, "faults")
+MARK_PART = 0.09
+"""Radius of a mark, as a part of that of arm and objects: larger than a link is thick."""
+AXES = (CELL, "axes")
+AXES_PART = 0.25
+AXES_RADIUS_PART = 0.0125
+AXES_BESIDE = np.array([-0.6, -0.45, 0.0])
+"""Length, radius and place of the axes, in radii of arm and objects: left of the arm."""
+AXES_COLOURS = (0xE64646FF, 0x46B45AFF, 0x468CE6FF)
 PUSHES = (CELL, "pushes")
 PUSH_M = 0.02
 PUSH_RADIUS_M = 0.0015
@@ -56,9 +67,23 @@ def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
     return np.flatnonzero(moves)
 
 
-def write_geometry(stream: Stream, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Log all geoms, and the frames that never move with their poses in `data`."""
+def write_geometry(stream: Stream, cell: Cell) -> None:
+    """Log all geoms, the frames that never move with their poses at the start, and directions
+    of the world's axes."""
+    model = cell.model
+    data = cell.start()
     stream.static((CELL,), stream.within(WORLD))
+    centre, radius = extent_of(cell)
+    begin = centre + radius * AXES_BESIDE
+    begin[2] = floor_of(cell)
+    axes = rr.Arrows3D(
+        origins=[begin] * 3,
+        vectors=AXES_PART * radius * np.eye(3),
+        radii=AXES_RADIUS_PART * radius,
+        colors=packed(AXES_COLOURS),
+        labels=["x", "y", "z"],
+    )
+    stream.static(AXES, axes, stream.within(WORLD))
     is_shown = model.geom_group < SHOWN_GROUPS
     if not is_shown.any():
         is_shown[:] = True
@@ -163,6 +188,75 @@ class Pushes:
                 colors=[FORCE],
             )
             self._stream.at(block.when(row), PUSHES, arrows)
+
+
+class Marks:
+    """Marks in red what stops the arm: joints whose brakes are engaged, and faults while they
+    act."""
+
+    def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
+        self._stream = stream
+        self._braked = Changes()
+        self._faults: dict[int, tuple[str, str]] = {}  # joint and text, by entry of the fault table
+        self._joints = {name: cell.model.joint(name).pos for name in joints}
+        self._radius = MARK_PART * extent_of(cell)[1]
+        for name in joints:
+            body = int(cell.model.joint(name).bodyid[0])
+            for group in (BRAKES, FAULTS):
+                stream.static((*group, name), stream.within(frame_of(cell.model, body)))
+
+    def write(self, block: RowBlock) -> None:
+        """Mark every joint from when the brakes are engaged until they are released."""
+        braked = block.messages["braked"]
+        for row in self._braked.rows(braked):
+            texts = dict.fromkeys(self._joints, "") if braked[row] else {}
+            if texts:
+                texts[list(texts)[-1]] = "brakes engaged"
+            self._mark(block.when(row), BRAKES, texts)
+
+    def fault(self, when: Moment, event: Event) -> None:
+        """Mark the joint of a fault that begins, or the first joint for one of no joint, until it
+        ends."""
+        joint = event.subject if event.subject in self._joints else next(iter(self._joints))
+        if event.code == "begins":
+            text = event.text.partition(" begins")[0]
+            self._faults[event.fault] = joint, f"fault of {event.board}: {text}"
+        else:
+            self._faults.pop(event.fault, None)
+        self._mark(when, FAULTS, dict(self._faults.values()))
+
+    def _mark(self, when: Moment, group: tuple[str, str], texts: dict[str, str]) -> None:
+        """Write a ball at each joint with a text, the text at those that say something."""
+        for name, place in self._joints.items():
+            text = texts.get(name)
+            balls = rr.Points3D(
+                [] if text is None else [place],
+                radii=self._radius,
+                colors=[LOST],
+                labels=[text] if text else None,
+            )
+            self._stream.at(when, (*group, name), balls)
+
+
+def extent_of(cell: Cell) -> tuple[Array, float]:
+    """Return the middle of arm and objects at the start, (3,), m, and the radius around it, m."""
+    data = cell.start()
+    model = cell.model
+    geoms = np.union1d(
+        cell.arm_geoms, np.flatnonzero(np.isin(model.geom_bodyid, cell.bodies))
+    ).astype(int)
+    if not len(geoms):
+        return model.stat.center, float(model.stat.extent)
+    radii = model.geom_rbound[geoms, None]
+    low = (data.geom_xpos[geoms] - radii).min(axis=0)
+    high = (data.geom_xpos[geoms] + radii).max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+
+
+def floor_of(cell: Cell) -> float:
+    """Return the height of the floor, m; without one that of the world's origin."""
+    floors = np.flatnonzero(cell.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    return float(cell.start().geom_xpos[floors, 2].min(initial=0.0))
 
 
 class PlannedPath:

@@ -10,7 +10,7 @@ import numpy as np
 from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.levels.robot.cell import Cell
 from rack.tools.viewer.stream import RowBlock, Stream
-from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
+from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves, write_legend
 
 SIGNALS = "signals"
 MAX_CURVES = 16
@@ -18,6 +18,8 @@ MAX_CURVES = 16
 JOINTS = "joints"
 ERROR = "tracking_error"
 GRIPPER = "gripper"
+OPENING = "opening"
+GRIP = "force"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
 """Curves of a joint and their units; the torque is the one applied, after the limit gate."""
 FIELDS = {
@@ -44,6 +46,8 @@ class Joints:
             "velocity": np.column_stack((-bounds.velocity, bounds.velocity)),
             "torque": np.column_stack((-bounds.torque, bounds.torque)),
         }
+        colours = [of_joint(at) for at in range(len(names))]
+        write_legend(stream, JOINTS, names, colours)
         for at, name in enumerate(names):
             for quantity, unit in QUANTITIES.items():
                 entity = (JOINTS, name, quantity)
@@ -56,13 +60,10 @@ class Joints:
                     # The lower one is wider: it shows on both sides where the two agree.
                     style_curves(stream, entity, both, [COMMANDED, of_joint(at)], [2.5, 1.0])
         labels = [f"{name}, mrad" for name in names]
-        style_curves(stream, (ERROR,), labels, [of_joint(at) for at in range(len(names))])
+        style_curves(stream, (ERROR,), labels, colours)
         if cell.gripper is not None and has_gripper:
-            joint = cell.model.dof_jntid[cell.gripper.dof]
-            turns = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-            way, force = ("mrad", "N m") if turns else ("mm", "N")
-            style_curves(stream, (GRIPPER, "opening"), [f"opening, {way}"])
-            style_curves(stream, (GRIPPER, "force"), [f"force, {force}"])
+            for name, unit in zip((OPENING, GRIP), gripper_units(cell), strict=True):
+                style_curves(stream, (GRIPPER, name), [f"{name}, {unit}"])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of that level."""
@@ -79,8 +80,16 @@ class Joints:
                 self._stream.scalars((*entity, "limits"), ends, np.tile(limits[at], (2, 1)))
         self._stream.scalars((ERROR,), times, (messages["position"] - messages["target"]) * 1e3)
         if self._has_gripper:
-            self._stream.scalars((GRIPPER, "opening"), times, messages["opening"] * 1e3)
-            self._stream.scalars((GRIPPER, "force"), times, messages["grip_force"])
+            self._stream.scalars((GRIPPER, OPENING), times, messages["opening"] * 1e3)
+            self._stream.scalars((GRIPPER, GRIP), times, messages["grip_force"])
+
+
+def gripper_units(cell: Cell) -> tuple[str, str]:
+    """Return the units of the gripper's opening and of its force."""
+    assert cell.gripper is not None, "there is a gripper"
+    joint = cell.model.dof_jntid[cell.gripper.dof]
+    turns = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    return ("mrad", "N m") if turns else ("mm", "N")
 
 
 class Fields:

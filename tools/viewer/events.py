@@ -13,6 +13,7 @@ from pathlib import Path
 import rerun as rr
 
 from rack.boards.events import Event
+from rack.tools.viewer.cell import Marks
 from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Moment, Stream
 from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
@@ -38,10 +39,14 @@ LEVELS = {
 class Events:
     """Follows events.jsonl, which the launcher writes line by line."""
 
-    def __init__(self, stream: Stream, path: Path, hierarchy: Hierarchy) -> None:
+    def __init__(
+        self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: Marks | None = None
+    ) -> None:
+        """Show faults in the hierarchy and, where there is an arm, in 3D by `marks`."""
         self._stream = stream
         self._path = path
         self._hierarchy = hierarchy
+        self._marks = marks
         self._read = 0
         self._lanes: dict[str, str] = {}  # what each board's lane shows
 
@@ -68,6 +73,8 @@ class Events:
         self._stream.say(when, "events", text, LEVELS.get(event.kind, "INFO"))
         if event.kind not in UNSHOWN:
             self._show(when, board, event)
+        if event.kind == "fault" and self._marks is not None:
+            self._marks.fault(when, event)
         if event.kind == "died":
             self._hierarchy.lose(when, board)
         elif event.code == "hang":

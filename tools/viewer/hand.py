@@ -7,7 +7,7 @@ import numpy as np
 from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.tools.viewer.stream import RowBlock, Stream
-from rack.tools.viewer.style import COMMANDED, dimmed, of_joint, style_curves
+from rack.tools.viewer.style import COMMANDED, dimmed, of_joint, style_curves, write_legend
 
 HAND = "hand"
 JOINTS = "joints"
@@ -43,7 +43,9 @@ class HandCurves:
             axes = [f"{axis}, N" for axis in "xyz"]
             style_curves(stream, (HAND, finger, FORCES), axes, [of_joint(at) for at in range(3)])
         labels = [f"{finger}, N" for finger in self._fingers]
-        style_curves(stream, TIPS, labels, [of_joint(at) for at in range(len(labels))])
+        colours = [of_joint(at) for at in range(len(labels))]
+        style_curves(stream, TIPS, labels, colours)
+        write_legend(stream, HAND, hand.names, colours)
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle of the hand."""

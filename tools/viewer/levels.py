@@ -14,6 +14,7 @@ import rerun as rr
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State
 from rack.levels.messages import Verb
+from rack.levels.systems.hand.messages import GraspKind
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Changes, Moment, RowBlock, Stream
@@ -57,9 +58,14 @@ class ValueLane:
             write_spans(self._stream, self._lane, block.times_of(rows), names)
 
 
-def numbered(what: str, serial: int) -> str:
-    """Return a command, or a motion request, in words; empty without one."""
-    return f"{what} {serial}" if serial else ""
+def numbered(serial: int) -> str:
+    """Return the number of a command, or of a motion request; empty without one."""
+    return str(serial) if serial else ""
+
+
+def step_name(step: tuple[int, int]) -> str:
+    """Return a step of a grasp, which is the count of those before it and its kind."""
+    return f"{step[0] + 1} {worded(GraspKind, step[1])}"
 
 
 def move_name(move: tuple[int, int]) -> str:

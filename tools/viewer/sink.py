@@ -27,11 +27,11 @@ from rack.levels.messages import (
 )
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH, Mode
-from rack.levels.systems.hand.messages import HAND_STATUS, STREAMED_DOWN
+from rack.levels.systems.hand.messages import GRASP_STATUS, HAND_STATUS, STREAMED_DOWN
 from rack.levels.systems.joint_boards.messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.systems.trajectory.messages import MOTION_STATUS
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
-from rack.tools.viewer.cell import Goals, PlannedPath, Poses, Pushes, write_geometry
+from rack.tools.viewer.cell import Goals, Marks, PlannedPath, Poses, Pushes, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
 from rack.tools.viewer.events import Events, Losses, RecorderLoad
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces
@@ -44,11 +44,13 @@ from rack.tools.viewer.levels import (
     ValueLane,
     move_name,
     numbered,
+    step_name,
     worded,
 )
 from rack.tools.viewer.parts import next_file
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
-from rack.tools.viewer.timing import Age, CycleLanes, Load, Misses
+from rack.tools.viewer.style import write_legend
+from rack.tools.viewer.timing import LOAD, Age, CycleLanes, Load, Misses, boards_of, colours_of
 
 SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
 """Messages whose numbers are not shown as curves."""
@@ -91,21 +93,29 @@ class RackWriter:
         of_mailbox: dict[str, list[ViewPart]] = {
             box.name: _of_any(stream, box) for box in layout.mailboxes
         }
+        marks = None
         if ran.cell is not None:
-            write_geometry(stream, ran.cell.model, ran.cell.start())
+            write_geometry(stream, ran.cell)
             goals = Goals(stream, config.scene.bodies)
+            assert config.robot is not None, "there is an arm"
+            marks = Marks(stream, ran.cell, config.robot.joints)
             for box in layout.mailboxes:
+                if box.message in DRIVING:
+                    of_mailbox[box.name].append(marks.write)
                 of_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
         period_ns = tick_ns(config)
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
+        colours = colours_of(layout)
+        boards = boards_of(layout)
+        write_legend(stream, LOAD, boards, [colours[board] for board in boards])
         slice_ns = layout.clock_ns if lockstep else period_ns
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
         self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
                 CycleLanes(stream, task, speed, lockstep).write,
-                Load(stream, task, slice_ns, lockstep).write,
+                Load(stream, task, colours[task.name], slice_ns, lockstep).write,
                 Misses(stream, task).write,
             ]
             for task in layout.tasks
@@ -113,11 +123,14 @@ class RackWriter:
         # The mailboxes of operators and host boards, and queues, have no age: they are not written
         # periodically.
         periodic = [box for box in layout.timed if box.writer != CLOCK and box.protocol != "queue"]
-        self._ages = {mailbox.name: Age(stream, mailbox, layout) for mailbox in periodic}
+        self._ages = {
+            mailbox.name: Age(stream, mailbox, layout, colours[mailbox.writer])
+            for mailbox in periodic
+        }
         for mailbox, age in self._ages.items():
             of_mailbox[mailbox].append(age.write)
         self._parts = self._of_task | of_mailbox
-        self._events = Events(stream, ran.events, self._hierarchy)
+        self._events = Events(stream, ran.events, self._hierarchy, marks)
         self._losses = Losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
@@ -216,14 +229,15 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         and "id" in names
         and mailbox.message not in (*STREAMED, *STREAMED_DOWN)
     ):
-        parts.append(ValueLane(stream, (board, port), "id", partial(numbered, "command")).write)
+        parts.append(ValueLane(stream, (board, port), "id", numbered).write)
     if names.issuperset(FIRED):
         parts.append(FiredRows(stream, mailbox).write)
     if mailbox.message == MOVE_STATUS.name:
         parts.append(ValueLane(stream, (board, "move"), ["current", "verb"], move_name).write)
     if mailbox.message in (MOTION_STATUS.name, SERVER_STATUS.name):
-        name = partial(numbered, "request")
-        parts.append(ValueLane(stream, (board, "request"), "current", name).write)
+        parts.append(ValueLane(stream, (board, "request"), "current", numbered).write)
+    if mailbox.message == GRASP_STATUS.name:
+        parts.append(ValueLane(stream, (board, "step"), ["step", "kind"], step_name).write)
     if mailbox.message == SERVER_STATUS.name:
         parts.append(ValueLane(stream, (board, "mode"), "mode", partial(worded, Mode)).write)
     if mailbox.message not in (

@@ -33,6 +33,11 @@ GOAL: Colour = 0x46D25AFF
 CURRENT: Colour = 0xFF6E28FF
 FORCE: Colour = 0xF03C3CFF
 LOST: Colour = 0xE63232FF
+GRID: Colour = 0xFFFFFF78
+LEGEND = "legend"
+LEGEND_ROW = 30.0
+LEGEND_LETTER = 7.0
+"""Distance between names of a legend, and width of a letter, in the units of a graph."""
 
 _GREY: Colour = 0x6E6E78FF
 _BLUE: Colour = 0x468CE6FF
@@ -70,6 +75,8 @@ PHASES: dict[str, Colour] = {
     "write": _YELLOW,
     "missed": 0xE63232FF,
 }
+LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", "missed": "!"}
+"""Labels of phases, as in the paper's figures: words would not fit into their spans."""
 
 
 def of_joint(at: int) -> Colour:
@@ -89,15 +96,18 @@ def packed(colours: Iterable[Colour]) -> np.ndarray:
 
 
 def style_lane(
-    stream: Stream, entity: Sequence[str], colours: Mapping[str, Colour], quiet: Sequence[str] = ()
+    stream: Stream,
+    entity: Sequence[str],
+    colours: Mapping[str, Colour],
+    labels: Mapping[str, str] | None = None,
 ) -> None:
-    """Set the colours of a lane's states, and their labels except for the `quiet` ones.
+    """Set the colours of a lane's states, and their labels: without `labels` their own names.
 
     The viewer picks a colour for any other state.
     """
-    labels = [" " if name in quiet else name for name in colours]
     shades = packed(colours.values())
-    stream.static(entity, rr.StateConfiguration(values=list(colours), labels=labels, colors=shades))
+    shown = [name if labels is None else labels[name] for name in colours]
+    stream.static(entity, rr.StateConfiguration(values=list(colours), labels=shown, colors=shades))
 
 
 def style_curves(
@@ -111,6 +121,21 @@ def style_curves(
     them."""
     shades = None if colours is None else packed(colours)
     stream.static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
+
+
+def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[Colour]) -> None:
+    """Write names in their colours, one below the other: a legend within a plot covers curves."""
+    places = [(0.0, LEGEND_ROW * row) for row in range(len(names))]
+    nodes = rr.GraphNodes(names, labels=names, positions=places, colors=packed(colours))
+    stream.static((LEGEND, what), nodes)
+
+
+def legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
+    """Return a view of a legend of these names."""
+    half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
+    rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
+    bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
+    return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
 
 
 def write_spans(

@@ -15,7 +15,18 @@ from rack.levels.timing.trace_times import (
 )
 from rack.tools.viewer.levels import LEVELS
 from rack.tools.viewer.stream import Ints, RowBlock, Stream
-from rack.tools.viewer.style import LIMIT, PHASES, of_joint, style_curves, style_lane, write_spans
+from rack.tools.viewer.style import (
+    COMMANDED,
+    LETTERS,
+    LIMIT,
+    PHASES,
+    Colour,
+    dimmed,
+    of_joint,
+    style_curves,
+    style_lane,
+    write_spans,
+)
 
 BOARDS = "boards"
 LOAD = "load"
@@ -45,7 +56,7 @@ class CycleLanes:
             else None
         )
         self._work = "process" if task.role == "executor" else "plan"
-        style_lane(stream, self._lane, PHASES, quiet=["wait"])
+        style_lane(stream, self._lane, PHASES, LETTERS)
 
     def write(self, block: RowBlock) -> None:
         """Write four spans a cycle."""
@@ -62,6 +73,18 @@ class CycleLanes:
         write_spans(self._stream, self._lane, times, states.ravel().tolist())
 
 
+def boards_of(layout: Layout) -> list[str]:
+    """Return the first names of tasks: planners have those of their boards."""
+    return list(dict.fromkeys(task.name.partition(".")[0] for task in layout.tasks))
+
+
+def colours_of(layout: Layout) -> dict[str, Colour]:
+    """Return a colour for each task, by name; a planner has its board's, dimmed."""
+    boards = boards_of(layout)
+    own = {task.name: of_joint(boards.index(task.name.partition(".")[0])) for task in layout.tasks}
+    return {name: dimmed(colour) if "." in name else colour for name, colour in own.items()}
+
+
 class Load:
     """Writes trace records as curves: lateness, execution and deadline in ms, and the used part of
     the time slice.
@@ -70,7 +93,9 @@ class Load:
     compare it with.
     """
 
-    def __init__(self, stream: Stream, task: TaskSpec, period_ns: int, is_lockstep: bool) -> None:
+    def __init__(
+        self, stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
+    ) -> None:
         self._stream = stream
         self._task = task.name
         self._is_lockstep = is_lockstep
@@ -78,8 +103,8 @@ class Load:
         curves = [
             f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")
         ]
-        style_curves(stream, (TIMES, task.name), curves, [of_joint(1), of_joint(0), LIMIT])
-        style_curves(stream, (LOAD, task.name), [f"{task.name}, %"])
+        style_curves(stream, (TIMES, task.name), curves, [COMMANDED, colour, LIMIT])
+        style_curves(stream, (LOAD, task.name), [f"{task.name}, %"], [colour])
 
     def write(self, block: RowBlock) -> None:
         """Write every cycle; 100 % is the deadline."""
@@ -141,7 +166,9 @@ class Age:
     """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is
     visible then."""
 
-    def __init__(self, stream: Stream, mailbox: MailboxSpec, layout: Layout) -> None:
+    def __init__(
+        self, stream: Stream, mailbox: MailboxSpec, layout: Layout, colour: Colour
+    ) -> None:
         self._stream = stream
         self._lane = (AGES, mailbox.name)
         own = TickGrid(mailbox.every, mailbox.phase)
@@ -151,7 +178,7 @@ class Age:
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)
         self._upto = -1
-        style_curves(stream, self._lane, [f"{mailbox.name}, ms"])
+        style_curves(stream, self._lane, [f"{mailbox.name}, ms"], [colour])
 
     def write(self, block: RowBlock) -> None:
         """Take messages; they count from the tick at which they become visible."""
