@@ -101,22 +101,28 @@ class InverseKinematics:
         )
 
     def solutions(
-        self, target: Pose, reference: Array, free: Callable[[Array], bool]
+        self,
+        target: Pose,
+        reference: Array,
+        free: Callable[[Array], bool],
+        restarts: int = MAX_RESTARTS,
     ) -> list[Array]:
         """Return distinct free configurations at `target`, the quickest to reach from `reference`
         first.
 
         Empty when `target` is out of reach or everything there collides.
         """
-        return [q for q in self.reachable(target, reference) if free(q)]
+        return [q for q in self.reachable(target, reference, restarts=restarts) if free(q)]
 
-    def reachable(self, target: Pose, reference: Array, turned: bool = True) -> list[Array]:
+    def reachable(
+        self, target: Pose, reference: Array, turned: bool = True, restarts: int = MAX_RESTARTS
+    ) -> list[Array]:
         """Return distinct configurations at `target`, free or not, the quickest to reach first;
         without `turned` in any orientation."""
         rng = np.random.default_rng(self._seed)
         found: list[Array] = []
         idle = 0
-        for start in self._starts(reference, rng):
+        for start in self._starts(reference, rng, restarts):
             q = self.reach(target, start, turned)
             known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in found)
             idle = idle + 1 if known else 0
@@ -131,9 +137,9 @@ class InverseKinematics:
         limit."""
         return float(np.max(np.abs(one - other) * self._pace))
 
-    def _starts(self, reference: Array, rng: np.random.Generator) -> Iterable[Array]:
+    def _starts(self, reference: Array, rng: np.random.Generator, restarts: int) -> Iterable[Array]:
         yield reference
-        for _ in range(MAX_RESTARTS):
+        for _ in range(restarts):
             yield rng.uniform(self._low, self._high)
 
     def _error(self, target: Pose, q: Array) -> Array:

@@ -11,11 +11,12 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
+from rack.levels.planning.ik import MAX_RESTARTS
 from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner, in_metres
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import SceneConfig
-from rack.levels.task.grasps import goals, grasps, slip_room, standing
+from rack.levels.task.grasps import SLIP_M, goals, grasps, leans, standing
 from rack.levels.task.program import DOWN, Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal
 
@@ -25,6 +26,9 @@ TURNS = 8
 """Turns about the tool's z axis that are tried where only its direction is given."""
 MAX_WAYS = 16
 """Ways to do an action that are planned completely."""
+LEANING_RESTARTS = 20
+"""Random starts of the inverse kinematics for a tool that leans, of which many poses are out of
+reach: of 7,100 poses in reach in layouts that the PUMA refuses, so few missed 80."""
 HALVINGS = 7
 """Bisections in the search for a reachable place on the way to one that is not."""
 
@@ -169,7 +173,7 @@ class Handling(NamedTuple):
         puts: list[tuple[Pose, list[Spot]]] = []
         for take in takes:
             grip = take.tool.inverse() @ situation.object_pose(self.row)
-            room = slip_room(take.tool)
+            room = SLIP_M if leans(take.tool) else 0.0
             for goal in standing_goals:
                 tool = goal.raised(room) @ grip.inverse()
                 same = next((spots for known, spots in puts if known.is_near(tool)), None)
@@ -200,7 +204,9 @@ class Handling(NamedTuple):
         if it `grasps` there, close the gripper."""
         motion = self.start.motion
         situation.lay_out(motion.checker, None)
-        above = motion.ik.solutions(tool.raised(self.lift), self.start.q, motion.checker.free)
+        restarts = LEANING_RESTARTS if leans(tool) else MAX_RESTARTS
+        over = tool.raised(self.lift)
+        above = motion.ik.solutions(over, self.start.q, motion.checker.free, restarts)
         situation.lay_out(motion.checker, self.row)
         ends = [(q, motion.ik.reach(tool, q)) for q in above]
         free = [(q, end) for q, end in ends if end is not None and motion.checker.free(end)]

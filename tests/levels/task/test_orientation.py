@@ -20,6 +20,7 @@ from rack.levels.task.actions import goto, rehearse
 from rack.levels.task.program import Goto, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import CLOCK_NS, config
+from tests.levels.task.layouts import ORIGIN_Z, arm, draw
 from tests.levels.whole_rack import WholeRack
 
 FIVE = """
@@ -146,16 +147,15 @@ def test_five_joints_transfer_a_can(tmp_path: Path, bend: float) -> None:
     assert rack.read("world.model").position[0] == pytest.approx(to, abs=0.01)
 
 
-def moved(to: tuple[float, float, float]) -> Rehearsal:
+def moved(
+    to: tuple[float, float, float], cell: tuple[RobotConfig, SceneConfig] | None = None
+) -> Rehearsal:
     """Return the rehearsal of the PUMA's block1 moved to `to`, m."""
-    robot, scene = config("puma560")
-    cell = build_cell(robot, scene, CLOCK_NS)
-    poses = cell.start().qpos[cell.object_qpos[:, None] + np.arange(7)]
-    situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
+    robot, scene = cell or config("puma560")
     program = TaskConfig.model_validate(
         {"action": [{"do": "transfer", "object": "block1", "to": to}]}
     )
-    return rehearse(program, scene, Rehearsal(MotionPlanner(cell, scene, 1), cell.home, situation))
+    return rehearse(program, scene, rehearsal(robot, scene))
 
 
 def test_a_block_is_taken_otherwise_where_its_goal_cannot_be_reached_so() -> None:
@@ -173,3 +173,11 @@ def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
         match=r"place block1 at \[0.62, 0, 0.475\]: 'forearm' and 'wall' are -\d+.\d mm apart",
     ):
         moved((0.62, 0.0, 0.475))
+
+
+@pytest.mark.slow
+def test_a_place_that_only_a_lean_between_those_of_ten_degrees_reaches(tmp_path: Path) -> None:
+    layout = draw(np.random.default_rng([1990, 21]))
+    x, y = layout.end[0]
+    end = moved((x, y, ORIGIN_Z), arm(tmp_path / "cell", layout))
+    assert np.degrees(leaning_of(end)) % 10 == pytest.approx(5.0, abs=0.01)
