@@ -18,7 +18,6 @@ from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import pointing, pose
 from rack.levels.systems.cell.messages import Response
-from rack.tools.viewer.window import free_port
 from tests.boards.lan.racks import run_together
 from tests.levels.arms import cell, config
 from tests.levels.whole_rack import WholeRack
@@ -143,11 +142,10 @@ def test_an_obstacle_cannot_be_shared(tmp_path: Path) -> None:
 
 
 def racks(name: str, folder: Path) -> list[RackConfig]:
-    """Return coordinator and arms, in lockstep, under names and on ports of their own."""
-    ports = {"7447": str(free_port()), "7448": str(free_port())}
+    """Return coordinator and arms, in lockstep, under names and on sockets of their own."""
     for file in (CONFIGS / "cell").glob("*.toml"):
-        text = re.sub(r'"cell(?=["/-])', f'"{name}', file.read_text().replace('"../', '"'))
-        (folder / file.name).write_text(re.sub("7447|7448", lambda port: ports[port[0]], text))
+        text = file.read_text().replace('"../', '"')
+        (folder / file.name).write_text(re.sub(r'(?<=["/])cell(?=["/-])', name, text))
     return [
         load(folder / f"{rack}.toml", ["clock.mode=lockstep"]) for rack in ("cell", "puma", "k1607")
     ]

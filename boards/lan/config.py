@@ -29,7 +29,9 @@ Remote = Annotated[
     str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")
 ]
 TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
-ENDPOINT_NOTE = "as in tls/192.168.1.5:7447 or tcp/127.0.0.1:7447"
+ENDPOINT_NOTE = (
+    "as in tls/192.168.1.5:7447, or on one machine unix/cell: a socket that only this user reaches"
+)
 
 
 class ExportConfig(Table):
@@ -115,8 +117,9 @@ class LanTable(Table):
     permit: dict[PeerName, Rights] = Field(
         {},
         description=(
-            "what others may do besides exchanging mailboxes, by name; watch: read status and"
-            " signals; command: command levels; stop: set the emergency stop"
+            "what others may do besides exchanging mailboxes, by name, which certificates prove;"
+            " watch: read status and signals; command: command levels; stop: set the emergency"
+            " stop"
         ),
     )
     most_bytes: int = Field(

@@ -8,13 +8,19 @@ from ipaddress import ip_address
 from typing import NamedTuple
 
 TLS = ("tls", "quic")
+UNIX = "unix"
 _SHAPE = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})", re.ASCII)
+_OWN = re.compile(rf"{UNIX}/([a-z0-9][a-z0-9_-]{{0,39}})")
 _NUMBERS = re.compile(r"[0-9.]*")
-PERMITTED = "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535"
+PERMITTED = (
+    "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535; or"
+    " unix/ and a name"
+)
 
 
 class Endpoint(NamedTuple):
-    """An endpoint; `host` is a name, or an address without brackets."""
+    """An endpoint; `host` is a name, or an address without brackets; of a Unix socket, its own
+    name."""
 
     protocol: str
     host: str
@@ -23,6 +29,8 @@ class Endpoint(NamedTuple):
     @classmethod
     def of(cls, text: str) -> Endpoint:
         """Return the endpoint in a text. Raises `ValueError`: it is malformed."""
+        if (own := _OWN.fullmatch(text)) is not None:
+            return cls(UNIX, own[1], 0)
         found = _SHAPE.fullmatch(text)
         if found is None or not 0 < int(found[3]) <= 65535:
             raise ValueError(PERMITTED)
@@ -37,12 +45,19 @@ class Endpoint(NamedTuple):
 
     def __str__(self) -> str:
         """Return it as a text."""
+        if self.is_private:
+            return f"{UNIX}/{self.host}"
         return f"{self.protocol}/{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
     @property
     def has_tls(self) -> bool:
         """Whether both sides show certificates."""
         return self.protocol in TLS
+
+    @property
+    def is_private(self) -> bool:
+        """Whether only this user's processes can reach it."""
+        return self.protocol == UNIX
 
     @property
     def is_loopback(self) -> bool:

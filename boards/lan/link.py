@@ -13,6 +13,8 @@ list the others in `connect`, and let the firewall admit their addresses alone.
 from __future__ import annotations
 
 import json
+import os
+import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
@@ -21,7 +23,8 @@ import zenoh
 
 from rack.boards.lan.access import access_control
 from rack.boards.lan.config import LanTable
-from rack.boards.lan.credentials import Credential, Credentials
+from rack.boards.lan.credentials import OTHERS, Credential, Credentials
+from rack.boards.lan.endpoint import Endpoint
 from rack.boards.lan.envelope import HEAD_BYTES, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
@@ -38,6 +41,8 @@ MOST_ANSWER = 65_536 + 1024
 """Length of the longest answer to a question: 64 KiB, and what says what they are."""
 ZENOH_BYTES = 1024
 """What zenoh adds to the content of a message, at most: key expression, lengths, options."""
+SOCKET = "unixsock-stream"
+"""A Unix socket's protocol, as zenoh calls it."""
 NO_WAIT = {"messages": ["query"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
 
 
@@ -205,7 +210,9 @@ def _settings(
 ) -> zenoh.Config:
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
     shortest, longest = RETRY_MS
-    protocols = {endpoint.protocol for _, endpoint in table.endpoints}
+    protocols = {
+        SOCKET if endpoint.is_private else endpoint.protocol for _, endpoint in table.endpoints
+    }
     settings: dict[str, Any] = {
         "mode": "peer",
         # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it
@@ -214,8 +221,8 @@ def _settings(
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": False,
-        "listen/endpoints": [f"{endpoint}{timed}" for endpoint in table.listen],
-        "connect/endpoints": list(table.connect),
+        "listen/endpoints": [f"{_locator(endpoint)}{timed}" for endpoint in table.listen],
+        "connect/endpoints": list(map(_locator, table.connect)),
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         # A peer that is not there yet keeps nobody: opening would wait for it for half a second.
@@ -250,6 +257,27 @@ def _settings(
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _locator(text: str) -> str:
+    """Return an endpoint as zenoh knows it. Raises `LevelError`: others may enter the folder of
+    this user's sockets."""
+    endpoint = Endpoint.of(text)
+    if not endpoint.is_private:
+        return text
+    folder = Path(os.environ.get("XDG_RUNTIME_DIR") or "/tmp") / f"rack-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        about = folder.lstat()
+    except OSError as error:
+        raise LevelError(f"adapter.lan: {folder}: {error.strerror}") from None
+    is_folder = stat.S_ISDIR(about.st_mode)
+    if not is_folder or about.st_uid != os.getuid() or about.st_mode & OTHERS:
+        raise LevelError(
+            f"adapter.lan: {folder}: others may enter it; permitted: a folder of this user, mode"
+            " 0700"
+        )
+    return f"{SOCKET}/{folder / endpoint.host}"
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Head, Run, System
+from rack.boards.lan.endpoint import Endpoint
 from rack.levels.peer import Presence, peer_port
 from rack.tools.console.address import Asker, HostAddress, RackAddress
 from rack.tools.console.answer import Failure
@@ -56,6 +57,8 @@ def known_hosts() -> list[HostAddress]:
         lan = tomllib.loads(segment.config).get("adapter", {}).get("lan", {})
         segment.close()
         for endpoint in (*lan.get("listen", ()), *lan.get("connect", ())):
+            if Endpoint.of(endpoint).is_private:
+                continue
             found[HostAddress.of_endpoint(endpoint)] = None
     return list(found)
 

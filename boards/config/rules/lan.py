@@ -196,6 +196,13 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
     for key, endpoint in table.endpoints:
         if why := _why_not(endpoint, table, connects=key.startswith("connect")):
             yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
+    if table.permit and (at := _open(table)):
+        why = f"whoever reaches {at[0]} could pass for any of them; permitted: tls/ or quic/ with"
+        yield Mistake(
+            f"{PLACE}.permit",
+            ", ".join(table.permit),
+            f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
+        )
     if table.has_tls and table.certificates is None:
         yield Mistake(
             f"{PLACE}.certificates",
@@ -210,6 +217,13 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
         )
 
 
+def _open(table: LanTable) -> list[str]:
+    """Return the endpoints that others reach without a certificate: every user of this machine
+    reaches those of loopback."""
+    ends = (endpoint for _, endpoint in table.endpoints)
+    return [str(end) for end in ends if not (end.has_tls or end.is_private)]
+
+
 def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
     if endpoint.has_tls and connects and ":" in endpoint.host:
         return (
@@ -221,7 +235,7 @@ def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
             "without TLS, which others have: who comes here is not known; permitted: all with TLS,"
             " or none"
         )
-    if not endpoint.has_tls and not endpoint.is_loopback and not table.insecure:
+    if not (endpoint.has_tls or endpoint.is_private or endpoint.is_loopback or table.insecure):
         return (
             "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an"
             f" address of loopback, or by name, {PLACE}.insecure = true"
@@ -249,11 +263,7 @@ def network_notes(config: RackConfig) -> list[str]:
     table = config.adapter.lan
     if table is None:
         return []
-    far = [
-        str(endpoint)
-        for _, endpoint in table.endpoints
-        if not (endpoint.has_tls or endpoint.is_loopback)
-    ]
+    far = _open(table)
     may = "read and forge" if table.certificates is None else "read"
     notes = (
         [f"without TLS: whoever reaches {', '.join(far)} may {may} what is exchanged"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -11,7 +12,10 @@ from typing import Any
 
 import pytest
 
+from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import out_key
+from rack.boards.lan.link import LanLink
+from rack.levels.errors import LevelError
 from rack.tools.viewer.window import free_port
 from tests.boards.lan.test_strangers import OWN, Program, Site, at_home, friend, running
 from tests.processes import wait_until
@@ -56,6 +60,21 @@ def test_it_listens_where_the_config_says_and_sends_no_datagram() -> None:
     with home(listen=[f"tcp/127.0.0.1:{free_port()}"]) as program:
         assert program.state()["came"] == {}
         assert list(sockets(program.pid)) == [("tcp", LISTENS)]
+
+
+def test_a_unix_socket_is_reached_by_its_own_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with home(listen=["unix/cell"]), home(connect=["unix/cell"]) as program:
+        wait_until(lambda: program.state()["connected"])
+        assert list(sockets(program.pid)) == []
+    (folder,) = tmp_path.iterdir()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    for mode in (0o710, 0o702):
+        folder.chmod(mode)
+        with pytest.raises(LevelError, match="others may enter it"):
+            LanLink("cell", LanTable(listen=("unix/cell",)))
 
 
 def test_a_link_that_connects_does_not_listen() -> None:

@@ -160,7 +160,8 @@ def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 40)
     far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
     for listen, lan, note in (
-        (near, "", ""),
+        (near, "", f"without TLS: whoever reaches {near} may read and forge what is exchanged"),
+        ("unix/cell", "", ""),
         (TLS, own, ""),
         (
             far,
@@ -175,6 +176,24 @@ def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
     ):
         assert mistakes(tmp_path, listen, lan) == []
         assert network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])
+
+
+@pytest.mark.parametrize("right", ["watch", "command", "stop"])
+def test_nothing_is_permitted_where_anyone_could_pass_for_another(
+    tmp_path: Path, right: str
+) -> None:
+    lan = f'permit = {{ operator = ["{right}"] }}'
+    for at, more in (("tcp/127.0.0.1:7447", ""), ("tcp/10.0.0.1:7447", "\ninsecure = true")):
+        line = (
+            f'adapter.lan.permit = "operator": whoever reaches {at} could pass for any of them;'
+            " permitted: tls/ or quic/ with certificates (rack lan certificates --help), or unix/"
+            " on one machine"
+        )
+        assert mistakes(tmp_path, at, lan + more) == [line]
+        assert mistakes(tmp_path, lan=lan + more, connect=(at,)) == [line]
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    assert mistakes(tmp_path, TLS, f'{lan}\ncertificates = "certs"') == []
+    assert mistakes(tmp_path, "unix/cell", lan, connect=("unix/puma",)) == []
 
 
 def test_bundled_configs_bring_no_certificates() -> None:
