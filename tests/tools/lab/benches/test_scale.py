@@ -19,7 +19,8 @@ def constant(name: str) -> float:
     return float(found)
 
 
-IDLE_KB, EXCHANGE_KB, LINK_MS, EXCHANGE_MS = map(constant, "KEAB")
+IDLE_KB, EXCHANGE_KB, LIVING_MS, EXCHANGE_MS, ADAPTER_MS = map(constant, "KEABD")
+LINK_MS = LIVING_MS + ADAPTER_MS
 
 
 def row(start: str) -> list[float]:
