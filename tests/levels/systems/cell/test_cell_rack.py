@@ -101,7 +101,7 @@ def test_coordinator_that_remembers_nothing_goes_on_with_the_step_under_way() ->
             Error.UNREACHABLE,
             "goto [1.5, 0.0, 0.6]: out of reach: [1.5",
         ),
-        ({**HOME, "by": 0.2}, Error.TOO_LATE, "home, by 0.2 s: it is 0.50 s already"),
+        ({**HOME, "by": 0.2}, Error.TOO_LATE, "home, by 0.45 s: it is 0.50 s already"),
         (
             {**TRANSFER, "object": "cup"},
             Error.UNREACHABLE,
