@@ -91,7 +91,7 @@ def test_check_shows_the_exchange() -> None:
     assert found["network"]["peers"] == ("other-one", "third")
     text = "\n".join(inventory_lines(found))
     assert (
-        "network: listen tcp/127.0.0.1:7447; works with other-one, third; lost after 200 ms: go on"
+        "network: listen tcp/127.0.0.1:7447; works with other-one, third; lost after 500 ms: go on"
         in text
     )
     assert "lan.other  in   other-one/pulse.status        50          100" in text
