@@ -7,7 +7,8 @@ a message; `levels` defines its meaning.
 
 A request belongs to the run, or to a client that waits for it. The latter is withdrawn when the
 client's process ends, even if it is killed: the client holds a kernel lock, which the clock can
-check in a microsecond.
+check in a microsecond. With a lease the client stays after its command was issued, and the clock
+sees when it ends, or is not `heard` any more.
 """
 
 from __future__ import annotations
@@ -37,6 +38,14 @@ class RequestStage(IntEnum):
     GIVEN = 2  # issued; the entry may be filled again
 
 
+class Client(IntEnum):
+    """Values of `RequestWord.CLIENT`."""
+
+    NONE = 0  # the request belongs to the run
+    WAITS = 1  # issued only while its client lives
+    LEASES = 2  # the same, and in force only while its client lives
+
+
 class RequestWord(IntEnum):
     """Words of an entry. The host fills a free one; from then on the clock writes STAGE, SERIAL and
     GIVEN_TICK."""
@@ -47,7 +56,8 @@ class RequestWord(IntEnum):
     TICK = 3  # tick at which to issue it; -1: at once
     SERIAL = 4  # of the command, rising over all levels in the order of issue; 0: not yet
     GIVEN_TICK = 5  # -1: not yet
-    HAS_CLIENT = 6  # 1: issued only while its client lives
+    CLIENT = 6
+    HEARD = 7  # tick at which the client of a lease was last heard
 
 
 @dataclass(frozen=True)
@@ -107,31 +117,31 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        claim = self._await_turn(request, has_client=False)
+        claim = self._await_turn(request, Client.NONE)
         claim.leave()
         return claim.entry
 
     @contextmanager
-    def claim(self, request: Request) -> Iterator[RequestEntry]:
+    def claim(self, request: Request, client: Client = Client.WAITS) -> Iterator[RequestEntry]:
         """Add a request as its client, and withdraw it at the end of the `with` block unless it has
         been issued.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        claim = self._await_turn(request, has_client=True)
+        claim = self._await_turn(request, client)
         try:
             yield claim.entry
         finally:
             self.withdraw(claim.entry, claim.ticket)
             claim.leave()
 
-    def _await_turn(self, request: Request, has_client: bool) -> RequestClaim:
+    def _await_turn(self, request: Request, client: Client) -> RequestClaim:
         # Bounded by the time in which another process fills an entry.
-        while (claim := self.try_claim(request, has_client)) is None:
+        while (claim := self.try_claim(request, client)) is None:
             continue
         return claim
 
-    def try_claim(self, request: Request, has_client: bool = True) -> RequestClaim | None:
+    def try_claim(self, request: Request, client: Client = Client.WAITS) -> RequestClaim | None:
         """Add a request without waiting; None while another process fills an entry, and might be
         preempted meanwhile.
 
@@ -139,12 +149,13 @@ class OperatorTable:
         """
         lock = ByteLock(self._segment.fd, self._segment.map.operator)
         try:
-            return self._add(request, has_client) if lock.take() else None
+            return self._add(request, client) if lock.take() else None
         finally:
             lock.close()
 
-    def _add(self, request: Request, has_client: bool) -> RequestClaim:
-        settled = [entry for entry in self.entries if not self.is_waiting(entry)]
+    def _add(self, request: Request, client: Client) -> RequestClaim:
+        leased = self.leased()
+        settled = [e for e in self.entries if not self.is_waiting(e) and e not in leased]
         if not settled:
             why = f"{len(self.entries)} commands wait for their ticks"
             raise OperatorTableError(
@@ -153,9 +164,9 @@ class OperatorTable:
         entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
         ticket = self._words[System.REQUESTED] + 1
         lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
-        if has_client:
+        if client:
             lock.take()
-        self._fill(entry, request, ticket, has_client)
+        self._fill(entry, request, ticket, client)
         return RequestClaim(entry, ticket, lock)
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
@@ -172,24 +183,46 @@ class OperatorTable:
         words = entry.words
         if words[RequestWord.STAGE] != RequestStage.WAITING:
             return False
-        return not words[RequestWord.HAS_CLIENT] or self._segment.is_locked(
-            _CLAIMS + words[RequestWord.TICKET]
-        )
+        return not words[RequestWord.CLIENT] or self.client_lives(entry)
+
+    def client_lives(self, entry: RequestEntry) -> bool:
+        """Say whether the client of a request lives."""
+        return self._segment.is_locked(_CLAIMS + entry.words[RequestWord.TICKET])
+
+    def leased(self) -> list[RequestEntry]:
+        """Return the requests that were issued under a lease, until it is released."""
+        return [
+            entry
+            for entry in self.entries
+            if entry[RequestWord.CLIENT] == Client.LEASES
+            and entry[RequestWord.STAGE] == RequestStage.GIVEN
+        ]
+
+    def hear(self, entry: RequestEntry, ticket: int) -> bool:
+        """Note that the client of a lease is there; False when the lease was released."""
+        entry.words[RequestWord.HEARD] = self._words[System.TICK]
+        words = entry.words
+        return words[RequestWord.TICKET] == ticket and words[RequestWord.CLIENT] == Client.LEASES
+
+    def release(self, entry: RequestEntry) -> None:
+        """End the lease of a request: what happens to its client does not matter any more."""
+        entry.words[RequestWord.CLIENT] = Client.WAITS
 
     def waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""
         found = [entry for entry in self.entries if self.is_waiting(entry)]
         return sorted(found, key=lambda entry: entry.words[RequestWord.TICKET])
 
-    def _fill(self, entry: RequestEntry, request: Request, ticket: int, has_client: bool) -> None:
+    def _fill(self, entry: RequestEntry, request: Request, ticket: int, client: Client) -> None:
         words = entry.words
         words[RequestWord.STAGE] = RequestStage.FREE
         words[RequestWord.TICKET] = ticket
-        words[RequestWord.HAS_CLIENT] = has_client
+        words[RequestWord.CLIENT] = client
         words[RequestWord.MAILBOX] = request.mailbox
         words[RequestWord.TICK] = request.tick
         words[RequestWord.SERIAL] = 0
         words[RequestWord.GIVEN_TICK] = -1
+        words[RequestWord.HEARD] = -1
         entry.message[: len(request.message)] = request.message
         # From here the clock may issue it.
         words[RequestWord.STAGE] = RequestStage.WAITING

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry, RequestWord
@@ -21,6 +21,13 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
     spec = layout.mailboxes[entry[RequestWord.MAILBOX]]
     message = Message(message_dtype(spec.fields, spec.size))
     message.raw[:] = entry.message[: spec.size]
+    return message
+
+
+def hold(mailbox: MailboxSpec) -> Message:
+    """Return the operator's hold, for the mailbox of a level's operator."""
+    message = Message(message_dtype(mailbox.fields, mailbox.size))
+    message.what = Operation.HOLD
     return message
 
 

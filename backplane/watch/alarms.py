@@ -55,6 +55,7 @@ class Alarm(IntEnum):
     COMMANDED = 6  # [entry of the operator table; serial]  an operator's command was issued
     # [mailbox; ticks since the fault ended] a good message made after a fault of its messages
     FLOWS = 7
+    OPERATOR_GONE = 8  # [entry of the operator table; serial]  a command under a lease: hold
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
     PLAN_LATE = 11  # [task; releases missed]  a plan has not finished within its cycles (eq. 3.8)

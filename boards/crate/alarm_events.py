@@ -230,6 +230,12 @@ class AlarmEvents:
             code = Operation(message.what).name.lower()
             before = self._before(board, message) if message.what == Operation.SET else ""
             text = f"{describe(message)}{before} (command {value:.0f})"
+        elif alarm == Alarm.OPERATOR_GONE:
+            request = self._operator.entries[number]
+            subject = board = level_of(request, self._layout)
+            kind = "command"
+            what = describe(message_of(request, self._layout))
+            text = f"{what}: its operator is gone: hold (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
             demand = Demand(int(value))
             subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)

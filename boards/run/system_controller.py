@@ -7,6 +7,7 @@ restarted boards rejoin the grid, and demands that the arm stop or brake.
 from __future__ import annotations
 
 import os
+import sys
 import time
 
 from rack.backplane.address_map import CLOCK
@@ -16,16 +17,27 @@ from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import State
-from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    Client,
+    OperatorTable,
+    RequestEntry,
+    RequestStage,
+    RequestWord,
+)
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System, is_on
 from rack.boards.faults.clock_board import FaultStage
+from rack.boards.operator import hold
 from rack.boards.wiring import ClockWiring
+from rack.levels.operator import DRIVES, SETTINGS, Answer
 
 HEAD_START_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that its start-up does not delay a
 tick."""
+SILENT_NS = 1_000_000_000
+"""Real time, at the clock's own speed, after which an operator within a lease is gone that was not
+heard."""
 # Plain integers for the hot path.
 _LOSSES, _EMERGENCY, _REQUESTED, _INJECTED, _PEER_STOP = (
     int(word)
@@ -59,7 +71,7 @@ class SystemController:
         desk = self._desk
         if faults.open or faults.awaited or words[_INJECTED] != faults.injected:
             faults.advance(tick)
-        if desk.waiting or words[_REQUESTED] != desk.requested:
+        if desk.waiting or desk.leased or words[_REQUESTED] != desk.requested:
             desk.advance(tick)
         if self._settled != (
             words[_LOSSES],
@@ -131,8 +143,8 @@ class OperatorDesk:
     """Issues operator commands at the start of a tick, each into its level's mailbox, before any
     task is released.
 
-    There is nothing to do in a tick if no command is `waiting` and none but the first `requested`
-    ones have come.
+    There is nothing to do in a tick if no command is `waiting` or `leased` and none but the first
+    `requested` ones have come.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -140,20 +152,30 @@ class OperatorDesk:
         self._alarms = alarms
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
-        boxes = segment.layout.mailboxes
+        self._segment = segment
+        self._boxes = segment.layout.mailboxes
         self._writers = {
             at: open_writer(segment, box.name)
-            for at, box in enumerate(boxes)
+            for at, box in enumerate(self._boxes)
             if box.writer == CLOCK
         }
         self.requested = -1
         self.waiting: list[RequestEntry] = []
+        self.leased: list[RequestEntry] = []
+        self._newest: dict[int, int] = {}
+        """Of each mailbox, the serial of the newest command that takes the place of others."""
+        # A tick of lockstep has no length.
+        in_time = not self._words[System.LOCKSTEP]
+        self._silent = SILENT_NS // segment.layout.clock_ns if in_time else sys.maxsize
 
     def advance(self, tick: int) -> None:
         """Issue all commands due at `tick`."""
         if self._words[_REQUESTED] != self.requested:
             self.requested = self._words[_REQUESTED]
             self.waiting = self._table.waiting()
+            self.leased = self._table.leased()
+        for entry in list(self.leased):
+            self._check_lease(entry, tick)
         for entry in [entry for entry in self.waiting if entry[RequestWord.TICK] <= tick]:
             self.waiting.remove(entry)
             # Mark first, then check that it still waits; a client that withdraws it uses the
@@ -177,7 +199,43 @@ class OperatorDesk:
         message.id = words[RequestWord.SERIAL]
         writer.write(tick, self._clock.now())
         words[RequestWord.STAGE] = RequestStage.GIVEN
+        if message.what not in (*SETTINGS, *DRIVES):
+            self._newest[words[RequestWord.MAILBOX]] = message.id
         self._alarms.ring(tick, Alarm.COMMANDED, entry.index, words[RequestWord.SERIAL])
+        if words[RequestWord.CLIENT] == Client.LEASES:
+            self.leased.append(entry)
+
+    def _check_lease(self, entry: RequestEntry, tick: int) -> None:
+        """Have a level hold whose operator has gone while the command is in force."""
+        mailbox = entry[RequestWord.MAILBOX]
+        if self._is_replaced(entry):
+            self._table.release(entry)
+        if entry[RequestWord.CLIENT] == Client.LEASES:
+            heard = max(entry[RequestWord.GIVEN_TICK], entry[RequestWord.HEARD])
+            if self._table.client_lives(entry) and tick - heard <= self._silent:
+                return
+            # At once, without a request: there may be no room for one.
+            writer = self._writers[mailbox]
+            self._words[System.COMMANDED] += 1
+            writer.message.raw[:] = hold(self._boxes[mailbox]).raw
+            writer.message.id = self._words[System.COMMANDED]
+            writer.write(tick, self._clock.now())
+            self._table.release(entry)
+            self._alarms.ring(tick, Alarm.OPERATOR_GONE, entry.index, writer.message.id)
+        self.leased.remove(entry)
+
+    def _is_replaced(self, entry: RequestEntry) -> bool:
+        """Return whether the level has accepted a newer command that replaces this one."""
+        mailbox = entry[RequestWord.MAILBOX]
+        newest = self._newest.get(mailbox, 0)
+        if newest <= entry[RequestWord.SERIAL]:
+            return False
+        level = self._boxes[mailbox].name.partition(".")[0]
+        status = open_observer(self._segment, f"{level}.status").peek()
+        if not status.is_there:
+            return False
+        accepted = status.value.answer in (Answer.TAKEN, Answer.DONE)
+        return bool(status.value.order == newest and accepted)
 
 
 class EndOfRun:

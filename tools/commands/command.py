@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +18,9 @@ from rack.tools.console.parameters import (
     Timeout,
     check_timeout,
 )
+
+if TYPE_CHECKING:
+    from rack.tools.live.desk import LiveDesk, Reply
 
 DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
 """Commands that leave none in force."""
@@ -50,6 +54,13 @@ At = Annotated[
 Wait = Annotated[
     bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")
 ]
+Lease = Annotated[
+    bool,
+    typer.Option(
+        "--lease",
+        help="stay while it is in force; where this command ends before, the level holds",
+    ),
+]
 List = Annotated[
     bool,
     typer.Option("--list", help="list the levels, the commands each takes, and the one in force"),
@@ -65,6 +76,7 @@ def command(
     at: At = None,
     wait: Wait = False,
     timeout: Timeout = None,
+    lease: Lease = False,
     is_list: List = False,
     certificates: Certificates = "",
     name: AskAs = OPERATOR,
@@ -88,9 +100,11 @@ def command(
     reset     clear a fault of the arm's drives, which are then disabled
     release   end the bring-up of an arm: full speed from now on
 
-    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`. They survive a restart of the
-    level's board. An emergency stop takes precedence. On a rack that is held a command waits for
-    the next step: it is given then, and this returns at once.
+    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`, and the mode of the level is
+    "operator", otherwise "automatic": see 'rack status'. They survive a restart of the level's
+    board. With --lease they are in force while this command lasts: Ctrl-C, a closed terminal or
+    SIGKILL make the level hold. An emergency stop takes precedence. On a rack that is held a
+    command waits for the next step: it is given then, and this returns at once.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.
@@ -103,6 +117,7 @@ def command(
       rack command nasrem servo setpoint joints=0.2,1.3,-2.9,0,-1.3,0 --wait
       rack command nasrem task goto position=0.45,0.1,0.95
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
+      rack command nasrem task goto home --lease
       rack command hardware servo enable --wait
       rack command brown joints modify friction on --at 2.5
       rack command nist-state-table task table careful
@@ -115,6 +130,9 @@ def command(
     from rack.tools.live.watched import watched
 
     check_timeout(timeout, wait)
+    if lease and (wait or "/" in rack):
+        other = "--wait" if wait else rack
+        raise Failure(f"--lease, {other}: a lease stays anyway, on the rack's own machine alone", 2)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising(), watched(rack, Asker.of(name, certificates)) as one:
         desk = LiveDesk(one)
@@ -126,9 +144,25 @@ def command(
                 f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2
             )
         given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
+        if lease:
+            _attend(desk, given, as_json)
+            return
         reply = desk.give(given, wait, timeout)
     print_answer(reply.document(), reply.line, as_json)
     if not reply.worked:
         raise typer.Exit(1)
     if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
+
+
+def _attend(desk: LiveDesk, given: dict[str, Any], as_json: bool) -> None:
+    """Give a command under a lease, and stay while it is in force."""
+
+    def tell(reply: Reply) -> None:
+        print_answer(reply.document(), reply.line, as_json)
+        sys.stdout.flush()
+
+    reply = desk.attend(given, tell)
+    if not reply.worked:
+        tell(reply)
+        raise typer.Exit(1)

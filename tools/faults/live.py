@@ -79,7 +79,8 @@ class LiveRack:
         self._table.disarm(entry)
         words = self._segment.words
         tick = words[System.TICK]
-        self._wait_until(lambda: words[System.TICK] > tick + 1, BEGIN_S)
+        # A clock that is held begins nothing.
+        self._wait_until(lambda: words[System.TICK] > tick + 1 or words[System.HELD] > 0, BEGIN_S)
         if not self._table.free(entry):
             raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
         return {**answer, "stage": "free", "message": f"{answer['text']}: withdrawn"}

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -15,15 +15,23 @@ import numpy as np
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.operator_table import OperatorTable, RequestEntry, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    Client,
+    OperatorTable,
+    Request,
+    RequestEntry,
+    RequestStage,
+    RequestWord,
+)
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import loads
 from rack.boards.config.commands import asked, live_params, request, takes
+from rack.boards.config.schema import CommandConfig
 from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
-from rack.levels.operator import Answer, Operation
+from rack.levels.operator import EFFECTS, Answer, Operation
 from rack.tools.console.answer import Failure
 from rack.tools.console.held import waits
 from rack.tools.console.tables import table
@@ -139,14 +147,7 @@ class LiveDesk:
         in time.
         """
         segment = self._segment
-        tick = self._segment.words[System.TICK]
-        command = asked({key: value for key, value in given.items() if value is not None})
-        wanted = request(command, self._config, segment.layout)
-        if 0 <= wanted.tick <= tick:
-            key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
-            raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
-        if _Patience(self._rack, "").is_in_vain:
-            raise Failure(f"rack '{segment.rack}': its run is over")
+        command, wanted = self._request(given)
         if held := waits(segment):
             # Without a client: the user steps the rack afterwards.
             entry = OperatorTable(segment).add(wanted)
@@ -160,6 +161,47 @@ class LiveDesk:
             text = describe(message_of(entry, segment.layout))
             reply = self._await_giving(entry, ticket, command.level, text)
         return self._await_reply(reply, wait, timeout_s)
+
+    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> Reply:
+        """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
+        the run is over: if this process ends or falls silent before, its level holds.
+
+        Raises as `give` does, and for a command that leaves none in force.
+        """
+        command, wanted = self._request(given)
+        segment = self._segment
+        takes_hold = Operation.HOLD in commandable(self._config)[command.level]
+        if command.said not in EFFECTS or not takes_hold:
+            kept = [what.name.lower() for what in EFFECTS]
+            why = f"a level that takes no hold, or a command other than {', '.join(kept)}"
+            raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
+        if held := waits(segment):
+            raise Failure(f"--lease: the rack is held: {held}")
+        table = OperatorTable(segment)
+        with table.claim(wanted, Client.LEASES) as entry:
+            ticket = entry[RequestWord.TICKET]
+            text = describe(message_of(entry, segment.layout))
+            reply = self._await_giving(entry, ticket, command.level, text)
+            reply = self._await_reply(reply, False, None)
+            if reply.worked:
+                tell(reply)
+                while table.hear(entry, ticket) and not segment.run_is_over:
+                    self._rack.refresh()
+            else:
+                table.release(entry)
+        return reply
+
+    def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
+        """Return a command and what asks the clock for it. Raises as `give` does."""
+        tick = self._segment.words[System.TICK]
+        command = asked({key: value for key, value in given.items() if value is not None})
+        wanted = request(command, self._config, self._segment.layout)
+        if 0 <= wanted.tick <= tick:
+            key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
+            raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
+        if self._segment.run_is_over:
+            raise Failure(f"rack '{self._segment.rack}': its run is over")
+        return command, wanted
 
     def set_param(self, setting: str, tick: int | None = None, at: float | None = None) -> Reply:
         """Set a live parameter, as in `board.servo.params.bandwidth=80`; raises as `give` does."""

@@ -42,7 +42,7 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "restarts": lambda row: str(row.restarts),
     "exec ms": lambda row: decimal(row.exec_ms, 2),
     "late ms": lambda row: decimal(row.lateness_ms, 2),
-    "state": lambda row: row.state,
+    "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
 }
 """Columns by heading; `exec` and `late` are the longest since the last look."""
 DROPPED = (
@@ -278,7 +278,7 @@ def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
 
 def _style(column: str, text: str) -> str:
     if column == "state":
-        return STATES.get(text, "")
+        return STATES.get(text.partition(" (")[0], "")
     return COUNTED.get(column, "") if text != "0" else ""
 
 

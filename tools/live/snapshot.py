@@ -41,8 +41,9 @@ TASK_STATUS = "task_status"
 class TaskRow:
     """One task now. Times are the longest of the newest cycles, in ms; None before the first.
 
-    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `row` is what fired
-    of a state table.
+    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `mode` is "operator"
+    while a command of an operator is in force, otherwise "automatic"; empty for tasks that take
+    none. `row` is what fired of a state table.
     """
 
     task: str
@@ -61,6 +62,7 @@ class TaskRow:
     lateness_ms: float | None
     reason: str
     row: str = ""
+    mode: str = ""
 
 
 @dataclass(frozen=True)
@@ -217,12 +219,14 @@ class RackMonitor:
         state = TaskState(block[Block.STATE]).name.lower()
         reason = ""
         row = ""
+        mode = ""
         if block[Block.LOST]:
             state = LOST
         elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
             state = State(status.value.state).name.lower()
             reason = status.value.reason
             row = fired(status.value)
+            mode = mode_of(status.value)
         return TaskRow(
             task=task.name,
             slot=task.slot,
@@ -240,6 +244,7 @@ class RackMonitor:
             lateness_ms=lateness_ms,
             reason=reason,
             row=row,
+            mode=mode,
         )
 
     def _times_ms(self, task: str) -> tuple[float | None, float | None]:
@@ -260,6 +265,13 @@ class RackMonitor:
         return TaskProgress(
             at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason
         )
+
+
+def mode_of(status: Message) -> str:
+    """Return by whose commands a level works, as in `TaskRow`."""
+    if "standing" not in (status.record.dtype.names or ()):
+        return ""
+    return "operator" if status.standing else "automatic"
 
 
 def fired(status: Message) -> str:

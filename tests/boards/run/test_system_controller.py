@@ -3,20 +3,31 @@ the arm."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from rack.backplane.clock.driver import RealtimeDriver
-from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import State
-from rack.backplane.operator_table import OperatorTable, Request, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    Client,
+    OperatorTable,
+    Request,
+    RequestStage,
+    RequestWord,
+)
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, Demand, System, TaskState
 from rack.boards import Rack
+from rack.boards.config.layout import field_specs
 from rack.boards.faults.config import FaultConfig
+from rack.boards.operator import hold
 from rack.boards.run.system_controller import EndOfRun, SystemController
 from rack.boards.wiring import ClockWiring
 from rack.levels.messages import TASK_STATUS
+from rack.levels.operator import OPERATOR_COMMAND, Operation
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.boards.conftest import MakeConfig
@@ -115,6 +126,42 @@ def test_a_command_whose_client_has_died_is_not_issued_and_says_so(
     assert segment.words[System.COMMANDED] == 0
     # Left out for good: the clock has no more to do with it.
     assert not table.waiting()
+
+
+@pytest.mark.parametrize("is_released", [False, True])
+@pytest.mark.parametrize("is_restarted", [False, True])
+def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
+    make_bus: MakeBus,  # noqa: F811
+    is_released: bool,
+    is_restarted: bool,
+) -> None:
+    fields = field_specs(OPERATOR_COMMAND, {})
+    size = OPERATOR_COMMAND.dtype({}).itemsize
+    box = replace(mailbox(name="left.operator", writer="clock"), fields=fields, size=size)
+    segment = make_bus(box, *BOARDS)
+    rack, table = Controlled(segment), OperatorTable(segment)
+    operator = open_observer(segment, "left.operator")
+    goto = hold(box)
+    goto.what = Operation.GOTO
+    claim = table.try_claim(Request(0, bytes(goto.raw)), Client.LEASES)
+    assert claim is not None
+    for tick in (1, 2, 3):
+        rack.controller.begin(tick)
+    assert operator.peek().value.what == Operation.GOTO
+    if is_restarted:
+        for writer in rack.controller._desk._writers.values():
+            writer.close()
+        rack = Controlled(segment)
+    if is_released:
+        table.release(claim.entry)
+    claim.leave()
+    for tick in (4, 5, 6):
+        rack.controller.begin(tick)
+    codes = rack.alarms.drain().rows["code"].tolist()
+    assert codes.count(Alarm.OPERATOR_GONE) == (not is_released)
+    last = Operation.GOTO if is_released else Operation.HOLD
+    assert operator.peek().value.what == last
+    assert not table.leased()
 
 
 def test_the_emergency_stop_engages_brakes_until_it_is_released(

@@ -125,6 +125,16 @@ def test_one_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
         rack.live.withdraw(0)
 
 
+@pytest.mark.timeout(20)
+def test_one_is_withdrawn_at_once_from_a_rack_that_is_held(
+    rack: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "BEGIN_S", 1000.0)
+    rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 50}, False)
+    rack.segment.words[System.HELD] = TICK
+    assert rack.live.withdraw(0)["stage"] == "free"
+
+
 def test_waits_have_an_end(rack: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "BEGIN_S", 0.02)
     with pytest.raises(Failure, match=r"the clock has not begun it within 0\.02 s"):

@@ -21,6 +21,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.live import desk
 from rack.tools.live.desk import LiveDesk, Replies, goal_of
 from rack.tools.live.watched import LocalRack
+from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
@@ -105,6 +106,65 @@ def test_a_command_that_stays_in_force_says_how_to_end_it(running: str) -> None:
     held = rack("command", running, "upper", "hold").stdout.splitlines()
     assert held[1:] == [f"in force until: rack command {running} upper resume"]
     assert len(rack("command", running, "upper", "resume").stdout.splitlines()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_level_holds_whose_operator_has_gone_within_a_lease(
+    running: str, gone: signal.Signals
+) -> None:
+    segment = Segment.attach(running)
+    hold = [*RACK, "command", running, "upper", "hold", "--lease"]
+    with AttachedRack(running) as live:
+        with subprocess.Popen(hold, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            modes = {row.task: row.mode for row in live.status().tasks}
+            given = segment.words[System.COMMANDED]
+            process.send_signal(gone)
+            if gone == signal.SIGSTOP and segment.words[System.LOCKSTEP]:
+                # A tick of lockstep has no length: silence means nothing there.
+                until = segment.words[System.TICK] + 1000
+                wait_until(lambda: segment.words[System.TICK] > until)
+                assert OperatorTable(segment).leased()
+                process.kill()
+            event = live.wait_for("operator_gone", BOUND_S)
+            process.kill()
+        assert line.startswith("command ")
+        assert modes == {"upper": "operator", "lower": "automatic"}
+        text = f"hold: its operator is gone: hold (command {given + 1})"
+        assert (event.board, event.text) == ("upper", text)
+        assert segment.words[System.COMMANDED] == given + 1
+    assert rack("command", running, "upper", "resume").returncode == 0
+
+
+@pytest.mark.slow
+def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None:
+    segment = Segment.attach(running)
+    upper = [*RACK, "command", running, "upper", "hold", "--lease"]
+    with subprocess.Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("command ")
+        # Refused, so the hold is still in force; then taken.
+        assert rack("command", running, "upper", "goto", "home").returncode == 1
+        assert process.poll() is None
+        assert rack("command", running, "upper", "resume").returncode == 0
+        assert process.wait(BOUND_S) == 0
+    assert not OperatorTable(segment).leased()
+    assert LiveDesk(LocalRack(running)).highest("hold") == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("upper resume --lease", "--lease: 'upper', resume: a level that takes no hold, or a "),
+        ("upper hold --lease --wait", "--lease, --wait: a lease stays anyway"),
+    ],
+)
+def test_a_lease_that_means_nothing_is_refused(running: str, words: str, why: str) -> None:
+    done = rack("command", running, *words.split())
+    assert (done.returncode, done.stderr.startswith(why)) == (2, True), done.stderr
 
 
 @pytest.mark.slow
