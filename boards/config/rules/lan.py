@@ -196,11 +196,12 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
     for key, endpoint in table.endpoints:
         if why := _why_not(endpoint, table, connects=key.startswith("connect")):
             yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
-    if table.permit and (at := _open(table)):
+    known = [name for name, rights in table.permit.items() if rights]
+    if known and (at := _open(table)):
         why = f"whoever reaches {at[0]} could pass for any of them; permitted: tls/ or quic/ with"
         yield Mistake(
             f"{PLACE}.permit",
-            ", ".join(table.permit),
+            ", ".join(known),
             f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
         )
     if table.has_tls and table.certificates is None:

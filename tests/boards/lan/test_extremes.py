@@ -116,9 +116,8 @@ def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
         text = re.sub(r'"cell(?=["/-])', f'"{name}', path.read_text().replace('"../', '"'))
         (folder / path.name).write_text(text)
     endpoint = f'adapter.lan.listen=["tcp/127.0.0.1:{listen}"]'
-    return load(
-        folder / f"{file}.toml", ["clock.mode=lockstep", endpoint, "adapter.lan.connect=[]"]
-    )
+    lan = (endpoint, "adapter.lan.connect=[]", "adapter.lan.permit.operator=[]")
+    return load(folder / f"{file}.toml", ["clock.mode=lockstep", *lan])
 
 
 def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) -> Ended:

@@ -20,6 +20,7 @@ from rack.boards.crate.line import CrateLine
 from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
+from rack.tools.network.certificates import make_credentials
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.timing.analysis.report import write_report
@@ -32,6 +33,8 @@ from tests.tools.machines import A, B, recorded
 pytestmark = pytest.mark.thorough
 
 WATCHED = """
+certificates = "certs"
+
 [adapter.lan.permit]
 operator = ["watch"]
 """
@@ -126,7 +129,11 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
     rack_name: str, tmp_path: Path
 ) -> None:
     names = [f"{rack_name}-a", f"{rack_name}-b"]
-    one, other = configs(ring_texts(names, lan=WATCHED), tmp_path, "adapter.lan.rate_hz=100")
+    certificates = tmp_path / "certs"
+    at_home = {name: ["127.0.0.1"] for name in names}
+    make_credentials(certificates, {**at_home, "operator": []}, 1)
+    texts = [text.replace("tcp/", "tls/") for text in ring_texts(names, lan=WATCHED)]
+    one, other = configs(texts, tmp_path, "adapter.lan.rate_hz=100")
     port = one.adapter.lan.listen[0].rpartition(":")[2]
     with CrateLine() as crate, Rack(one, crate=crate) as near, Rack(other) as far:
         far.start()
@@ -139,6 +146,8 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
             names[1],
             "--with",
             f"127.0.0.1:{port}/{names[0]}",
+            "--certificates",
+            str(certificates),
             "--out",
             str(folder),
             "--json",
