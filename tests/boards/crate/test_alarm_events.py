@@ -75,8 +75,9 @@ def heard(
     return AlarmEvents(segment, JOINTS).of(row, owner)
 
 
-# Operator commands come from the operator table: see test_operator.py.
-TOLD_HERE = [alarm for alarm in Alarm if alarm is not Alarm.COMMANDED]
+# Operator commands come from the operator table: see test_operator.py and test_desk.py.
+OF_OPERATORS = (Alarm.COMMANDED, Alarm.OPERATOR_GONE)
+TOLD_HERE = [alarm for alarm in Alarm if alarm not in OF_OPERATORS]
 
 
 @pytest.mark.parametrize("alarm", TOLD_HERE, ids=lambda alarm: alarm.name.lower())
