@@ -11,6 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,9 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from rack.backplane.segment import Launch, racks
+from rack.backplane.segment import Launch, Segment, racks
 from rack.backplane.trace import RECORD
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load, wire
 from rack.boards.events import Event
@@ -239,6 +241,23 @@ class AtTick(Display):
         os.kill(pid, self._number)
 
 
+class Held(AtTick):
+    """Strikes while a rack in lockstep, launched with `step`, is held at the tick: however late the
+    looks of a busy machine, the run is not over. Lets it go on once it has struck."""
+
+    def __init__(self, rack: str, number: signal.Signals, tick: int = FIRST_BLOCK, times: int = 1):
+        super().__init__(number, -1, times=times)
+        self._rack, self._hold_at = rack, tick + 1
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Let it run to the tick; strike there."""
+        with closing(Segment.attach(self._rack)) as segment:
+            if segment.words[System.HELD] == self._hold_at:
+                super().show(snapshot)
+            is_done = len(self.struck) == self._times
+            segment.words[System.HOLD_AT] = 0 if is_done else self._hold_at
+
+
 class FillingDisk(AtTick):
     """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is
     full."""
@@ -271,8 +290,8 @@ def realtime(config: RackConfig) -> RackConfig:
 def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    display = AtTick(signal.SIGKILL)
-    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    display = Held(config.name, signal.SIGKILL)
+    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
@@ -296,8 +315,8 @@ def test_recorders_killed_before_their_first_block_cost_no_row(
     config: RackConfig, tmp_path: Path
 ) -> None:
     # Each new one, too, is struck as soon as it is there.
-    display = AtTick(signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
-    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    display = Held(config.name, signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
+    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
     assert len(display.struck) == recorder_process.RESTARTS
     assert (result.worked, result.recording, result.rows_lost) == (True, "complete", {})
     serials = Recording(tmp_path / "run").signal("lower.status", "serial")
@@ -308,8 +327,8 @@ def test_recorders_killed_before_their_first_block_cost_no_row(
 def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    display = AtTick(signal.SIGSTOP)
-    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    display = Held(config.name, signal.SIGSTOP)
+    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
@@ -331,8 +350,8 @@ def test_lockstep_waits_for_a_recorder_that_comes_late(
 def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_is_missing(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    display = AtTick(signal.SIGKILL, times=recorder_process.RESTARTS + 1)
-    result = run_rack(config, LONG_S, tmp_path / "run", display)
+    display = Held(config.name, signal.SIGKILL, times=recorder_process.RESTARTS + 1)
+    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
     assert len(display.struck) == recorder_process.RESTARTS + 1
     assert (result.outcome.worked, result.worked) == (True, False)
     recording, ticks = Recording(tmp_path / "run"), result.outcome.ticks
@@ -391,9 +410,9 @@ def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(
     lasts = "" if kind == "masquerade" else ", for = '0.4s'"
     faults = f"fault=[{{ kind = '{kind}', board = 'lower', at = 0.4{lasts} }}]"
     folder = small.parent / "run"
-    result = run_rack(
-        load(small, [f"name={rack_name}", faults]), LONG_S, folder, AtTick(signal.SIGKILL)
-    )
+    config, display = load(small, [f"name={rack_name}", faults]), Held(rack_name, signal.SIGKILL)
+    result = run_rack(config, LONG_S, folder, display, step=True)
+    assert display.struck
     assert result.recording == "complete"
     serials = Recording(folder).signal("lower.status", "serial")
     assert np.all(np.diff(serials) > 0)
