@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -98,7 +98,7 @@ RESTS_ON = Field(
 )
 ANSWER = (
     RESTS_ON,
-    Field("order", "u4", "1", "newest command that an operator gave to this level; 0: none yet"),
+    Field("order", "u4", "1", "command of an operator that this answers, new or not; 0: none yet"),
     Field("answer", "u1", Answer, "this level's answer to it"),
     Field(
         "standing",
@@ -146,11 +146,21 @@ def described(what: int, goal: int) -> str:
     return " ".join(names[: 1 + (goal != Goal.NONE)])
 
 
+class _Told(NamedTuple):
+    """A command and the answer to it."""
+
+    serial: int
+    answer: Answer
+    objection: str = ""
+
+
 class Orders:
     """The operator's commands to one level.
 
     A refused command leaves the one before it in force, even on a restarted board, which processes
-    all commands again, in order.
+    all commands again, in order. Operators may overlap: a setting, or a refused command, takes
+    nothing from the answer to the command in force, which comes later. A status shows one answer;
+    several of a cycle are shown in the cycles that follow, oldest first.
     """
 
     def __init__(self, commands: Commands) -> None:
@@ -160,12 +170,23 @@ class Orders:
         )  # in force: one of `EFFECTS`; NONE: the level does its own work
         self.serial = 0  # of the newest command; 0: none yet
         self.basis = 0  # of the newest command that was not refused; 0: none yet
-        self.answer = Answer.NONE
-        self._objection = ""
-        self._before = 0, Operation.NONE
+        self._in_force = _Told(0, Answer.NONE)  # the newest that was neither refused nor a setting
+        self._before = self.basis, self.standing, self._in_force
+        self._news: list[_Told] = []  # answers that no status has shown
+        self._shown = self._in_force
         self._reported: int | None = (
             None  # newest command rested on, in the last report; None: there is news
         )
+
+    @property
+    def in_force(self) -> int:
+        """Serial of the newest command that was neither refused nor a setting; 0: none yet."""
+        return self._in_force.serial
+
+    @property
+    def answer(self) -> Answer:
+        """The answer to that command."""
+        return self._in_force.answer
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command other than a setting.
@@ -177,20 +198,21 @@ class Orders:
             return False
         taken = False
         for message in (*operator.earlier, operator.value):
+            replaced = self.in_force
             if self._take_up(message):
                 taken = taken or message.what not in (*SETTINGS, *DRIVES)
                 if judge is not None:
                     judge(message)
+            if self.in_force != replaced:
+                self._news = [told for told in self._news if told.serial != replaced]
         return taken
 
     def _take_up(self, message: Message) -> bool:
         # Once only: a clock board restarted while giving a command gives it again.
         if message.id <= self.serial:
             return False
-        self._before = self.basis, self.standing
+        self._before = self.basis, self.standing, self._in_force
         self.serial = message.id
-        self._objection = ""
-        self._reported = None
         what = message.what
         goal = message.goal
         if what not in self._commands or goal not in (
@@ -202,16 +224,18 @@ class Orders:
             )
             return False
         self.basis = self.serial
+        is_done = what in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
+        told = _Told(self.serial, Answer.DONE if is_done else Answer.TAKEN)
         if what not in (*SETTINGS, *DRIVES):
             self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
-        is_done = what in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
-        self.answer = Answer.DONE if is_done else Answer.TAKEN
+            self._in_force = told
+        self._tell(told)
         return True
 
     def refuse(self, why: str) -> None:
         """Refuse the command just accepted: the one before it is in force again."""
-        self.basis, self.standing = self._before
-        self._answer(Answer.REFUSED, why)
+        self.basis, self.standing, self._in_force = self._before
+        self._tell(_Told(self.serial, Answer.REFUSED, why))
 
     def fail(self, why: str) -> None:
         """Abandon the command in force: the level holds instead."""
@@ -223,21 +247,33 @@ class Orders:
         self._answer(Answer.TAKEN)
 
     def done(self) -> None:
-        """Report that the command is done; it remains in force."""
+        """Report that the command in force is done; it remains in force."""
         if self.answer is Answer.TAKEN:
             self._answer(Answer.DONE)
 
+    def drives_done(self, serial: int) -> None:
+        """Report that a command to the arm's drives is done."""
+        self._tell(_Told(serial, Answer.DONE))
+
     def keeps(self, board: str) -> str:
         """Return why an operator keeps level `board` from its own work; empty: none does."""
-        if self.answer is Answer.REFUSED and self.basis == self.serial:
-            return f"{board} held, `resume` releases it: {self._objection}"
+        if self.answer is Answer.REFUSED:
+            return f"{board} held, `resume` releases it: {self._in_force.objection}"
         effect = EFFECTS.get(self.standing)
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
     def _answer(self, answer: Answer, why: str = "") -> None:
-        self.answer = answer
-        self._objection = why
+        self._in_force = _Told(self.in_force, answer, why)
+        self._tell(self._in_force)
+
+    def _tell(self, told: _Told) -> None:
+        """Show an answer in the status, in place of an older one to the same command."""
         self._reported = None
+        for at, waiting in enumerate(self._news):
+            if waiting.serial == told.serial:
+                self._news[at] = told
+                return
+        self._news.append(told)
 
     def rests_on(self, above: int) -> int:
         """Return the newest command that this cycle rests on; `above` is that of the command from
@@ -248,12 +284,21 @@ class Orders:
         """Fill the fields of `ANSWER` when they change."""
         rests_on = max(self.basis, above)
         if rests_on != self._reported:
+            if self._news:
+                self._shown = self._news.pop(0)
             status.operator = rests_on
-            status.order = self.serial
-            status.answer = self.answer
+            status.order = self._shown.serial
+            status.answer = self._shown.answer
             status.standing = self.standing
-            status.objection = self._objection
-            self._reported = rests_on
+            status.objection = self._shown.objection
+            self._reported = None if self._news else rests_on
+
+
+def answered(status: Message) -> int:
+    """Return the newest command that a level had taken up by this status of it, so that a restarted
+    board does not do it twice."""
+    # The answer shown may be a late one, to a command before the newest.
+    return max(int(status.order), int(status.operator))
 
 
 def joints_of(

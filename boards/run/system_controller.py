@@ -152,12 +152,16 @@ class OperatorDesk:
         self._alarms = alarms
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
-        self._segment = segment
         self._boxes = segment.layout.mailboxes
         self._writers = {
             at: open_writer(segment, box.name)
             for at, box in enumerate(self._boxes)
             if box.writer == CLOCK
+        }
+        statuses = {at: f"{self._boxes[at].name.partition('.')[0]}.status" for at in self._writers}
+        there = {box.name for box in self._boxes}
+        self._statuses = {
+            at: open_observer(segment, name) for at, name in statuses.items() if name in there
         }
         self.requested = -1
         self.waiting: list[RequestEntry] = []
@@ -230,8 +234,9 @@ class OperatorDesk:
         newest = self._newest.get(mailbox, 0)
         if newest <= entry[RequestWord.SERIAL]:
             return False
-        level = self._boxes[mailbox].name.partition(".")[0]
-        status = open_observer(self._segment, f"{level}.status").peek()
+        if mailbox not in self._statuses:
+            return True
+        status = self._statuses[mailbox].peek()
         if not status.is_there:
             return False
         accepted = status.value.answer in (Answer.TAKEN, Answer.DONE)

@@ -252,8 +252,8 @@ class ArmDriver(Executor):
         if self._adopted and self._guard is not None and self._guard.exceeded is not None:
             self.stopping.exceeds(*self._guard.exceeded, tick)
         self.feel(tick)
-        if self.enabling.arrived(self.orders.serial):
-            self.orders.done()
+        if serial := self.enabling.arrived():
+            self.orders.drives_done(serial)
         reaction = self._decide(tick)
         if reaction is Reaction.BRAKE:
             self.brake()

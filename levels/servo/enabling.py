@@ -41,8 +41,7 @@ class Enabling:
     def obey(self, command: Message) -> str:
         """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
         arm = self._arm
-        self._serial = command.id
-        self._goal = list(DriveState)
+        goal: Collection[DriveState] = list(DriveState)
         if command.what in (Operation.ENABLE, Operation.DISABLE):
             self._disables = command.what == Operation.DISABLE
         if command.what == Operation.ENABLE and not self.is_enabled:
@@ -50,29 +49,31 @@ class Enabling:
                 return "its board was restarted since; if it still stands, command it again"
             if self._guessed or arm.state is DriveState.FAULT:
                 return self.reason
-            self._goal = (DriveState.ENABLED,)
+            goal = (DriveState.ENABLED,)
             self._leaves = False
             arm.enable()
         elif command.what == Operation.DISABLE:
-            self._goal = (DriveState.DISABLED, DriveState.FAULT)
+            goal = (DriveState.DISABLED, DriveState.FAULT)
         elif command.what == Operation.RESET and arm.state is DriveState.FAULT:
             if not self._restarted:
                 arm.reset()
-            self._goal = set(DriveState) - {DriveState.FAULT}
+            goal = set(DriveState) - {DriveState.FAULT}
+        self._serial = command.id
+        self._goal = goal
         return ""
 
-    def arrived(self, serial: int) -> bool:
-        """Return whether the drives are where the newest command, `serial`, wants them: once."""
+    def arrived(self) -> int:
+        """Return the command, once, that wanted the drives where they are now; 0: none."""
         self._restarted = False
         if self._disables:
             self._disables = False
             self._leaves = True
             self._arm.disable()
         if not self._serial or self._arm.state not in self._goal:
-            return False
-        is_newest = self._serial == serial
+            return 0
+        serial = self._serial
         self._serial = 0
-        return is_newest
+        return serial
 
     @property
     def is_enabled(self) -> bool:

@@ -14,6 +14,7 @@ from rack.levels.operator import (
     Goal,
     Operation,
     Orders,
+    answered,
 )
 from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
@@ -62,7 +63,7 @@ class TaskExecutor(Executor):
         if not self._started:
             self._recall(read, write)
         self._orders.take(
-            read.operator, lambda command: self._judge(command, read.last_status.value.order)
+            read.operator, lambda command: self._judge(command, answered(read.last_status.value))
         )
         plan = self._plan_to_follow(read, write, tick)
         below = read.status.value

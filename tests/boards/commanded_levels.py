@@ -55,7 +55,10 @@ class CountParams(Table):
 
 
 class Lower(Executor):
-    """Counts, unless it is held from above or here; twice as fast while it is set to `twice`."""
+    """Counts, unless it is held from above or here; twice as fast while it is set to `twice`.
+
+    It is home once it counts by nine.
+    """
 
     inputs = {
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
@@ -65,6 +68,7 @@ class Lower(Executor):
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
+        Operation.GOTO: (Goal.HOME,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
         Operation.SET: (),
     }
@@ -81,7 +85,8 @@ class Lower(Executor):
         self.orders.take(read.operator, self._set)
         held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
         write.status.count += 0 if held else self.step * self.given.by
-        self.orders.done()
+        if self.orders.standing is not Operation.GOTO or self.given.by == 9:
+            self.orders.done()
         self.orders.report(write.status, read.command.value.operator)
         write.status.state = State.EXECUTING
 

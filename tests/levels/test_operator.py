@@ -17,6 +17,7 @@ from rack.levels.operator import (
     Goal,
     Operation,
     Orders,
+    answered,
     joints_of,
 )
 from tests.levels.lockstep import Operator
@@ -70,6 +71,7 @@ def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
 ) -> None:
     orders = Orders(TAKES)
     orders.take(said(1, Operation.HOLD))
+    report(orders)
     assert not orders.take(said(2, what, goal))
     shown = report(orders)
     assert (shown.order, shown.answer, shown.standing) == (2, Answer.REFUSED, Operation.HOLD)
@@ -121,6 +123,75 @@ def test_only_a_command_under_way_becomes_done() -> None:
     assert report(orders).answer == Answer.TAKEN
     orders.done()
     assert report(orders).answer == Answer.DONE
+
+
+SETTING = {**TAKES, Operation.SET: (), Operation.ENABLE: ()}
+
+
+def told(orders: Orders) -> tuple[int, Answer, str]:
+    shown = report(orders)
+    return shown.order, Answer(shown.answer), shown.objection
+
+
+def test_a_setting_takes_nothing_from_the_answer_to_the_command_in_force() -> None:
+    orders = Orders(SETTING)
+    orders.take(said(5, Operation.GOTO, Goal.HOME))
+    assert told(orders) == (5, Answer.TAKEN, "")
+    orders.take(said(6, Operation.SET))
+    assert told(orders) == (6, Answer.DONE, "")
+    # Nor does it make the goto a command that is done.
+    assert orders.answer is Answer.TAKEN
+    orders.done()
+    assert told(orders) == (5, Answer.DONE, "")
+
+
+def test_a_goto_that_fails_after_a_setting_fails_under_its_own_serial() -> None:
+    orders = Orders(SETTING)
+    orders.take(said(5, Operation.GOTO, Goal.HOME))
+    orders.take(said(6, Operation.SET))
+    orders.fail("out of reach")
+    # Both in one cycle: shown one after the other, the newest answer to each.
+    assert told(orders) == (5, Answer.REFUSED, "out of reach")
+    assert told(orders) == (6, Answer.DONE, "")
+    assert orders.keeps("task") == "task held, `resume` releases it: out of reach"
+
+
+def test_a_refused_command_leaves_the_one_in_force_its_answer() -> None:
+    orders = Orders(SETTING)
+    orders.take(said(5, Operation.GOTO, Goal.HOME))
+    orders.take(said(6, Operation.GOTO, Goal.JOINTS), lambda message: orders.refuse("too far"))
+    orders.done()
+    assert told(orders) == (5, Answer.DONE, "")
+    assert told(orders) == (6, Answer.REFUSED, "too far")
+
+
+def test_drives_that_arrive_answer_their_own_command() -> None:
+    orders = Orders(SETTING)
+    orders.take(said(5, Operation.HOLD))
+    orders.take(said(6, Operation.ENABLE))
+    assert [told(orders), told(orders)] == [(5, Answer.TAKEN, ""), (6, Answer.TAKEN, "")]
+    orders.done()
+    assert told(orders) == (5, Answer.DONE, "")
+    orders.drives_done(6)
+    assert told(orders) == (6, Answer.DONE, "")
+
+
+def test_a_command_that_another_replaces_in_the_same_cycle_gets_no_answer() -> None:
+    orders = Orders(SETTING)
+    earlier, newest = said(5, Operation.HOLD), said(6, Operation.RESUME)
+    orders.take(Reading(newest.value, Verdict.NEW, earlier=(earlier.value,)))
+    assert told(orders) == (6, Answer.DONE, "")
+
+
+def test_what_was_answered_late_was_still_taken_up_before() -> None:
+    orders = Orders(SETTING)
+    orders.take(said(5, Operation.GOTO, Goal.HOME))
+    orders.take(said(6, Operation.SET))
+    report(orders)
+    report(orders)
+    orders.done()
+    shown = report(orders)
+    assert (shown.order, answered(shown)) == (5, 6)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from rack.boards.config.schema import CommandConfig
 from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
-from rack.levels.operator import EFFECTS, Answer, Operation
+from rack.levels.operator import DRIVES, EFFECTS, SETTINGS, Answer, Operation
 from rack.tools.console.answer import Failure
 from rack.tools.console.held import waits
 from rack.tools.console.tables import table
@@ -155,6 +155,7 @@ class LiveDesk:
             return Reply(0, command.level, text, -1, "waiting", waits=held)
         if (answering := _answering(segment, command.level)) is not None:
             self._rack.follow(answering.name)
+            self._rack.follow(f"{command.level}.operator")
         # However the wait ends, leaving the claim withdraws a request that has not been given.
         with self._rack.claim(wanted) as entry:
             ticket = entry[RequestWord.TICKET]
@@ -172,8 +173,8 @@ class LiveDesk:
         segment = self._segment
         takes_hold = Operation.HOLD in commandable(self._config)[command.level]
         if command.said not in EFFECTS or not takes_hold:
-            kept = [what.name.lower() for what in EFFECTS]
-            why = f"a level that takes no hold, or a command other than {', '.join(kept)}"
+            kept = ", ".join(what.name.lower() for what in EFFECTS)
+            why = f"permitted: {kept}, to levels that take a hold"
             raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
         if held := waits(segment):
             raise Failure(f"--lease: the rack is held: {held}")
@@ -319,15 +320,25 @@ def _answering(segment: Segment, level: str) -> MailboxSpec | None:
 
 
 class Replies:
-    """Follows a level's statuses, message by message, for their reply to one command."""
+    """Follows a level's statuses, message by message, for their reply to one command.
+
+    A newer command replaces it once the level has accepted that one, unless it is a setting, or one
+    to the drives while this one is not.
+    """
 
     def __init__(self, segment: Segment, status: MailboxSpec, reply: Reply) -> None:
         self._ring = MailboxRing(segment, status.name)
+        self._given = MailboxRing(segment, f"{reply.level}.operator")
+        self._kinds: dict[int, int] = {}
+        """What each command given to the level is, by serial."""
         self.reply = reply  # as of the last look
 
     def look(self) -> Reply:
         """Read the statuses written since the last call."""
         rows = self._ring.drain().rows
+        # After the statuses: what they answer was given before.
+        given = self._given.drain().rows["message"]
+        self._kinds.update(zip(given["id"].tolist(), given["what"].tolist(), strict=True))
         orders = rows["message"]["order"]
         answers = rows["message"]["answer"]
         mine = orders == self.reply.serial
@@ -340,9 +351,19 @@ class Replies:
             )
         if self.reply.fate == "taken" and (late := mine & (answers == Answer.REFUSED)).any():
             self._refuse(rows[int(np.argmax(late))])
-        if self.reply.fate in ("given", "taken") and (orders > self.reply.serial).any():
+        newer = (orders > self.reply.serial) & np.isin(answers, (Answer.TAKEN, Answer.DONE))
+        if self.reply.fate in ("given", "taken") and any(
+            self._replaces(serial) for serial in set(orders[newer].tolist())
+        ):
             self.reply = replace(self.reply, fate="superseded")
         return self.reply
+
+    def _replaces(self, serial: int) -> bool:
+        """Return whether a newer command, accepted, takes this one's place."""
+        kind = self._kinds.get(serial)
+        if kind in SETTINGS:
+            return False
+        return kind not in DRIVES or self._kinds.get(self.reply.serial) in DRIVES
 
     def _take_up(self, row: np.void) -> None:
         self.reply = replace(self.reply, fate="taken", taken_up=int(row["tick"]))

@@ -19,7 +19,7 @@ from rack.boards.events import Event
 from rack.boards.lan.awaited import awaited
 from rack.boards.operator import describe
 from rack.levels.messages import Error
-from rack.levels.operator import Answer, Operation
+from rack.levels.operator import Answer, Operation, answered
 
 STILL_S = 5.0
 """Simulated time without motion after which a held rack reports it as an event."""
@@ -123,9 +123,10 @@ class Holds:
             return
         status = seen.value
         if level in self._operated and status.standing:
-            since, what = self._standing(level, status)
+            since, serial, what = self._standing(level, status)
             is_hold = status.standing == Operation.HOLD
-            done = ", done" if status.answer == Answer.DONE and not is_hold else ""
+            is_done = status.answer == Answer.DONE and serial in (status.order, 0)
+            done = ", done" if is_done and not is_hold else ""
             why = f"{'held' if is_hold else 'diverted'} by the operator ({what}{done})"
             yield self._hold(level, since, why, resume_command(self._segment.rack, level))
         elif status.state == State.HOLDING:
@@ -135,24 +136,26 @@ class Holds:
             why = f"holding: {status.reason or 'no reason given'}"
             yield self._hold(level, since, why, release)
 
-    def _standing(self, level: str, status: Message) -> tuple[int, str]:
-        """Return the tick of the command in force, and its text."""
+    def _standing(self, level: str, status: Message) -> tuple[int, int, str]:
+        """Return tick, serial and text of the command in force; serial 0 where its message is
+        gone."""
         rows = MailboxRing(self._segment, f"{level}.operator").drain().rows
-        # A newer command that was refused has left it in force.
-        mine = [
-            row
+        newest = answered(status)
+        mine = {
+            int(row["message"]["id"]): row
             for row in rows
-            if row["message"]["what"] == status.standing and row["message"]["id"] <= status.order
-        ]
+            if row["message"]["what"] == status.standing and row["message"]["id"] <= newest
+        }
+        # A command that was refused has left the one before it in force.
         if status.answer == Answer.REFUSED and len(mine) > 1:
-            mine = [row for row in mine if row["message"]["id"] != status.order]
+            mine.pop(int(status.order), None)
         if not mine:
-            return self._segment.block(level)[Block.LEVEL_SINCE], Operation(
-                status.standing
-            ).name.lower()
+            text = Operation(status.standing).name.lower()
+            return self._segment.block(level)[Block.LEVEL_SINCE], 0, text
+        row = mine.get(int(status.order), mine[max(mine)])
         message = Message(rows["message"].dtype)
-        message.raw[:] = mine[-1]["message"].tobytes()
-        return int(mine[-1]["tick"]), describe(message)
+        message.raw[:] = row["message"].tobytes()
+        return int(row["tick"]), int(message.id), describe(message)
 
     def _hold(self, level: str, since: int, why: str, release: str) -> Hold:
         return Hold(level, since, since * self._segment.layout.clock_ns * 1e-9, why, release)

@@ -27,6 +27,7 @@ from rack.levels.operator import (
     Commands,
     Operation,
     Orders,
+    answered,
 )
 from rack.levels.systems.fields import flag, number
 from rack.levels.systems.state_table.checks import flaws
@@ -306,7 +307,7 @@ class StateTableExecutor(Executor):
         self.state = last.in_state
         table = last.table if last.table in self.tables else self.table_name
         self.use(table)
-        self._recalled = last.order
+        self._recalled = answered(last)
         self._done = last.done
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
@@ -393,7 +394,7 @@ class StateTableExecutor(Executor):
         shown.words = words
         shown.done = self._done
         is_done = self.resting if orders.standing is Operation.HOLD else state is State.DONE
-        if is_operators and serial == orders.serial and state is State.ERROR:
+        if is_operators and serial == orders.in_force and state is State.ERROR:
             orders.fail(reason)
         elif is_done:
             orders.done()

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,6 +86,42 @@ def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
+@contextmanager
+def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A process that waits for the end of its command, whose serial is given, too: until the level
+    counts by nine."""
+    words = Segment.attach(name).words
+    given = words[System.COMMANDED]
+    command = [*RACK, "command", name, "lower", "goto", "home", "--wait", "--json"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            wait_until(lambda: words[System.COMMANDED] > given)
+            yield process, given + 1
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_a_wait_goes_on_while_another_operator_sets_something(running: str) -> None:
+    with waiting(running) as (process, serial):
+        assert rack("set", running, "board.lower.params.by=2").returncode == 0
+        assert rack("command", running, "lower", "modify", "twice", "off").returncode == 0
+        assert process.poll() is None
+        assert rack("set", running, "board.lower.params.by=9").returncode == 0
+        answer = json.loads(process.communicate(timeout=BOUND_S)[0])
+    assert (process.returncode, answer["serial"], answer["fate"]) == (0, serial, "done")
+    assert rack("set", running, "board.lower.params.by=1").returncode == 0
+    assert rack("command", running, "lower", "resume").returncode == 0
+
+
+@pytest.mark.slow
+def test_a_wait_ends_when_another_command_takes_its_place(running: str) -> None:
+    with waiting(running) as (process, serial):
+        assert rack("command", running, "lower", "resume").returncode == 0
+        answer = json.loads(process.communicate(timeout=BOUND_S)[0])
+    assert (answer["serial"], answer["fate"]) == (serial, "superseded")
+
+
 @pytest.mark.slow
 def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     running: str, monkeypatch: pytest.MonkeyPatch
@@ -158,7 +195,7 @@ def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ("upper resume --lease", "--lease: 'upper', resume: a level that takes no hold, or a "),
+        ("upper resume --lease", "--lease: 'upper', resume: permitted: hold, "),
         ("upper hold --lease --wait", "--lease, --wait: a lease stays anyway"),
     ],
 )
@@ -180,7 +217,7 @@ def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
         row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)
     }
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
-    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off, set by"
+    assert rows["lower"]["takes"] == "hold, resume, goto home, modify twice on|off, set by"
 
 
 @pytest.mark.slow
