@@ -24,7 +24,7 @@ from rack.backplane.operator_table import (
     RequestWord,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
+from rack.backplane.words import Block, System
 from rack.boards.config import loads
 from rack.boards.config.commands import asked, live_params, request, takes
 from rack.boards.config.schema import CommandConfig
@@ -39,8 +39,10 @@ from rack.tools.live.holds import resume_command
 from rack.tools.live.watched import WatchedRack
 
 REPLY_CYCLES = 4
-"""Cycles of a level within which it replies: one to read, one to become visible, and two that may
-be missed."""
+"""Cycles that a level does within which it replies: one to read, one to become visible, one for an
+answer to another operator, and one that was under way."""
+NO_CYCLE_S = 1.0
+"""Simulated time without a cycle of a level after which it is not waited for."""
 SILENT_S = 5.0
 """Time without a tick after which a wait is given up."""
 NOTE_S = 1.5
@@ -238,7 +240,7 @@ class LiveDesk:
         if status is None:
             return reply
         replies = Replies(self._segment, status, reply)
-        last = reply.given + REPLY_CYCLES * status.every
+        last = LastCycle(self._segment, status)
         about = f"command {reply.serial}: "
         patience = _Patience(
             self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks"
@@ -246,16 +248,14 @@ class LiveDesk:
         while True:
             # Before the look: a reply written just before the run ended still counts.
             in_vain = patience.is_in_vain
-            tick = self._segment.words[System.TICK]
+            late = last.passed(self._segment.words[System.TICK])
             reply = replies.look()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
                 return reply
             if in_vain:
                 raise Failure(f"{reply.line}; the run ended")
-            if reply.fate == "given" and tick > last:
-                raise Failure(
-                    f"{about}'{reply.level}' has not answered in {REPLY_CYCLES} of its cycles"
-                )
+            if reply.fate == "given" and late:
+                raise Failure(f"{about}'{reply.level}' {late}")
             if time.monotonic() > deadline:
                 still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
                 raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
@@ -373,6 +373,31 @@ class Replies:
     def _refuse(self, row: np.void) -> None:
         objection = row["message"]["objection"].decode("ascii", "replace")
         self.reply = replace(self.reply, fate="refused", objection=objection)
+
+
+class LastCycle:
+    """Knows when a level should have answered: by the cycles that it did, not by ticks, of which a
+    level on a busy machine skips some."""
+
+    def __init__(self, segment: Segment, status: MailboxSpec) -> None:
+        self._block = segment.block(status.writer)
+        self._bound = self._block[Block.CYCLES] + REPLY_CYCLES
+        self._cycles = -1
+        self._since = 0
+        shortest = round(NO_CYCLE_S * 1e9 / segment.layout.clock_ns)
+        self._silent = max(REPLY_CYCLES * status.every, shortest)
+
+    def passed(self, tick: int) -> str:
+        """Return why no answer will come, as of `tick`; empty: it may still come."""
+        cycles = self._block[Block.CYCLES]
+        if cycles != self._cycles:
+            self._cycles = cycles
+            self._since = tick
+        if cycles > self._bound:
+            return f"has not answered in {REPLY_CYCLES} of its cycles"
+        if tick - self._since > self._silent:
+            return f"has not answered, and done no cycle since tick {self._since}"
+        return ""
 
 
 class _Patience:
