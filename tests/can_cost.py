@@ -1,4 +1,5 @@
-"""Measures what the bus of the example `can-arm` costs in a cycle: `python -m tests.can_cost`.
+"""Measures what the bus of the example `can-arm` costs in a cycle: `python -m tests.can_cost`,
+with --json for `rack claims`.
 
 Its arm, held by torques, is exchanged with at 500 Hz; each drive is a process.
 """
@@ -19,6 +20,7 @@ from rack.boards.config import load
 from rack.levels.arm import DriveState
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.tools.console.answer import print_json
 from tests.processes import own_can_channel
 
 EXAMPLE = Path(__file__).parent.parent / "configs" / "examples" / "can-arm"
@@ -73,9 +75,12 @@ def main() -> None:
     taken_s = monotonic() - start_s
     share = np.mean([processor_ns(d.pid or 0) - n for d, n in zip(drives, used_ns, strict=True)])
     median, high = 1e3 * np.percentile(costs, (50, 99))
-    print(f"a cycle: {median:.3f} ms (median), {high:.3f} ms (99th percentile)")
-    print(f"age of samples, ticks: {dict(sorted(ages.items()))}")
-    print(f"a drive: {share * 1e-9 / taken_s:.2f} of a core")
+    if "--json" in sys.argv:
+        print_json({"exchange_ms": {"p50": median, "p99": high}})
+    else:
+        print(f"a cycle: {median:.3f} ms (median), {high:.3f} ms (99th percentile)")
+        print(f"age of samples, ticks: {dict(sorted(ages.items()))}")
+        print(f"a drive: {share * 1e-9 / taken_s:.2f} of a core")
     arm._bus.shutdown()
 
 
