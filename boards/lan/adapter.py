@@ -26,6 +26,7 @@ from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.desk import Desk, Permit
 from rack.boards.lan.entries import Export, Import
+from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
 from rack.boards.lan.lockstep import Barrier
@@ -128,10 +129,12 @@ class LanAdapter(Adapter):
         link.sealer.resume(self._flaws)
         barrier = self._barrier
         carrier: Carrier = barrier or link
+        # A step has one seal for all that is in it.
+        sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
         for entry in self._imports.values():
-            entry.open(carrier, link.sealer, self._grid)
+            entry.open(carrier, sealer, self._grid)
         for export in self._exports.values():
-            export.open(carrier, link.sealer, self._grid)
+            export.open(carrier, sealer, self._grid)
         self._clocks.open(link, link.sealer)
         self._desk.open(link, self._launch)
         if barrier is not None:

@@ -92,10 +92,13 @@ class LanTable(Table):
     certificates: str | None = Field(
         None,
         description=(
-            "folder with this rack's certificate, key and secret; see rack lan certificates --help"
+            "folder with this rack's certificate and key; see rack lan certificates --help"
         ),
     )
-    insecure: bool = Field(False, description="permit endpoints beyond loopback without TLS")
+    insecure: bool = Field(
+        False,
+        description="permit endpoints without TLS beyond loopback, or without certificates on it",
+    )
     lease_ms: float = Field(
         500.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms"
     )

@@ -1,10 +1,11 @@
-"""The credentials of a rack on the network: a folder with the authority, its own certificate and
-key, and the secret.
+"""The credentials of a rack on the network: a folder with the authority, and with its own
+certificate and key.
 
-authority.pem    certificates of the authority that signs every rack of this network RACK.pem
-certificate of this rack: its common name is the rack's name, its alternative names are addresses
-RACK-key.pem     private key of that certificate, for its owner's eyes only secret           32
-bytes, or 64 hexadecimal digits: the key of the seals, the same on every machine of this network
+authority.pem    certificates of the authority that signs every rack of this network
+RACK.pem         certificate of this rack, and those that lead from it to the authority: its common
+                 name is the rack's name, its alternative names are addresses
+RACK-key.pem     private key of that certificate, for its owner's eyes only: it proves the rack to
+                 those who connect, and seals what it sends
 """
 
 from __future__ import annotations
@@ -12,19 +13,25 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
 if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ec import (
+        ECDSA,
+        EllipticCurvePrivateKey,
+        EllipticCurvePublicKey,
+    )
     from cryptography.x509 import Certificate
 
-SECRET_BYTES = 32
 AUTHORITY = "authority.pem"
-SECRET = "secret"
 MAX_CREDENTIAL_BYTES = 100_000
+MOST_CHAIN = 8192
+"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
+MOST_KNOWN = 1024
+"""Certificates of others that are remembered."""
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
 
@@ -38,29 +45,74 @@ class Credential(Exception):
         self.why = why
 
 
+class KeyPair(NamedTuple):
+    """A rack's certificates, as they travel with its seals, and its key."""
+
+    chain: bytes
+    key: EllipticCurvePrivateKey
+
+    def sign(self, digest: bytes) -> bytes:
+        """Return the signature of 32 bytes."""
+        return self.key.sign(digest, _algorithm())
+
+
+class Identity(NamedTuple):
+    """Whom certificates name, with the key that checks its signatures."""
+
+    name: str
+    key: EllipticCurvePublicKey
+    expires: datetime
+
+    def has_signed(self, digest: bytes, signature: bytes) -> bool:
+        """Say whether it has made a signature of 32 bytes."""
+        from cryptography.exceptions import InvalidSignature
+
+        try:
+            self.key.verify(signature, digest, _algorithm())
+        except InvalidSignature:
+            return False
+        return True
+
+
 class Credentials:
     """The files of one rack in a folder."""
 
     def __init__(self, folder: Path, rack: str) -> None:
         self.rack = rack
         self.authority = folder / AUTHORITY
-        self.secret_file = folder / SECRET
         self.certificate = folder / f"{rack}.pem"
         self.key = folder / f"{rack}-key.pem"
+        self._known: dict[bytes, Identity] = {}
 
     @cached_property
-    def secret(self) -> bytes:
-        """The key of the seals. Raises `Credential`."""
-        content = _content(self.secret_file, is_private=True)
-        if len(content) == SECRET_BYTES:
-            return content
-        with suppress(ValueError):
-            if len(found := bytes.fromhex(content.decode("ascii").strip())) == SECRET_BYTES:
-                return found
-        raise Credential(
-            self.secret_file,
-            f"no secret; permitted: {SECRET_BYTES} bytes, or {2 * SECRET_BYTES} digits",
-        )
+    def pair(self) -> KeyPair:
+        """What it seals with. Raises `Credential`."""
+        chain = _certificates(self.certificate)
+        from cryptography.hazmat.primitives.serialization import Encoding
+
+        content = b"".join(one.public_bytes(Encoding.DER) for one in chain)
+        if len(content) > MOST_CHAIN:
+            raise Credential(self.certificate, f"{len(content)} bytes; permitted: {MOST_CHAIN}")
+        key = _private_key(self.key)
+        if key.public_key() != chain[0].public_key():
+            raise Credential(self.key, f"not the key of {self.certificate.name}")
+        return KeyPair(content, key)
+
+    def identity(self, chain: bytes) -> Identity | None:
+        """Return whom certificates name that came with a seal; None: nobody whom the authority has
+        signed, or not any more. Raises `Credential`: the authority cannot be read."""
+        found = self._known.get(chain)
+        if found is None:
+            if (found := _identified(chain, self._authorities)) is None:
+                return None
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            self._known[chain] = found
+        return found if datetime.now(UTC) < found.expires else None
+
+    @cached_property
+    def _authorities(self) -> list[Certificate]:
+        return _certificates(self.authority)
 
     @property
     def expires(self) -> datetime:
@@ -84,13 +136,10 @@ class Credentials:
         if chain:
             yield from self._flaws_of(chain, found[self.authority], addresses)
         try:
-            key = _public_part(self.key)
-            if chain and key != chain[0].public_key():
-                yield Credential(self.key, f"not the key of {self.certificate.name}")
-        except Credential as flaw:
-            yield flaw
-        try:
-            _ = self.secret
+            if chain:
+                _ = self.pair
+            else:
+                _private_key(self.key)
         except Credential as flaw:
             yield flaw
 
@@ -99,7 +148,7 @@ class Credentials:
     ) -> Iterator[Credential]:
         if (name := _common_name(chain[0])) != self.rack:
             yield Credential(self.certificate, f"for '{name}', not for rack '{self.rack}'")
-        if authorities and not _is_issued(chain, authorities):
+        if authorities and not _path(chain, authorities):
             yield Credential(self.certificate, f"not signed by {self.authority.name}")
         if lost := [
             address for address in addresses if address not in (known := _addresses(chain[0]))
@@ -133,14 +182,14 @@ def _certificates(path: Path) -> list[Certificate]:
     content = _content(path)
     # Here: a rack without TLS does without this package.
     try:
-        from cryptography.x509 import load_pem_x509_certificates
+        from cryptography.x509 import InvalidVersion, load_pem_x509_certificates
     except ImportError:
         raise Credential(
             path, "cannot be checked without 'cryptography': install nasrem-rack[lan]"
         ) from None
     try:
         found = load_pem_x509_certificates(content)
-    except ValueError:
+    except (ValueError, InvalidVersion):
         raise Credential(path, "no certificate in PEM form") from None
     now = datetime.now(UTC)
     for certificate in found:
@@ -155,17 +204,59 @@ def _certificates(path: Path) -> list[Certificate]:
     return found
 
 
-def _public_part(path: Path) -> object:
+def _private_key(path: Path) -> EllipticCurvePrivateKey:
     content = _content(path, is_private=True)
     from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     try:
-        return load_pem_private_key(content, None).public_key()
+        key = load_pem_private_key(content, None)
     except TypeError:
         raise Credential(path, "encrypted; permitted: a key without a password") from None
     except (ValueError, UnsupportedAlgorithm):
         raise Credential(path, "no private key in PEM form") from None
+    if not isinstance(key, EllipticCurvePrivateKey) or not _is_p256(key.public_key()):
+        raise Credential(path, "of another kind; permitted: a key on the curve P-256")
+    return key
+
+
+def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
+    """Say whether a key is on the curve whose signatures are short and quick to check."""
+    from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePublicKey
+
+    return isinstance(key, EllipticCurvePublicKey) and isinstance(key.curve, SECP256R1)
+
+
+@cache
+def _algorithm() -> ECDSA:
+    from cryptography.hazmat.primitives.asymmetric.ec import ECDSA
+    from cryptography.hazmat.primitives.asymmetric.utils import Prehashed
+    from cryptography.hazmat.primitives.hashes import SHA256
+
+    return ECDSA(Prehashed(SHA256()))
+
+
+def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None:
+    """Return whom certificates in DER form name; None: they do not lead to an authority."""
+    from cryptography.x509 import load_der_x509_certificate
+
+    found = []
+    try:
+        while chain:
+            # Each says its length itself, in two bytes after the first two.
+            size = 4 + int.from_bytes(chain[2:4], "big")
+            found.append(load_der_x509_certificate(chain[:size]))
+            chain = chain[size:]
+        path = _path(found, authorities)
+        name = _common_name(found[0])
+        key = found[0].public_key()
+    except Exception:
+        # A stranger's bytes, and what they raise is not all documented: some are no `ValueError`.
+        return None
+    if not path or not _is_p256(key):
+        return None
+    return Identity(name, key, min(one.not_valid_after_utc for one in path))
 
 
 def _common_name(certificate: Certificate) -> str:
@@ -185,22 +276,24 @@ def _addresses(certificate: Certificate) -> list[str]:
     return [*map(str, found.get_values_for_type(IPAddress)), *found.get_values_for_type(DNSName)]
 
 
-def _is_issued(chain: list[Certificate], authorities: list[Certificate]) -> bool:
-    """Say whether each certificate of a chain is signed by the next, and one of them by an
-    authority."""
-    for at, certificate in enumerate(chain):
-        if any(_issued(certificate, authority) for authority in authorities):
-            return True
-        if at + 1 == len(chain) or not _issued(certificate, chain[at + 1]):
-            return False
-    return False
+def _path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
+    """Return the certificates from the first of a chain to an authority; empty: it does not lead
+    there, as where the certificate of a rack has signed another one."""
+    from cryptography.x509 import BasicConstraints
+    from cryptography.x509.verification import (
+        Criticality,
+        ExtensionPolicy,
+        PolicyBuilder,
+        Store,
+        VerificationError,
+    )
 
-
-def _issued(certificate: Certificate, issuer: Certificate) -> bool:
-    from cryptography.exceptions import InvalidSignature
-
+    # As TLS does: of an authority that it says to be one, of a rack or person no more than that.
+    any_kind = ExtensionPolicy.permit_all()
+    authority = any_kind.require_present(BasicConstraints, Criticality.AGNOSTIC, None)
+    policy = PolicyBuilder().store(Store(authorities))
+    policy = policy.extension_policies(ca_policy=authority, ee_policy=any_kind)
     try:
-        certificate.verify_directly_issued_by(issuer)
-    except (InvalidSignature, ValueError, TypeError):
-        return False
-    return True
+        return policy.build_client_verifier().verify(chain[0], chain[1:]).chain
+    except VerificationError:
+        return []

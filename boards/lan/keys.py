@@ -23,6 +23,16 @@ ALL_ALIVE = "rack/*/alive/*"
 _ALIVE = re.compile(r"rack/[^/]+/alive/([0-9a-f]{16})(?:-([0-9]{1,18}))?")
 ASKED: Mapping[Right, str] = {"watch": "read", "command": "command", "stop": "stop"}
 """What those may ask who have a right, as in its key."""
+_SENDER = re.compile(r"rack/([^/]+)/(?:ask/[^/]+/([^/]+)/[^/]+\Z)?")
+
+
+def sender_of(key: str) -> str:
+    """Return in whose name something comes under a key expression: the rack's, but for a question;
+    empty: nobody's."""
+    if (found := _SENDER.match(key)) is None:
+        return ""
+    rack, asker = found.groups()
+    return asker or rack
 
 
 def out_key(rack: str, mailbox: str) -> str:

@@ -25,7 +25,7 @@ from rack.boards.lan.access import access_control
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.credentials import OTHERS, Credential, Credentials
 from rack.boards.lan.endpoint import Endpoint
-from rack.boards.lan.envelope import HEAD_BYTES, Sealer
+from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
 
@@ -86,7 +86,7 @@ class Question(NamedTuple):
 class LanLink:
     """One open session of `rack`, or of a tool that `asks` racks and is known by that name.
 
-    Raises `LevelError` if an endpoint cannot be opened, or the secret cannot be read.
+    Raises `LevelError` if an endpoint cannot be opened, or the credentials cannot be used.
     """
 
     def __init__(self, rack: str, table: LanTable, asks: bool = False) -> None:
@@ -96,7 +96,7 @@ class LanLink:
         )
         try:
             most = MOST_ANSWER if asks else table.most_bytes
-            self.sealer = Sealer(credentials.secret if credentials else b"", most)
+            self.sealer = Sealer(credentials, most)
             """Seals and opens what this rack sends and receives."""
             self.session = zenoh.open(_settings(rack, table, credentials, asks))
         except zenoh.ZError as error:
@@ -238,7 +238,7 @@ def _settings(
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/link/rx/max_message_size": (
-            max(table.most_bytes, MOST_ANSWER) + HEAD_BYTES + ZENOH_BYTES
+            max(table.most_bytes, MOST_ANSWER) + MOST_ENVELOPE + ZENOH_BYTES
         ),
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,

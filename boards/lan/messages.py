@@ -54,7 +54,7 @@ FLAWS = MessageType(
     1,
     _counts(
         malformed="not of this protocol, or of another version of it; in lockstep always 0",
-        unsigned="changed on the way, under another key, or sealed with another secret; likewise",
+        unsigned="changed on the way, under another key, or not sealed by whom it names; likewise",
         oversized="longer than most_bytes; likewise",
     ),
 )

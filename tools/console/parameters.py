@@ -93,7 +93,7 @@ Certificates = Annotated[
     typer.Option(
         metavar="DIR",
         envvar=CERTIFICATES,
-        help="for HOST/RACK: folder with certificates and secret; see rack lan certificates --help",
+        help="for HOST/RACK: folder with certificates; see rack lan certificates --help",
     ),
 ]
 AskAs = Annotated[

@@ -1,14 +1,12 @@
-"""Making of credentials: an authority, a certificate and key for each rack, and the secret of the
-seals.
+"""Making of credentials: an authority, and a certificate and key for each rack.
 
-The keys are on the curve P-256, which every TLS library knows. A certificate serves both sides of a
-connection: racks listen and connect.
+The keys are on the curve P-256, which every TLS library knows, and which the seals need. A
+certificate serves both sides of a connection: racks listen and connect.
 """
 
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -27,7 +25,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rack.boards.lan.credentials import AUTHORITY, OWNER_ONLY, SECRET, SECRET_BYTES, Credentials
+from rack.boards.lan.credentials import AUTHORITY, OWNER_ONLY, Credentials
 from rack.tools.console.answer import Failure
 
 AUTHORITY_KEY = "authority-key.pem"
@@ -50,8 +48,8 @@ class _Authority(NamedTuple):
 
 
 def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int) -> Made:
-    """Write a certificate and key for each name with its addresses; a new authority and secret, if
-    there are none.
+    """Write a certificate and key for each name with its addresses; a new authority, if there
+    is none.
 
     Raises `Failure`: a file is there already, the set there is not whole, or its authority has
     expired.
@@ -61,14 +59,12 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     pairs = [path for own in wanted for path in (own.certificate, own.key)]
     if taken := [path.name for path in pairs if os.path.lexists(path)]:
         raise Failure(f"{folder}: {', '.join(taken)} exist already; nothing is overwritten", 2)
-    shared = (AUTHORITY, AUTHORITY_KEY, SECRET)
+    shared = (AUTHORITY, AUTHORITY_KEY)
     there = [name for name in shared if os.path.lexists(folder / name)]
     if there and len(there) < len(shared):
         lost = ", ".join(name for name in shared if name not in there)
         raise Failure(
-            f"{folder}: {lost} missing; a set is added to where its authority, with its key, and"
-            " secret are",
-            2,
+            f"{folder}: {lost} missing; a set is added to where its authority and its key are", 2
         )
     files: dict[str, bytes] = {}
     expires = now + timedelta(days=days)
@@ -77,7 +73,6 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     else:
         authority = _made(now, expires)
         files |= {AUTHORITY: _pem(authority.certificate), AUTHORITY_KEY: _key_pem(authority.key)}
-        files[SECRET] = secrets.token_bytes(SECRET_BYTES)
     expires = min(expires, authority.certificate.not_valid_after_utc)
     for name, addresses in names.items():
         key = ec.generate_private_key(ec.SECP256R1())

@@ -37,23 +37,23 @@ def lan() -> None:
 
 @app.command()
 def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = False) -> None:
-    """Make a set of certificates for tests: an authority, a pair for each name, and a secret.
+    """Make a set of certificates for tests: an authority, and a pair for each name.
 
     Racks know each other by name: the common name of a certificate is the name of the rack, and
     what a rack may send, read or command depends on it. Give a rack that listens the addresses or
     host names that stand in the others' `connect`: they check them. One that only connects, or a
     person who uses `rack status HOST/RACK` and the like, needs none.
 
-    In DIR it writes authority.pem and authority-key.pem, NAME.pem and NAME-key.pem for each name,
-    and secret, the key of the seals on all messages. In a folder that holds a set already, it adds
-    names to it. It never overwrites.
+    In DIR it writes authority.pem and authority-key.pem, and NAME.pem and NAME-key.pem for each
+    name. NAME's key seals all its messages, and nobody else can. In a folder that holds a set
+    already, it adds names to it. It never overwrites.
 
     A config names the folder in [adapter.lan]: certificates = "DIR", relative to the config. Each
-    machine needs only authority.pem, secret, and its own pair. Keys and secret must be readable by
-    their owner alone.
+    machine needs only authority.pem and its own pair. Keys must be readable by their owner alone.
 
     It is a set for tests: one folder holds the keys of all. Where it matters, have your own
-    authority sign certificates with the same names, from keys that never leave their machines.
+    authority sign certificates with the same names, from keys on the curve P-256 that never leave
+    their machines.
 
     Exit status: 0 made, 2 nothing was made.
 
@@ -82,8 +82,8 @@ def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = 
         f"valid until {made.expires:%Y-%m-%d}",
         "A set for tests: whoever has this folder can pass for any of these racks.",
         (
-            f"Each machine needs only authority.pem, secret, and its own pair, as in {first}.pem"
-            f" and {first}-key.pem."
+            f"Each machine needs only authority.pem and its own pair, as in {first}.pem and"
+            f" {first}-key.pem."
         ),
     ]
     print_answer(answer, lines, as_json)

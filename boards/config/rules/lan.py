@@ -198,7 +198,10 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
     known = [name for name, rights in table.permit.items() if rights]
     if known and (at := _open(table)):
-        why = f"whoever reaches {at[0]} could pass for any of them; permitted: tls/ or quic/ with"
+        could = "pass for any of them"
+        if table.certificates is not None:
+            could = "repeat what one of them has asked"
+        why = f"whoever reaches {at[0]} could {could}; permitted: tls/ or quic/ with"
         yield Mistake(
             f"{PLACE}.permit",
             ", ".join(known),
@@ -236,10 +239,17 @@ def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
             "without TLS, which others have: who comes here is not known; permitted: all with TLS,"
             " or none"
         )
-    if not (endpoint.has_tls or endpoint.is_private or endpoint.is_loopback or table.insecure):
+    if endpoint.has_tls or endpoint.is_private or table.insecure:
+        return ""
+    if not endpoint.is_loopback:
         return (
             "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an"
             f" address of loopback, or by name, {PLACE}.insecure = true"
+        )
+    if table.certificates is None:
+        return (
+            "every user of this machine could pass for any rack here; permitted: unix/ and a name,"
+            f" certificates, which seal what is sent, or by name, {PLACE}.insecure = true"
         )
     return ""
 
@@ -265,12 +275,10 @@ def network_notes(config: RackConfig) -> list[str]:
     if table is None:
         return []
     far = _open(table)
-    may = "read and forge" if table.certificates is None else "read"
-    notes = (
-        [f"without TLS: whoever reaches {', '.join(far)} may {may} what is exchanged"]
-        if far
-        else []
-    )
+    may = "read and forge what is exchanged"
+    if table.certificates is not None:
+        may = "read what is exchanged, and feign that racks come and go"
+    notes = [f"without TLS: whoever reaches {', '.join(far)} may {may}"] if far else []
     if table.certificates is not None and table.has_tls:
         expires = Credentials(Path(table.certificates), config.name).expires
         if expires - datetime.now(UTC) < SOON:

@@ -61,12 +61,17 @@ def rack_text(
     *,
     peers: Iterable[str] = (),
     lan: str = "",
+    insecure: bool | None = None,
 ) -> str:
     """Return the config of a rack that exports its pulse, and adds up that of rack `other`, if one
     is named.
 
-    `lan`: further lines of its `[adapter.lan]`.
+    `lan`: further lines of its `[adapter.lan]`. `insecure`: by default where an endpoint needs it.
     """
+    if insecure is None:
+        insecure = any(end.startswith("tcp/") for end in (listen, *connect))
+    if insecure:
+        lan = f"insecure = true\n{lan}"
     imported = f"""
 [adapter.lan.import.other]
 from = "{other}/pulse.status"

@@ -13,10 +13,12 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.keys import ALL_ALIVE
 from tests.boards.lan.home import HEAD, serve
@@ -26,8 +28,8 @@ ASKED_EVERY = 5
 
 
 class Stranger:
-    """One session. `table`: settings, secret, puts (key, bytes, key sealed for), asks, keys to
-    listen to, token."""
+    """One session. `table`: settings, the folder and name of its seals, puts (key, bytes, key
+    sealed for), asks, keys to listen to, token."""
 
     def __init__(self, table: dict[str, Any]) -> None:
         config = zenoh.Config()
@@ -53,7 +55,8 @@ class Stranger:
         }.items():
             config.insert_json5(key, json.dumps(value))
         self._session = session = zenoh.open(config)
-        sealer = Sealer(bytes.fromhex(table.get("secret", "")))
+        folder, name = table.get("seals", ("", ""))
+        sealer = Sealer(Credentials(Path(folder), name)) if folder else Sealer()
         self._puts = []
         for key, size, sealed_for in table.get("puts", []):
             payload = bytes(size)

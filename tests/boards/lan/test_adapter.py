@@ -180,7 +180,7 @@ def test_in_real_time_the_status_counts_what_the_seals_refused(make: MakeAdapter
     class Link:
         """The link's end that counts."""
 
-        sealer = Sealer(b"secret")
+        sealer = Sealer()
 
     Link.sealer.resume([3] * len(Flaw))
     out = Message(status_of(adapter._table.exports, adapter._table.imports).dtype({}))

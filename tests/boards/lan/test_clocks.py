@@ -42,11 +42,13 @@ from rack.boards.lan.clocks import (
     Responder,
     RoundTrip,
 )
+from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import Arrived
 from rack.boards.lan.peers import PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
+from rack.tools.network.certificates import make_credentials
 from rack.tools.viewer.window import free_port
 from tests.boards.lan.clock_machine import CLOCK_NS, PERIOD_NS, Found
 
@@ -255,7 +257,7 @@ def ping(asker: str, sealer: Sealer, to: str) -> Arrived:
 
 
 def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
-    responder, network, sealer = Responder(segment, 1), Answers(), Sealer(b"secret")
+    responder, network, sealer = Responder(segment, 1), Answers(), Sealer()
     responder.open(network, sealer)  # type: ignore[arg-type]
     began = time.monotonic_ns()
     for _ in range(1000):
@@ -270,12 +272,20 @@ def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
     assert f"rack/{segment.rack}/pong/rack-0" in network.sent
 
 
-def test_a_ping_without_the_secret_gets_no_answer(segment: Segment) -> None:
+def test_a_ping_with_a_seal_of_another_rack_gets_no_answer(
+    segment: Segment, tmp_path: Path
+) -> None:
+    make_credentials(tmp_path, {segment.rack: [], "asker": [], "stranger": []}, 1)
+    own, asker, stranger = (
+        Sealer(Credentials(tmp_path, name)) for name in (segment.rack, "asker", "stranger")
+    )
     responder, network = Responder(segment, 1), Answers()
-    responder.open(network, Sealer(b"secret"))  # type: ignore[arg-type]
-    responder._on_ping(ping("stranger", Sealer(b"guessed"), segment.rack))
+    responder.open(network, own)  # type: ignore[arg-type]
+    responder._on_ping(ping("asker", stranger, segment.rack))
     assert network.sent == []
     assert (responder.answered, responder.refused) == (0, 1)
+    responder._on_ping(ping("asker", asker, segment.rack))
+    assert (responder.answered, responder.refused) == (1, 1)
 
 
 @contextmanager
@@ -418,7 +428,7 @@ class Wire:
         self.sent: list[Arrived] = []
         self.peers = Peers(["b"])
         self.clocks = Clocks(segment, self.peers, LAUNCH, OwnGrid(segment, 1))
-        self.sealer = Sealer(b"secret")
+        self.sealer = Sealer()
         self.clocks.open(self, self.sealer)  # type: ignore[arg-type]
         self.peers["b"].comes(OTHER, 0)
 

@@ -11,10 +11,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from rack.boards.lan.credentials import Credentials
+from rack.tools.network import certificates
 from rack.tools.network.certificates import make_credentials
 
+DAY = timedelta(days=1)
 NAMES = {"cell": ["10.0.0.1", "cell.local"], "puma": []}
 
 
@@ -41,13 +44,12 @@ def flaws(folder: Path, rack: str = "cell", *addresses: str) -> list[str]:
 
 def test_a_set_as_made_has_no_flaws(made: Path) -> None:
     assert flaws(made, "cell", "10.0.0.1", "cell.local") == flaws(made, "puma") == []
-    assert len(Credentials(made, "cell").secret) == 32
 
 
 def test_every_missing_file_is_named(tmp_path: Path) -> None:
     why = "missing; see rack lan certificates --help"
     assert flaws(tmp_path) == [
-        f"{name}: {why}" for name in ("authority.pem", "cell.pem", "cell-key.pem", "secret")
+        f"{name}: {why}" for name in ("authority.pem", "cell.pem", "cell-key.pem")
     ]
 
 
@@ -57,11 +59,10 @@ def test_a_file_that_cannot_be_read_is_named(folder: Path) -> None:
     assert flaws(folder) == ["cell.pem: cannot be read: Is a directory"]
 
 
-@pytest.mark.parametrize("name", ["cell-key.pem", "secret"])
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
-def test_what_others_may_read_is_refused(folder: Path, name: str, mode: int) -> None:
-    (folder / name).chmod(mode)
-    assert flaws(folder) == [f"{name}: others may read it, mode {mode:04o}; permitted: 0600"]
+def test_what_others_may_read_is_refused(folder: Path, mode: int) -> None:
+    (folder / "cell-key.pem").chmod(mode)
+    assert flaws(folder) == [f"cell-key.pem: others may read it, mode {mode:04o}; permitted: 0600"]
 
 
 def test_a_certificate_is_for_one_rack(folder: Path) -> None:
@@ -105,52 +106,32 @@ def test_what_is_not_pem_is_refused(folder: Path, name: str, content: bytes) -> 
     assert f"{name}: no {kind} in PEM form" in flaws(folder)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"short", bytes(31), bytes(33), b"ab" * 31, b"xy" * 32, b"\xff" * 64]
-)
-def test_a_secret_has_32_bytes(folder: Path, content: bytes) -> None:
-    (folder / "secret").write_bytes(content)
-    assert flaws(folder) == ["secret: no secret; permitted: 32 bytes, or 64 digits"]
-
-
-def test_a_secret_may_be_hexadecimal(folder: Path) -> None:
-    secret = Credentials(folder, "cell").secret
-    (folder / "secret").write_text(secret.hex() + "\n")
+def test_a_secret_of_earlier_versions_is_not_needed_and_in_nobodys_way(folder: Path) -> None:
+    (folder / "secret").write_bytes(bytes(32))
     assert flaws(folder) == []
-    assert Credentials(folder, "cell").secret == secret
 
 
-def signed(folder: Path, begins: timedelta, ends: timedelta, chain: bool = False) -> Iterator[str]:
-    """Put a certificate with other dates, or of an authority below the set's, in place of the
-    rack's."""
-    old = x509.load_pem_x509_certificate((folder / "cell.pem").read_bytes())
+def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
+    for key in (ec.generate_private_key(ec.SECP384R1()), Ed25519PrivateKey.generate()):
+        form = serialization.PrivateFormat.PKCS8
+        none = serialization.NoEncryption()
+        path = folder / "cell-key.pem"
+        path.write_bytes(key.private_bytes(serialization.Encoding.PEM, form, none))
+        assert flaws(folder) == [
+            "cell-key.pem: of another kind; permitted: a key on the curve P-256"
+        ]
+
+
+def signed(folder: Path, begins: timedelta, ends: timedelta) -> Iterator[str]:
+    """Put a certificate with other dates in place of the rack's."""
     issuer = x509.load_pem_x509_certificate((folder / "authority.pem").read_bytes())
     key = serialization.load_pem_private_key((folder / "authority-key.pem").read_bytes(), None)
     assert isinstance(key, ec.EllipticCurvePrivateKey)
-    now, below = datetime.now(UTC), []
-    if chain:
-        own = ec.generate_private_key(ec.SECP256R1())
-        name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "below")])
-        builder = (
-            x509.CertificateBuilder()
-            .subject_name(name)
-            .issuer_name(issuer.subject)
-            .public_key(own.public_key())
-        )
-        dated = (
-            builder.serial_number(1).not_valid_before(now).not_valid_after(now + timedelta(days=1))
-        )
-        issuer, key = dated.sign(key, hashes.SHA256()), own
-        below = [issuer]
-    builder = x509.CertificateBuilder().subject_name(old.subject).issuer_name(issuer.subject)
-    builder = builder.public_key(old.public_key()).serial_number(2)
-    new = (
-        builder.not_valid_before(now + begins)
-        .not_valid_after(now + ends)
-        .sign(key, hashes.SHA256())
-    )
-    pem = b"".join(one.public_bytes(serialization.Encoding.PEM) for one in (new, *below))
-    (folder / "cell.pem").write_bytes(pem)
+    now = datetime.now(UTC)
+    own = Credentials(folder, "cell").pair.key
+    authority = certificates._Authority(issuer, key)
+    new = certificates._for_rack("cell", [], own, authority, now + begins, now + ends)
+    (folder / "cell.pem").write_bytes(certificates._pem(new))
     yield from flaws(folder)
 
 
@@ -164,5 +145,41 @@ def test_a_certificate_not_valid_yet_is_refused(folder: Path) -> None:
     assert flaw.startswith("cell.pem: not valid before 20")
 
 
-def test_an_authority_may_sign_through_another(folder: Path) -> None:
-    assert list(signed(folder, timedelta(), timedelta(days=1), chain=True)) == []
+def step(
+    name: str, issuer: tuple[str, ec.EllipticCurvePrivateKey] | None, length: int | None
+) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Return a certificate and its key, signed by an issuer or itself; `length`: of the path below
+    it, None: it may sign nothing."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    above, signer = issuer or (name, key)
+    now, is_ca = datetime.now(UTC), length is not None
+    builder = certificates._builder(
+        certificates._named(name), key, certificates._named(above), now, now + DAY, is_ca
+    )
+    # As little as the tools of others write.
+    builder._extensions = []
+    builder = builder.add_extension(x509.BasicConstraints(is_ca, length), critical=True)
+    return builder.sign(signer, hashes.SHA256()), key
+
+
+@pytest.mark.parametrize(
+    ("below", "expected"), [(0, []), (None, ["cell.pem: not signed by authority.pem"])]
+)
+def test_an_authority_may_sign_through_another_but_not_through_a_rack(
+    tmp_path: Path, below: int | None, expected: list[str]
+) -> None:
+    root, root_key = step("root", None, 1)
+    between, between_key = step("puma", ("root", root_key), below)
+    own, own_key = step("cell", ("puma", between_key), None)
+    certificates._write(
+        tmp_path,
+        {
+            "authority.pem": certificates._pem(root),
+            "cell.pem": certificates._pem(own) + certificates._pem(between),
+            "cell-key.pem": certificates._key_pem(own_key),
+        },
+    )
+    assert flaws(tmp_path) == expected
+    found = Credentials(tmp_path, "cell")
+    identity = found.identity(found.pair.chain)
+    assert (identity is None) == bool(expected)

@@ -19,6 +19,7 @@ from rack.backplane.segment import VERSION, Segment, unlink
 from rack.backplane.words import Head, System
 from rack.boards.config import load, wire
 from rack.boards.lan import desk as desks
+from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.desk import ANSWERS_A_CYCLE, BYTES_A_CYCLE, QUESTIONS_A_CYCLE, Desk, Permit
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
@@ -37,10 +38,10 @@ from rack.boards.lan.questions import (
 )
 from rack.levels.level import Finding
 from rack.levels.operator import Operation
+from rack.tools.network.certificates import make_credentials
 from tests.boards.commanded_racks import COMMANDED
 
 RIGHTS = {"operator": ("watch", "command", "stop"), "watcher": ("watch",)}
-SECRET = b"of this network"
 LAUNCH, SESSION = 77, 5
 HEAD = packed_stretches([Stretch(0, 80)])
 
@@ -56,7 +57,7 @@ class Line:
     """A link whose questions a test asks; answers are opened as a client does."""
 
     def __init__(self, rack: str) -> None:
-        self.rack, self.sealer = rack, Sealer(SECRET)
+        self.rack, self.sealer = rack, Sealer()
         self.waiting: dict[str, list[Question]] = {}
         self.answers: list[Got] = []
         self._number = 0
@@ -211,11 +212,10 @@ def test_what_is_malformed_unsigned_or_oversized_is_dropped_and_counted(bench: B
     head = Envelope(VERSION, SESSION, 1, 0, 0, 0, 0)
     place = key.rpartition("/operator/")[0]
 
-    def ask(key: str, sealed_for: str, payload: bytes, sealer: Sealer = bench.line.sealer) -> None:
-        envelope = sealer.seal(sealed_for, head, payload)
+    def ask(key: str, sealed_for: str, payload: bytes) -> None:
+        envelope = bench.line.sealer.seal(sealed_for, head, payload)
         bench.line.put(Question(key, envelope, payload, lambda *answer: pytest.fail("answered")))
 
-    ask(key, key, HEAD, Sealer(b"another secret"))
     ask(key, question_key(bench.segment.rack, "read", "watcher"), HEAD)
     ask(key, key, bytes(MOST_QUESTION + 16))
     ask(f"{place}/operator/reset", f"{place}/operator/reset", b"")
@@ -223,7 +223,25 @@ def test_what_is_malformed_unsigned_or_oversized_is_dropped_and_counted(bench: B
     bench.line.put(Question(key, None, HEAD, lambda *answer: pytest.fail("answered")))
     bench.line.put(Question(key, b"RLN1", HEAD, lambda *answer: pytest.fail("answered")))
     assert bench.cycle() == []
-    assert bench.desk.count.dropped == 7
+    assert bench.desk.count.dropped == 6
+
+
+def test_nobody_asks_in_the_name_of_another(bench: Bench, tmp_path: Path) -> None:
+    make_credentials(tmp_path, dict.fromkeys((bench.segment.rack, *RIGHTS), ()), 1)
+    rack, operator, watcher = (
+        Sealer(Credentials(tmp_path, name)) for name in (bench.segment.rack, *RIGHTS)
+    )
+    bench.line.sealer = rack
+    bench.desk.open(bench.line, LAUNCH)  # type: ignore[arg-type]
+    bench.line.sealer = watcher
+    bench.line.ask("stop", asker="operator")
+    assert bench.cycle() == []
+    assert bench.desk.count.dropped == 1
+    assert not bench.segment.words[System.EMERGENCY_STOP]
+    bench.line.sealer = operator
+    # The answer has the seal of the rack, which `Line` checks.
+    assert bench.asked("stop").code is Code.GRANTED
+    assert bench.segment.words[System.EMERGENCY_STOP]
 
 
 def test_a_flood_costs_a_cycle_no_more_than_its_bounds(bench: Bench) -> None:

@@ -4,14 +4,22 @@ refused and counted."""
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import rack.boards.lan
-from rack.boards.lan.envelope import HEAD_BYTES, Envelope, Flaw, Sealer
+from rack.boards.lan import credentials as files
+from rack.boards.lan.credentials import Credential, Credentials, KeyPair
+from rack.boards.lan.envelope import _HEAD, MOST_ENVELOPE, Envelope, Flaw, Sealer
+from rack.boards.lan.keys import ask_keys, out_key, ping_key, sender_of, step_key
+from rack.boards.lan.questions import answer_key, question_key
+from rack.tools.network.certificates import make_credentials
+from tests.boards.lan.forger import below
 
 MOST = 256
 KEY = "rack/cell/out/task/status"
@@ -21,84 +29,210 @@ HEADS = st.builds(
     Envelope, WORDS, WORDS, WORDS, WORDS, SIGNED, SIGNED, SIGNED, st.integers(0, 2**32 - 1)
 )
 PAYLOADS = st.binary(max_size=MOST)
-SEALER = Sealer(b"s" * 32, MOST)
+UNTIMED = settings(deadline=None)
+PLACES = st.integers(0, 1 << 20)
+"""Of which those within an envelope count: the length of a signature varies."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The credentials of `cell` and `puma`; in `theirs` those of another network."""
+    folder = tmp_path_factory.mktemp("certs")
+    for each in (folder, folder / "theirs"):
+        make_credentials(each, {"cell": [], "puma": []}, 1)
+    return folder
+
+
+@pytest.fixture(scope="module", params=["signed", "bare"])
+def sealer(folder: Path, request: pytest.FixtureRequest) -> Sealer:
+    """A sealer with the credentials of `cell`, and one without any."""
+    return Sealer(Credentials(folder, "cell") if request.param == "signed" else None, MOST)
 
 
 @pytest.mark.slow
+@UNTIMED
 @given(st.text(), HEADS, PAYLOADS)
-def test_what_was_sealed_is_opened_unchanged(key: str, head: Envelope, payload: bytes) -> None:
-    assert SEALER.opened(key, SEALER.seal(key, head, payload), payload) == head
-
-
-@given(st.text(), st.none() | st.binary(max_size=2 * HEAD_BYTES), st.binary(max_size=2 * MOST))
-def test_arbitrary_input_raises_nothing_and_never_passes(
-    key: str, envelope: bytes | None, payload: bytes
+def test_what_was_sealed_is_opened_unchanged(
+    sealer: Sealer, end: str, head: Envelope, payload: bytes
 ) -> None:
-    assert isinstance(SEALER.opened(key, envelope, payload), Flaw)
+    key = KEY + end
+    assert sealer.opened(key, sealer.seal(key, head, payload), payload) == head
 
 
-@given(st.data(), PAYLOADS)
-def test_no_bit_of_envelope_or_payload_can_change(data: st.DataObject, payload: bytes) -> None:
-    envelope = SEALER.seal(KEY, HEAD, payload)
+@UNTIMED
+@given(
+    st.text(),
+    st.none() | st.binary(max_size=2 * _HEAD.size),
+    st.sampled_from([b"", b"RLN2"]),
+    st.binary(max_size=2 * MOST),
+)
+def test_arbitrary_input_raises_nothing_and_never_passes(
+    sealer: Sealer, key: str, envelope: bytes | None, magic: bytes, payload: bytes
+) -> None:
+    given = None if envelope is None else magic + envelope
+    assert isinstance(sealer.opened(key, given, payload), Flaw)
+
+
+@UNTIMED
+@given(PLACES, PAYLOADS)
+def test_no_bit_of_envelope_or_payload_can_change(
+    sealer: Sealer, place: int, payload: bytes
+) -> None:
+    envelope = sealer.seal(KEY, HEAD, payload)
     whole = bytearray(envelope + payload)
-    bit = data.draw(st.integers(0, 8 * len(whole) - 1))
+    bit = place % (8 * len(whole))
     whole[bit // 8] ^= 1 << bit % 8
-    assert isinstance(
-        SEALER.opened(KEY, bytes(whole[:HEAD_BYTES]), bytes(whole[HEAD_BYTES:])), Flaw
-    )
+    at = len(envelope)
+    assert isinstance(sealer.opened(KEY, bytes(whole[:at]), bytes(whole[at:])), Flaw)
 
 
-@given(st.data())
-def test_a_message_with_another_end_is_no_message(data: st.DataObject) -> None:
+@UNTIMED
+@given(PLACES, st.binary(min_size=1, max_size=16))
+def test_a_message_with_another_end_is_no_message(sealer: Sealer, place: int, more: bytes) -> None:
     payload = b"content"
-    whole = SEALER.seal(KEY, HEAD, payload) + payload
-    cut = data.draw(st.integers(0, len(whole) - 1))
-    assert isinstance(SEALER.opened(KEY, whole[:cut][:HEAD_BYTES], whole[:cut][HEAD_BYTES:]), Flaw)
-    more = data.draw(st.binary(min_size=1, max_size=16))
-    assert SEALER.opened(KEY, whole[:HEAD_BYTES], payload + more) is Flaw.UNSIGNED
+    envelope = sealer.seal(KEY, HEAD, payload)
+    whole = envelope + payload
+    cut = place % len(whole)
+    at = len(envelope)
+    assert isinstance(sealer.opened(KEY, whole[:cut][:at], whole[:cut][at:]), Flaw)
+    assert sealer.opened(KEY, envelope, payload + more) is Flaw.UNSIGNED
+    assert isinstance(sealer.opened(KEY, envelope + more, payload), Flaw)
 
 
+@UNTIMED
 @given(st.text(), st.text(), PAYLOADS)
 def test_a_message_replayed_under_another_key_is_unsigned(
-    key: str, other: str, payload: bytes
+    sealer: Sealer, key: str, other: str, payload: bytes
 ) -> None:
     assume(key != other)
-    assert SEALER.opened(other, SEALER.seal(key, HEAD, payload), payload) is Flaw.UNSIGNED
+    envelope = sealer.seal(KEY + key, HEAD, payload)
+    assert sealer.opened(KEY + other, envelope, payload) is Flaw.UNSIGNED
 
 
+@UNTIMED
 @given(st.text(min_size=1), PAYLOADS)
 def test_the_end_of_a_key_cannot_pass_for_the_beginning_of_a_payload(
-    key: str, payload: bytes
+    sealer: Sealer, end: str, payload: bytes
 ) -> None:
-    moved = key[-1].encode() + payload
+    moved = end[-1].encode() + payload
     assume(len(moved) <= MOST)
-    assert SEALER.opened(key[:-1], SEALER.seal(key, HEAD, payload), moved) is Flaw.UNSIGNED
+    envelope = sealer.seal(KEY + end, HEAD, payload)
+    assert sealer.opened((KEY + end)[:-1], envelope, moved) is Flaw.UNSIGNED
 
 
-@given(st.binary(max_size=64), PAYLOADS)
-def test_a_seal_made_with_another_secret_does_not_fit(secret: bytes, payload: bytes) -> None:
-    # BLAKE2b fills a key up with zeros.
-    assume(secret.rstrip(b"\0") != b"s" * 32)
-    assert SEALER.opened(KEY, Sealer(secret).seal(KEY, HEAD, payload), payload) is Flaw.UNSIGNED
+@pytest.mark.slow
+def test_a_spoilt_certificate_names_nobody_else(folder: Path) -> None:
+    own = Credentials(folder, "cell")
+    chain = own.pair.chain
+    for at in range(len(chain)):
+        for change in (1, 0x80):
+            spoilt = bytes([*chain[:at], chain[at] ^ change, *chain[at + 1 :]])
+            identity = own.identity(spoilt)
+            # The authority has not signed how it says that it has signed: that may differ.
+            assert identity is None or identity.key == own.pair.key.public_key()
+    assert own.identity(chain) is not None
+    assert own.identity(b"") is None
+    assert own.identity(chain + chain[:-1]) is None
 
 
-def test_flaws_are_counted_by_cause() -> None:
-    sealer, fits = Sealer(b"s" * 32, MOST), bytes(MOST)
+def test_each_key_is_sealed_by_the_one_in_whose_name_it_is() -> None:
+    question = question_key("cell", "stop", "operator")
+    assert sender_of(question) == "operator"
+    assert sender_of(answer_key(question)) == "cell"
+    for key in (KEY, out_key("cell", "ask.a"), step_key("cell"), ping_key("cell", "puma")):
+        assert sender_of(key) == "cell"
+    assert sender_of(ask_keys("cell", "stop", "operator")) == "operator"
+    assert [sender_of(key) for key in ("", "rack", "rack/", "rack//out/a", "other/cell/x")] == [
+        ""
+    ] * 5
+
+
+def forged(folder: Path, sealer: Sealer, mixed: KeyPair) -> Iterator[bytes]:
+    """Yield envelopes for a message of `cell` that others have made who know all that `puma` has,
+    and all that `cell` has sent."""
+    puma = Sealer(Credentials(folder, "puma"))
+    yield puma.seal(KEY, HEAD, b"")
+    yield Sealer(Credentials(folder / "theirs", "cell")).seal(KEY, HEAD, b"")
+    yield Sealer().seal(KEY, HEAD, b"")
+    yield Sealer(below(folder, "puma", "cell", folder / "below")).seal(KEY, HEAD, b"")
+    puma._pair = mixed
+    yield puma.seal(KEY, HEAD, b"")
+    seal = sealer.seal(KEY, HEAD, b"")
+    yield seal.replace(b"cell", b"puma")
+
+
+def test_no_rack_makes_the_seal_of_another(folder: Path) -> None:
+    cell = Credentials(folder, "cell")
+    sealer = Sealer(cell)
+    mixed = KeyPair(cell.pair.chain, Credentials(folder, "puma").pair.key)
+    found = [sealer.opened(KEY, envelope, b"") for envelope in forged(folder, sealer, mixed)]
+    assert found == [Flaw.UNSIGNED] * 6
+    assert sealer.opened(KEY, sealer.seal(KEY, HEAD, b""), b"") == HEAD
+
+
+def test_a_seal_is_worth_no_more_than_its_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_credentials(tmp_path, {"cell": []}, 1)
+    sealer = Sealer(Credentials(tmp_path, "cell"))
+    envelope = sealer.seal(KEY, HEAD, b"")
+    assert sealer.opened(KEY, envelope, b"") == HEAD
+
+    class Later(datetime):
+        """A clock after its end."""
+
+        @classmethod
+        def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
+            return datetime.now(UTC) + timedelta(days=2)
+
+    monkeypatch.setattr(files, "datetime", Later)
+    assert sealer.opened(KEY, envelope, b"") is Flaw.UNSIGNED
+
+
+def test_certificates_of_others_are_remembered_up_to_a_bound(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "MOST_KNOWN", 2)
+    own = Credentials(folder, "cell")
+    make_credentials(folder / "more", {f"rack-{at}": [] for at in range(5)}, 1)
+    own.authority = folder / "more/authority.pem"
+    for at in range(5):
+        other = Credentials(folder / "more", f"rack-{at}")
+        identity = own.identity(other.pair.chain)
+        assert identity is not None
+        assert identity.name == f"rack-{at}"
+        assert 0 < len(own._known) <= 2
+
+
+def test_a_chain_that_would_not_fit_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = len(Credentials(folder, "cell").pair.chain)
+    monkeypatch.setattr(files, "MOST_CHAIN", size - 1)
+    with pytest.raises(Credential, match=f"cell.pem: {size} bytes; permitted: {size - 1}"):
+        Sealer(Credentials(folder, "cell"))
+
+
+def test_flaws_are_counted_by_cause(sealer: Sealer) -> None:
+    fits = bytes(MOST)
+    sealer = sealer.taking(MOST)
+    sealer.flaws = dict.fromkeys(Flaw, 0)
     sealed = sealer.seal(KEY, HEAD, fits)
     for envelope, payload in (
         (sealed, fits),
         (sealed, bytes(MOST + 1)),
         (None, fits),
-        (sealed[:-1], fits),
-        (b"RLN0" + sealed[4:], fits),
+        (sealed[: _HEAD.size], fits),
+        (sealed + bytes(MOST_ENVELOPE), fits),
+        (b"RLN1" + sealed[4:], fits),
         (sealed, fits[1:]),
     ):
         sealer.opened(KEY, envelope, payload)
-    assert sealer.flaws == {Flaw.MALFORMED: 3, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
-    successor = Sealer(b"s" * 32, MOST)
+    assert sealer.flaws == {Flaw.MALFORMED: 4, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
+    successor = Sealer()
     successor.resume(sealer.flaws.values())
     successor.opened(KEY, None, fits)
-    assert successor.flaws == {Flaw.MALFORMED: 4, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
+    assert successor.flaws == {Flaw.MALFORMED: 5, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
 
 
 def test_nothing_from_the_network_is_decoded_as_a_program() -> None:

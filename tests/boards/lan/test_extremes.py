@@ -100,6 +100,7 @@ params = {{ port = "{name}", type = "{self.type}", cases = {json.dumps(rows)} }}
 slot = 3
 rate_hz = 50
 listen = ["tcp/127.0.0.1:{port}"]
+insecure = true
 connect = {json.dumps([f"tcp/127.0.0.1:{at}" for at in peers])}
 peers = ["{peer}"]
 
@@ -116,7 +117,8 @@ def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
         text = re.sub(r'"cell(?=["/-])', f'"{name}', path.read_text().replace('"../', '"'))
         (folder / path.name).write_text(text)
     endpoint = f'adapter.lan.listen=["tcp/127.0.0.1:{listen}"]'
-    lan = (endpoint, "adapter.lan.connect=[]", "adapter.lan.permit.operator=[]")
+    own = ("insecure=true", "connect=[]", "permit.operator=[]")
+    lan = (endpoint, *(f"adapter.lan.{setting}" for setting in own))
     return load(folder / f"{file}.toml", ["clock.mode=lockstep", *lan])
 
 

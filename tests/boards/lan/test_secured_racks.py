@@ -1,4 +1,4 @@
-"""Whole racks over TLS, each with its own certificate."""
+"""Whole racks, each with its own certificate: over TLS, and where only their seals prove it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from rack.backplane.errors import BackplaneError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.tools.network.certificates import make_credentials
+from tests.boards.lan.forger import FORGED
 from tests.boards.lan.racks import configs, endpoints, rack_text, started
+from tests.boards.lan.test_strangers import running
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
+ROUNDS = 20
 
 
 @pytest.fixture
@@ -60,3 +63,42 @@ def test_a_rack_under_another_name_needs_another_certificate(
 ) -> None:
     with started(tmp_path / "rack-0.toml", 1.0, f"name={names[0]}x") as process:
         assert f"{names[0]}x.pem: missing" in process.outcome()["error"]
+
+
+def test_a_rack_that_speaks_in_the_name_of_another_is_refused(
+    rack_name: str, tmp_path: Path
+) -> None:
+    names = [f"{rack_name}-{end}" for end in "ab"]
+    for folder in ("certs", "certs/theirs"):
+        make_credentials(tmp_path / folder, dict.fromkeys([*names, "forger"], ()), 1)
+    # Without TLS: with it a rack does not even hear another one under this name.
+    at, own = endpoints(2), 'certificates = "certs"'
+    texts = [
+        rack_text(names[0], at[0], (), lan=own, peers=names[1:], insecure=False),
+        rack_text(names[1], at[1], at[:1], names[0], lan=own, insecure=False),
+    ]
+    configs(texts, tmp_path)
+    with ExitStack() as stack:
+        for k in range(2):
+            stack.enter_context(started(tmp_path / f"rack-{k}.toml"))
+        wait_until(lambda: taken(names[1]) > ROUNDS)
+        members = [str(tmp_path / "certs"), "forger", names[0]]
+        forger = stack.enter_context(running("forger", *members, *at))
+        wait_until(lambda: forger.state()["forged"] > ROUNDS)
+        segment = Segment.attach(names[1])
+        stack.callback(segment.close)
+        status, echo = (open_observer(segment, name) for name in ("lan.status", "echo.status"))
+
+        def imported(count: str) -> int:
+            return int(status.peek().value.import_other[count])
+
+        before = taken(names[1])
+        wait_until(lambda: taken(names[1]) > before + ROUNDS)
+        wait_until(lambda: imported("repeated") > ROUNDS)
+        did, heard = forger.state(), echo.peek().value
+        wait_until(lambda: int(status.peek().value.flaws["unsigned"]) >= did["forged"])
+        assert did["opened"] == did["heard"]
+        assert imported("refused") >= did["forged"]
+        assert imported("missing") == 0
+        assert 0 < heard.count < heard.total < FORGED
+        assert heard.backward == 0

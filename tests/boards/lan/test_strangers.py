@@ -102,9 +102,9 @@ class Site:
         """Return settings of a session without a certificate."""
         return self._over(protocol, {})
 
-    def secret(self, folder: str = "set") -> str:
-        """Return the secret of the seals."""
-        return Credentials(self.folder / folder, "friend").secret.hex()
+    def seals(self, name: str, folder: str = "set") -> tuple[str, str]:
+        """Return whose seals a session has."""
+        return str(self.folder / folder), name
 
     def _over(self, protocol: str, tls: dict[str, Any]) -> dict[str, Any]:
         tls = {"root_ca_certificate": str(self.folder / "set/authority.pem"), **tls}
@@ -147,7 +147,7 @@ def friend(site: Site) -> dict[str, Any]:
     """Return the session of a rack that does nothing wrong."""
     return {
         "settings": site.mutual("friend"),
-        "secret": site.secret(),
+        "seals": site.seals("friend"),
         "puts": [(pulse("friend"), 100, pulse("friend"))],
         "listens": [OWN],
         "asks": ["rack/home/ask/stop/friend"],
@@ -157,9 +157,9 @@ def friend(site: Site) -> dict[str, Any]:
 
 def sessions(site: Site) -> dict[str, dict[str, Any]]:
     """Return a friend's session and those of strangers."""
-    secret = {"secret": site.secret()}
+    # Even with a seal of the one in whose name they come.
     eager = {
-        **secret,
+        "seals": site.seals("friend"),
         "puts": [(pulse("friend"), 99, pulse("friend"))],
         "listens": ["**", OWN],
         "asks": [STRANGER],
@@ -183,13 +183,21 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
             "puts": [*eager["puts"], *own],
             "asks": asks,
         },
-        "liar": {"settings": site.mutual("liar"), **secret, "puts": [*lies, (liar, 100, liar)]},
+        "liar": {
+            "settings": site.mutual("liar"),
+            "seals": site.seals("liar"),
+            "puts": [*lies, (liar, 100, liar)],
+        },
         "mole": {
             "settings": site.mutual("mole"),
             "puts": [(pulse("mole"), 9, pulse("mole"))],
-            "secret": "00" * 32,
+            "seals": site.seals("mole", "forged"),
         },
-        "heavy": {"settings": site.mutual("heavy"), **secret, "puts": heavy},
+        "heavy": {
+            "settings": site.mutual("heavy"),
+            "seals": site.seals("heavy"),
+            "puts": heavy,
+        },
         "impostor": {"settings": impostor, **eager},
     }
 
@@ -273,7 +281,7 @@ def test_what_is_sealed_wrongly_is_counted_by_cause_and_not_taken(found: Found) 
 
 
 @pytest.mark.slow
-def test_a_seal_with_another_secret_does_not_fit(found: Found) -> None:
+def test_a_seal_of_another_network_does_not_fit(found: Found) -> None:
     assert found.home["good"][pulse("mole")] == 0 < found.home["came"][pulse("mole")]
 
 

@@ -13,7 +13,7 @@ from cryptography import x509
 from rack.boards.lan.credentials import Credentials
 from tests.tools.command_line import rack
 
-SHARED = ["authority.pem", "authority-key.pem", "secret"]
+SHARED = ["authority.pem", "authority-key.pem"]
 
 
 def test_a_set_is_made_for_every_name(tmp_path: Path) -> None:
@@ -27,7 +27,7 @@ def test_a_set_is_made_for_every_name(tmp_path: Path) -> None:
     assert list(Credentials(folder, "cell").flaws(["10.0.0.1", "cell.local"])) == []
     assert list(Credentials(folder, "operator").flaws()) == []
     assert "A set for tests" in done.stdout
-    assert "Each machine needs only authority.pem, secret, and its own pair" in done.stdout
+    assert "Each machine needs only authority.pem and its own pair" in done.stdout
 
 
 def test_only_its_owner_may_read_it(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def mistakes(
 ) -> list[str]:
     """Return the mistakes of a rack with this endpoint and further lines of `[adapter.lan]`."""
     path = folder / "rack.toml"
-    path.write_text(rack_text("cell", listen, connect, peers=["puma"], lan=lan))
+    path.write_text(rack_text("cell", listen, connect, peers=["puma"], lan=lan, insecure=False))
     try:
         resolve(load(path))
     except ConfigError as error:
@@ -35,8 +35,18 @@ def mistakes(
     "endpoint",
     ["tcp/127.0.0.1:1", "tcp/127.9.9.9:65535", "tcp/localhost:7447", "tcp/[::1]:7447"],
 )
-def test_loopback_needs_no_tls(tmp_path: Path, endpoint: str) -> None:
-    assert mistakes(tmp_path, endpoint) == mistakes(tmp_path, connect=(endpoint,)) == []
+def test_loopback_needs_no_tls_but_certificates(tmp_path: Path, endpoint: str) -> None:
+    why = (
+        "every user of this machine could pass for any rack here; permitted: unix/ and a name,"
+        " certificates, which seal what is sent, or by name, adapter.lan.insecure = true"
+    )
+    assert mistakes(tmp_path, endpoint) == [f'adapter.lan.listen[0] = "{endpoint}": {why}']
+    assert mistakes(tmp_path, connect=(endpoint,)) == [
+        f'adapter.lan.connect[0] = "{endpoint}": {why}'
+    ]
+    make_credentials(tmp_path / "certs", {"cell": []}, 1)
+    for lan in ("insecure = true", 'certificates = "certs"'):
+        assert mistakes(tmp_path, endpoint, lan) == []
 
 
 @pytest.mark.parametrize(
@@ -104,7 +114,7 @@ def test_flaws_of_all_files_come_with_the_other_mistakes(tmp_path: Path) -> None
     assert lines[0].startswith(
         'adapter.lan.connect[0] = "tcp/127.0.0.1:7448": without TLS, which others have'
     )
-    files = ("authority.pem", "cell.pem", "cell-key.pem", "secret")
+    files = ("authority.pem", "cell.pem", "cell-key.pem")
     why = f"missing; see rack lan certificates --help; in {tmp_path}/certs"
     assert lines[1:] == [f"adapter.lan.certificates: {name}: {why}" for name in files]
 
@@ -126,9 +136,9 @@ def test_a_recorded_config_can_be_wired_where_its_certificates_are_not(tmp_path:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
     assert mistakes(tmp_path, TLS, 'certificates = "certs"') == []
     text = load(tmp_path / "rack.toml").text()
-    (tmp_path / "certs/secret").unlink()
+    (tmp_path / "certs/cell-key.pem").unlink()
     assert wire(loads(text)).task("lan").every > 0
-    with pytest.raises(ConfigError, match="secret"):
+    with pytest.raises(ConfigError, match=r"cell-key\.pem: missing"):
         resolve(loads(text))
 
 
@@ -159,8 +169,14 @@ def test_a_launch_warns_of_certificates_that_end_soon(tmp_path: Path) -> None:
 def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 40)
     far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
+    read = "read what is exchanged, and feign that racks come and go"
     for listen, lan, note in (
-        (near, "", f"without TLS: whoever reaches {near} may read and forge what is exchanged"),
+        (
+            near,
+            "insecure = true",
+            f"without TLS: whoever reaches {near} may read and forge what is exchanged",
+        ),
+        (near, own, f"without TLS: whoever reaches {near} may {read}"),
         ("unix/cell", "", ""),
         (TLS, own, ""),
         (
@@ -171,7 +187,7 @@ def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
         (
             far,
             f"insecure = true\n{own}",
-            f"without TLS: whoever reaches {far} may read what is exchanged",
+            f"without TLS: whoever reaches {far} may {read}",
         ),
     ):
         assert mistakes(tmp_path, listen, lan) == []
@@ -182,20 +198,22 @@ def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
 def test_nothing_is_permitted_where_anyone_could_pass_for_another(
     tmp_path: Path, right: str
 ) -> None:
-    lan = f'permit = {{ operator = ["{right}"] }}'
-    for at, more in (("tcp/127.0.0.1:7447", ""), ("tcp/10.0.0.1:7447", "\ninsecure = true")):
+    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
+    lan, own = f'permit = {{ operator = ["{right}"] }}', '\ncertificates = "certs"'
+    for at, more, could in (
+        ("tcp/127.0.0.1:7447", own, "repeat what one of them has asked"),
+        ("tcp/10.0.0.1:7447", "\ninsecure = true", "pass for any of them"),
+    ):
         line = (
-            f'adapter.lan.permit = "operator": whoever reaches {at} could pass for any of them;'
-            " permitted: tls/ or quic/ with certificates (rack lan certificates --help), or unix/"
+            f'adapter.lan.permit = "operator": whoever reaches {at} could {could}; permitted:'
+            " tls/ or quic/ with certificates (rack lan certificates --help), or unix/"
             " on one machine"
         )
         assert mistakes(tmp_path, at, lan + more) == [line]
         assert mistakes(tmp_path, lan=lan + more, connect=(at,)) == [line]
-    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
-    assert mistakes(tmp_path, TLS, f'{lan}\ncertificates = "certs"') == []
+    assert mistakes(tmp_path, TLS, lan + own) == []
     assert mistakes(tmp_path, "unix/cell", lan, connect=("unix/puma",)) == []
 
 
 def test_bundled_configs_bring_no_certificates() -> None:
     assert not list(CONFIGS.rglob("*.pem"))
-    assert not list(CONFIGS.rglob("secret"))

@@ -25,7 +25,7 @@ arms = { puma = "lan.puma", k1607 = "lan.k1607" }
 [adapter.lan]
 slot = 3
 rate_hz = 20
-connect = ["tcp/127.0.0.1:7448"]
+connect = ["unix/cell-puma"]
 [adapter.lan.export.puma]
 from = "task.order_puma"
 [adapter.lan.import.puma]
