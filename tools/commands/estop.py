@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import Annotated
 
 import typer
 
 from rack.backplane.lines import UtilityLines
+from rack.backplane.process import readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
 from rack.tools.console.address import AT_THE_RACK, OPERATOR, Asker, RackAddress, needing_zenoh
@@ -18,6 +20,10 @@ from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json
 Reset = Annotated[
     bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")
 ]
+Ready = Annotated[
+    bool,
+    typer.Option("--ready", help="for HOST/RACK: connect now, and set it when Enter is pressed"),
+]
 
 OBEY_S = 2.0
 """Longest wait for the clock, which reads the latch every tick."""
@@ -26,6 +32,7 @@ OBEY_S = 2.0
 def estop(
     rack: AnyRackName,
     reset: Reset = False,
+    ready: Ready = False,
     certificates: Certificates = "",
     name: AskAs = OPERATOR,
     as_json: Json = False,
@@ -34,7 +41,10 @@ def estop(
 
     The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
     ACFAIL is asserted. On another machine's rack, HOST/RACK, it may be set by who has the right
-    there, and never reset.
+    there, and never reset. Where strangers reach the port of a rack, they can delay new
+    connections: with --ready the connection is there before it is needed. It says on stderr
+    whenever that changes. Enter, or any line on stdin, sets the stop, at once or as soon as the
+    rack can be reached. Ctrl-C leaves without one.
 
     The arm of a rack that is held brakes when the rack goes on.
 
@@ -46,9 +56,13 @@ def estop(
       rack estop nasrem
       rack estop nasrem --reset
       rack estop 192.168.1.5/cell --certificates ~/cell
+      rack estop 192.168.1.5/cell --certificates ~/cell --ready
     """
+    if ready and (reset or "/" not in rack):
+        other = "--reset" if reset else rack
+        raise Failure(f"--ready, {other}: it waits to stop a rack of another machine, HOST/RACK", 2)
     if "/" in rack:
-        tick = _stop_from_afar(RackAddress.of(rack), reset, Asker.of(name, certificates))
+        tick = _stop_from_afar(RackAddress.of(rack), reset, ready, Asker.of(name, certificates))
         own = rack.partition("/")[2]
         held = ""
     else:
@@ -64,14 +78,36 @@ def estop(
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 
-def _stop_from_afar(address: RackAddress, reset: bool, asker: Asker) -> int:
-    """Set the latch of a rack on another machine; return the tick at which it was set. Raises
-    `Failure`."""
+def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, asker: Asker) -> int:
+    """Set the latch of a rack on another machine, at once or when Enter is pressed; return the tick
+    at which it was set. Raises `Failure`."""
     if reset:
         raise Failure(f"rack '{address.rack}' {AT_THE_RACK.format(address.rack)}")
     with needing_zenoh():
-        from rack.tools.network.remote import stop
-    return stop(address, asker)
+        from rack.tools.network.remote import stop, stop_when
+    return stop_when(_pressed, address, asker, _Teller()) if ready else stop(address, asker)
+
+
+class _Teller:
+    """Prints on stderr what differs from the line before."""
+
+    def __init__(self) -> None:
+        self._last = ""
+
+    def __call__(self, line: str) -> None:
+        if line != self._last:
+            print(line, file=sys.stderr, flush=True)
+        self._last = line
+
+
+def _pressed(wait_s: float) -> bool:
+    """Wait for a line on stdin, up to a time; say whether one has come. Raises `Failure` when none
+    can come any more."""
+    if not readable(sys.stdin.fileno(), wait_s):
+        return False
+    if not sys.stdin.readline():
+        raise Failure("stdin has ended, and no stop was set")
+    return True
 
 
 def _latch(rack: str, reset: bool) -> tuple[int, str]:

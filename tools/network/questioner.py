@@ -145,6 +145,13 @@ class Questioner:
         for question in pending:
             yield self._granted(asked.rack, what, self._answer(question))
 
+    def check_stop(self, asked: FarLaunch) -> None:
+        """Raise `Failure` unless an emergency stop would be set: a reset goes the same way, with
+        the same right, and is refused at its end."""
+        answer = self._answer(self._question(asked, "reset", b""))
+        if answer.code is not Code.AT_THE_RACK:
+            self._granted(asked.rack, "reset", answer)
+
     def _question(
         self, asked: FarLaunch, what: What, payload: bytes, first: int | None = None
     ) -> _Question:

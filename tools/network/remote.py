@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BytesIO
 from typing import Self
@@ -22,8 +22,10 @@ from rack.boards.lan.questions import (
 from rack.tools.console.address import Asker, RackAddress
 from rack.tools.console.answer import Failure
 from rack.tools.network.mirror import Mirror
-from rack.tools.network.questioner import Questioner, not_permitted
+from rack.tools.network.questioner import FarLaunch, Questioner, not_permitted
 
+LOOK_S = 0.2
+"""Time between two looks at whether a rack is still there."""
 AT_ONCE = 4
 """Questions on their way at once: as many as a desk answers in one cycle."""
 
@@ -109,8 +111,43 @@ def stop(address: RackAddress, asker: Asker) -> int:
     """Set the emergency stop of a rack; return the tick at which that was done. Raises
     `Failure`."""
     with Questioner(address.at, asker) as racks:
-        (answer,) = racks.ask(racks.launch(address.rack), "stop", [b""])
-        return answer.tick
+        return _stop(racks, address.rack)
+
+
+def stop_when(
+    pressed: Callable[[float], bool],
+    address: RackAddress,
+    asker: Asker,
+    tell: Callable[[str], None],
+) -> int:
+    """Stay connected to a rack, and set its emergency stop once `pressed` says so, which waits for
+    that up to a time in s; return the tick at which it was set.
+
+    `tell` gets, again and again, whether it could be set. What is pressed while it cannot is tried
+    until it can. Raises `Failure` if it cannot from the beginning.
+    """
+    with Questioner(address.at, asker) as racks:
+        checked: FarLaunch | None = None
+        while checked is None or not pressed(LOOK_S):
+            try:
+                if (launch := racks.launch(address.rack)) != checked:
+                    racks.check_stop(launch)
+                    checked = launch
+                tell(f"ready to stop rack '{address}'")
+            except Failure as failure:
+                if checked is None:
+                    raise
+                tell(f"not ready: {failure}")
+        while True:
+            try:
+                return _stop(racks, address.rack)
+            except Failure as failure:
+                tell(f"not stopped yet: {failure}")
+
+
+def _stop(racks: Questioner, rack: str) -> int:
+    (answer,) = racks.ask(racks.launch(rack), "stop", [b""])
+    return answer.tick
 
 
 def _questions(stretches: Sequence[Stretch]) -> Iterator[list[Stretch]]:

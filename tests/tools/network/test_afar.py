@@ -6,10 +6,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
+import ssl
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +42,7 @@ peers = ["{peer}"]
 operator = ["watch", "command", "stop"]
 watcher = ["watch"]
 """
+STRANGERS = 8
 LATE = str(10**9)
 """A tick that no test reaches."""
 NOT_PERMITTED = "rack '{}' does not permit '{}' to {}; its config: adapter.lan.permit"
@@ -127,7 +132,16 @@ def partner(config: Path, name: str, other: str, port: int) -> Iterator[None]:
 @contextmanager
 def client(*words: str) -> Iterator[subprocess.Popen[str]]:
     """Run a command in a process of its own, which is killed at the end, should it still run."""
-    process = subprocess.Popen([*RACK, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    is_ready = "--ready" in words
+    process = subprocess.Popen(
+        [*RACK, *words],
+        cwd=ROOT,
+        stdin=pipe if is_ready else None,
+        stdout=pipe,
+        stderr=pipe if is_ready else None,
+        text=True,
+    )
     try:
         yield process
     finally:
@@ -255,6 +269,80 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
     segment.close()
 
 
+@contextmanager
+def shaking_hands(port: int) -> Iterator[Callable[[], int]]:
+    """Let strangers without a certificate connect again and again; yield how often they have."""
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    ended = threading.Event()
+    made: list[None] = []
+
+    def shake() -> None:
+        while not ended.is_set():
+            with (
+                suppress(OSError),
+                socket.create_connection(("127.0.0.1", port), 3.0) as connection,
+                context.wrap_socket(connection) as refused,
+            ):
+                refused.recv(1)
+            made.append(None)
+
+    with ThreadPoolExecutor(STRANGERS) as pool:
+        for _ in range(STRANGERS):
+            pool.submit(shake)
+        try:
+            yield lambda: len(made)
+        finally:
+            ended.set()
+
+
+@pytest.mark.slow
+@REALTIME
+def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(far: Far) -> None:
+    segment = Segment.attach(far.name)
+    port = int(far.port.rpartition(":")[2])
+    with client("estop", far.address, "--ready", "--json") as ready, shaking_hands(port) as made:
+        assert ready.stdin is not None
+        assert ready.stderr is not None
+        assert ready.stderr.readline() == f"ready to stop rack '{far.address}'\n"
+        before = made()
+        wait_until(lambda: made() > before + STRANGERS)
+        assert segment.words[System.EMERGENCY_STOP] == 0
+        ready.stdin.write("\n")
+        ready.stdin.flush()
+        out, err = ready.communicate(timeout=BOUND_S)
+        assert (ready.returncode, err) == (0, "")
+        assert json.loads(out)["emergency_stop"] is True
+        assert segment.words[System.EMERGENCY_STOP] == 1
+        # They are still at it.
+        before = made()
+        wait_until(lambda: made() > before)
+    assert rack("estop", far.name, "--reset").returncode == 0
+    segment.close()
+
+
+@pytest.mark.slow
+@REALTIME
+def test_nobody_is_ready_to_stop_who_may_not_or_has_no_key_to_press(far: Far) -> None:
+    ended = afar(
+        f"estop {far.address} --ready --as watcher",
+        f"estop {far.address} --ready",
+        f"estop {far.name} --ready",
+        f"estop {far.address} --ready --reset",
+    )
+    where = "it waits to stop a rack of another machine, HOST/RACK"
+    assert [(one.status, one.err.splitlines()) for one in ended] == [
+        (1, [NOT_PERMITTED.format(far.name, "watcher", "stop")]),
+        (1, [f"ready to stop rack '{far.address}'", "stdin has ended, and no stop was set"]),
+        (2, [f"--ready, {far.name}: {where}"]),
+        (2, [f"--ready, --reset: {where}"]),
+    ]
+    segment = Segment.attach(far.name)
+    assert segment.words[System.EMERGENCY_STOP] == 0
+    segment.close()
+
+
 @pytest.mark.slow
 @REALTIME
 def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
@@ -278,12 +366,17 @@ def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
 @pytest.mark.slow
 @REALTIME
 def test_who_watches_sees_the_run_stop(far: Far) -> None:
-    with client("top", far.address) as top:
+    with client("top", far.address) as top, client("estop", far.address, "--ready") as ready:
         assert top.stdout is not None
+        assert ready.stderr is not None
+        assert ready.stderr.readline().startswith("ready to stop")
         assert "running" not in top.stdout.readline()
         assert rack("stop", far.name).returncode == 0
         assert top.wait(BOUND_S) == 0
         assert "gone" not in top.stdout.read()
+        assert ready.stderr.readline().startswith(f"not ready: no rack '{far.name}' at {far.port}")
+        ready.send_signal(signal.SIGINT)
+        assert ready.wait(BOUND_S) == 128 + signal.SIGINT
 
 
 @pytest.mark.slow
