@@ -141,9 +141,9 @@ class NextCycle:
                 sleep((point - now) * 1e-9)
                 return True
             is_due = now < point <= bound
-            deadline = min(
-                bound, point if now < point else point + ((now - point) // step + 1) * step
-            )
+            if point <= now:
+                point += ((now - point) // step + 1) * step
+            deadline = min(bound, point)
         self._semaphore.bind(deadline)
         if not self._semaphore.wait() or is_due or self._block[_RELEASED] >= self._due:
             return True

@@ -61,7 +61,9 @@ class MailboxRing(Ring):
             & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"])
             & (rows["serial"] == serials)
         )
-        return Drained(rows if good.all() else rows[good], lost)
+        if not good.all():
+            rows = rows[good]
+        return Drained(rows, lost)
 
 
 def row_dtype(spec: MailboxSpec) -> np.dtype:
@@ -93,7 +95,8 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
             slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)
         ):
             serial -= 1
-        found[spec.name] = (serial, slots.chain if serial > oldest else 0)
+        chain = slots.chain if serial > oldest else 0
+        found[spec.name] = (serial, chain)
     return found
 
 

@@ -110,7 +110,9 @@ class Writer:
         visible at the next boundary of the writer's period.
         """
         visible_at = tick + self._shown_after if now is None else self.visible_at(tick, now)
-        self.intruder = self._slots.publish(tick, visible_at, tick if basis is None else basis)
+        if basis is None:
+            basis = tick
+        self.intruder = self._slots.publish(tick, visible_at, basis)
         return now is None or now < tick + self._due
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
@@ -287,7 +289,8 @@ class Reader:
     def _cut_off(self) -> Reading:
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
-        return self._readings[Verdict.BUS_ERROR if self.serial else Verdict.NONE]
+        verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
+        return self._readings[verdict]
 
     def peek(self) -> Reading:
         """Return the newest whole message at once, under any protocol: for the host side."""

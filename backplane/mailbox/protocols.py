@@ -172,9 +172,9 @@ def open_reader(
     if inbox is not None and name in inbox.lines:
         return InterruptReader(segment, name, inbox)
     protocol = segment.layout.mailbox(name).protocol
-    return READERS["double-buffer" if asynchronous and protocol == "time-slice" else protocol](
-        segment, name
-    )
+    if asynchronous and protocol == "time-slice":
+        protocol = "double-buffer"
+    return READERS[protocol](segment, name)
 
 
 def open_observer(segment: Segment, name: str) -> Reader:

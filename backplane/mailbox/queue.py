@@ -123,9 +123,11 @@ class QueueWriter(Writer):
         late for them."""
         if not self._pending:
             return True
+        if basis is None:
+            basis = tick
         visible_at = self.visible_at(tick, now)
         for _ in self.outgoing():
-            self._slots.publish(tick, visible_at, tick if basis is None else basis)
+            self._slots.publish(tick, visible_at, basis)
         self.show()
         return self.is_in_time(tick, now)
 
