@@ -136,9 +136,8 @@ def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | Non
     truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)
     off = np.abs(stuck - truth)
-    return sample._replace(position=stuck[0], velocity=stuck[1]), bool(
-        (off > APART).any()
-    ) if off.any() else None
+    is_apart = bool((off > APART).any()) if off.any() else None
+    return sample._replace(position=stuck[0], velocity=stuck[1]), is_apart
 
 
 def torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:

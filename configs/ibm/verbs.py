@@ -46,10 +46,8 @@ class Assembly(HostProgram):
             self._fetch(motions, bus, block)
             touched = self._lower(motions)
             motions.wait(motions.release())
-            print(
-                f"{block}: {'touched at' if touched else 'no touch down to'}"
-                f" {motions.where()[2]:.4f} m"
-            )
+            found = "touched at" if touched else "no touch down to"
+            print(f"{block}: {found} {motions.where()[2]:.4f} m")
             motions.wait(motions.line((*PLACE, 0.70)))
         motions.wait(motions.move())
 

@@ -67,7 +67,8 @@ class FaultyLink:
         self._sensors = [(step, a) for step, a in steps if isinstance(step, SensorStep)]
         self._motors = [(step.part(a), a) for step, a in steps if isinstance(step, MotorStep)]
         self._commands = [(step, a) for step, a in steps if isinstance(step, CommandStep)]
-        self._arm.weaken(self._most() if self._motors else None)
+        most = self._most() if self._motors else None
+        self._arm.weaken(most)
 
     def _joints(self, fault: Fault) -> NDArray[np.bool_]:
         return (

@@ -60,7 +60,8 @@ class PresentLink:
         arm = self._arm
         last = self._last
         sample = copied(self._below.sense())
-        self._driven.append(Driven(arm.tick, None if arm.braked else arm.torque.copy()))
+        torque = None if arm.braked else arm.torque.copy()
+        self._driven.append(Driven(arm.tick, torque))
         if not 0 < arm.tick - sample.tick <= self._latency:
             self._last = Present(sample, sample, sample)
             return self._last

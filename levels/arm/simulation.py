@@ -185,7 +185,8 @@ def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
         since = time_s - push.at
         left = push.at + push.seconds - time_s
         if since >= 0.0 and left > 0.0:
-            total += np.array(push.force) * (
-                min(1.0, since / push.rise, left / push.rise) if push.rise > 0.0 else 1.0
-            )
+            share = 1.0
+            if push.rise > 0.0:
+                share = min(1.0, since / push.rise, left / push.rise)
+            total += np.array(push.force) * share
     return total

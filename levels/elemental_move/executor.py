@@ -212,9 +212,8 @@ class ElementalMoveExecutor(Executor):
         if gripper is None:
             self._fail(Error.UNREACHABLE, f"move {move['id']} needs a gripper; the robot has none")
             return False
-        segments.add_gripper(
-            move, gripper.closed if move["verb"] == Verb.GRASP else gripper.open, gripper.force
-        )
+        opening = gripper.closed if move["verb"] == Verb.GRASP else gripper.open
+        segments.add_gripper(move, opening, gripper.force)
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:

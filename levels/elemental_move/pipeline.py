@@ -75,9 +75,9 @@ class PlanStore:
         for move in [m for m in self._by_move if m < done]:
             del self._by_move[move]
         before = self.end(message.move - 1)
-        if message.move <= handed_down or not (
-            message.error or joins(message, end if before is None else before)
-        ):
+        if before is None:
+            before = end
+        if message.move <= handed_down or not (message.error or joins(message, before)):
             return
         known = self._by_move.get(message.move)
         stays = (

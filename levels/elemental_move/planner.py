@@ -177,7 +177,9 @@ class ElementalMovePlanner(Planner):
         """Return the first move without a path."""
         status = read.status.value
         primitive = read.primitive.value
-        newest = max(status.planned, self._published[-1].move.id if self._published else 0)
+        newest = status.planned
+        if self._published:
+            newest = max(newest, self._published[-1].move.id)
         move = next_motion(self._window, newest)
         if move is None:
             return None
@@ -197,7 +199,8 @@ class ElementalMovePlanner(Planner):
         done = read.status.value.done
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         if held >= 0:
-            situation = situation.holding(held, self._grip[1] if self._grip is not None else None)
+            grip = None if self._grip is None else self._grip[1]
+            situation = situation.holding(held, grip)
         for earlier in self._window:
             # A grasp may be reported done only after the object is reported held: it must not count
             # twice.

@@ -191,7 +191,8 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
             wanted.max_jerk = [limit.jerk]
             yield from _calculated(wanted)
         else:
-            yield (length / before if before > 0.0 else np.inf, start, before, 0.0, 0.0)
+            lasts_s = length / before if before > 0.0 else np.inf
+            yield (lasts_s, start, before, 0.0, 0.0)
 
 
 def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:

@@ -110,7 +110,8 @@ class CollisionChecker:
         """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
         self.held = row
         if self.longest is not None and (gripper := self.cell.gripper) is not None:
-            self.open_gripper(gripper.open if row is None else self.longest)
+            opening = gripper.open if row is None else self.longest
+            self.open_gripper(opening)
         self._offset[:3] = position
         self._offset[3:] = quaternion
         self._model.geom_contype[:] = self._contype
@@ -129,9 +130,8 @@ class CollisionChecker:
         lower the scene's."""
         self._q[:] = q
         self._least = np.inf if clearance is None else float(clearance)
-        return self._is_free(
-            -1 if self.held is None else self.cell.object_qpos[self.held], self._least
-        )
+        held_qpos = -1 if self.held is None else self.cell.object_qpos[self.held]
+        return self._is_free(held_qpos, self._least)
 
     def room(self, q: Array) -> float:
         """Return the largest clearance, in m and at most the scene's, with which `q` is free;
@@ -264,9 +264,12 @@ class CollisionChecker:
             self._require(held, held, ANY_DISTANCE)
         if self._touched is not None:
             touched = self._row_geoms[self._touched]
-            is_held = self._touched == self.held
-            self._require(touched, gripper, ANY_DISTANCE if is_held else -MAX_TOUCH_DEPTH_M)
-            self._require(touched, supports, -MAX_HELD_DEPTH_M if is_held else -MAX_TOUCH_DEPTH_M)
+            to_gripper = to_supports = -MAX_TOUCH_DEPTH_M
+            if self._touched == self.held:
+                to_gripper = ANY_DISTANCE
+                to_supports = -MAX_HELD_DEPTH_M
+            self._require(touched, gripper, to_gripper)
+            self._require(touched, supports, to_supports)
             self._require(gripper, supports, self._margin)
 
     def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:

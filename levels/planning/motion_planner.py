@@ -84,7 +84,8 @@ class MotionPlanner:
 
     def lay_out(self, move: Move, situation: Situation) -> None:
         """Set the collision checker to `situation` with the contacts that `move` intends."""
-        situation.lay_out(self.checker, move.object if move.touches else None)
+        touched = move.object if move.touches else None
+        situation.lay_out(self.checker, touched)
 
     def goal(self, move: Move, start: Array) -> Array:
         """Return the configuration at the end of a free motion, with the checker as it is set.

@@ -192,8 +192,10 @@ def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
     frictionless."""
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
+    elif model.geom_priority[one] > model.geom_priority[other]:
+        mixed = [one]
     else:
-        mixed = [one if model.geom_priority[one] > model.geom_priority[other] else other]
+        mixed = [other]
     if max(model.geom_condim[k] for k in mixed) == 1:
         return 0.0
     return float(max(model.geom_friction[k, 0] for k in mixed))

@@ -90,7 +90,8 @@ class Guard:
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
         self._checker.place(world.position, world.quaternion)
         far_clear = self._far_is_clear(path, begin)
-        near_clear = self._near_is_clear(path, trajectory, time_s, None if still else world)
+        moving = None if still else world
+        near_clear = self._near_is_clear(path, trajectory, time_s, moving)
         return near_clear and (far_clear or not still)
 
     def _near_is_clear(

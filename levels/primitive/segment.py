@@ -64,15 +64,16 @@ def read_segment(command: Message, serial: int) -> MotionSegment:
     record = command.segments[window(command).index(serial)]
     count = int(record["count"])
     kind = int(record["kind"])
-    held = int(record["object"])
+    row = int(record["object"])
     if kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
         raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
     if not np.isfinite([record["by"], record["opening"], record["force"]]).all():
         raise ValueError(f"segment {serial}: by, opening or force is not finite")
+    held = row if row >= 0 else None
     return MotionSegment(
         id=serial,
         kind=SegmentKind(kind),
-        object=held if held >= 0 else None,
+        object=held,
         touch=bool(record["touch"]),
         waypoints=record["waypoints"][:count].copy(),
         blend=record["blend"][:count].copy(),
@@ -106,11 +107,12 @@ def recall(read: Ports) -> Memory | None:
     command = read.last_command
     if not (status.is_there and command.is_there and command.value.id):
         return None
+    held = status.value.held if status.value.held >= 0 else None
     return Memory(
         done=status.value.done,
         interrupted=status.value.current,
         progress=status.value.progress,
-        held=status.value.held if status.value.held >= 0 else None,
+        held=held,
         opening=command.value.opening,
         force=command.value.force,
     )

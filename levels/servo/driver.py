@@ -261,9 +261,8 @@ class ArmDriver(Executor):
             self._drive(sensed, reaction, missed, tick)
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
-        self._brakes.after_cycle(
-            tick, self.findings, BY_DEMAND if self.demand else self.stopping.cause
-        )
+        cause = BY_DEMAND if self.demand else self.stopping.cause
+        self._brakes.after_cycle(tick, self.findings, cause)
         self._report(write, sensed, reaction)
         self.orders.report(write.status, self.rests_on)
         self.arm.save(write.state)
@@ -275,7 +274,8 @@ class ArmDriver(Executor):
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
         restores the arm."""
         if not self._started:
-            self._start(before.value if before.is_there else None, tick)
+            state = before.value if before.is_there else None
+            self._start(state, tick)
             return False
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
@@ -313,7 +313,8 @@ class ArmDriver(Executor):
             self.started()
             self._adopted = self.enabling.is_enabled
         if self.arm.braked:
-            self._brakes.start(self.arm.tick, AT_START if before is None else NO_TORQUE)
+            cause = AT_START if before is None else NO_TORQUE
+            self._brakes.start(self.arm.tick, cause)
         self.arm.step(tick - self.arm.tick)
         self._brakes.after_waiting(tick, self.findings)
         self._started = self.abandoned = True

@@ -189,7 +189,9 @@ class ServoExecutor(ArmDriver):
         """Return what the status says of set points."""
         operator = self.operator
         cut = self.reference.refused + self._loop.cut
-        kept = self.stopping.reason or (operator.reason if operator.stands else "")
+        kept = self.stopping.reason
+        if operator.stands and not kept:
+            kept = operator.reason
         holding = self.abandoned or self.reference.holding
         stopped = self.abandoned or reaction > 0 or operator.stands
         return self.command, holding, stopped, cut, kept

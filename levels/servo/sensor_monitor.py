@@ -326,7 +326,8 @@ class SensorMonitor:
     def _settled(self, good: bool) -> bool:
         """Count good samples in a row; return whether they are enough to end the episode."""
         self._streak = self._streak + 1 if good else 0
-        if self._streak < (self._retry_cycles if self._unproven.any() else self._good_cycles):
+        needed = self._retry_cycles if self._unproven.any() else self._good_cycles
+        if self._streak < needed:
             return False
         self._trust()
         return True

@@ -88,7 +88,9 @@ class Stopping:
 
     def remember(self, state: Message) -> None:
         """Fill in the state for `recall`."""
-        error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
+        error = self.error
+        if self.is_disabled and not error:
+            error = Error.DISABLED
         if (self._kept, error) != self._remembered:
             self._remembered = self._kept, error
             state.kept = self._kept
@@ -212,9 +214,9 @@ class Stopping:
         if joint < 0:
             return Cause(Error.SENSORS, sensors.missing, joint, read)
         text = f"sensor of '{self._joints[joint]}' reads {read:.4g} rad"
-        return Cause(
-            Error.SENSORS, f"{text}, off by {off:.3g}" if off == off else text, joint, read
-        )
+        if off == off:  # known: not NaN
+            text = f"{text}, off by {off:.3g}"
+        return Cause(Error.SENSORS, text, joint, read)
 
     def _about_torque(self, refused: Finding) -> Cause:
         what = (

@@ -261,7 +261,8 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
         reachable = motion.ik.reachable(tool, here)
         if why := next(filter(None, map(motion.checker.why, reachable)), ""):
             return Refused(Error.NO_PATH, why)
-        beyond = beyond or (tool if not reachable else None)
+        if beyond is None and not reachable:
+            beyond = tool
     end = beyond or tools[0]
     out_of_reach = f"out of reach: {in_metres(end)}; in reach"
     if motion.ik.reachable(end, here, turned=False):

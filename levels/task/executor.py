@@ -188,7 +188,8 @@ class TaskExecutor(Executor):
         """Show the program's next moves, or the operator's goto."""
         detour = self._detour
         window = self._window
-        if self._error or not (detour.is_known if detour.move else plan.count):
+        is_ready = detour.is_known if detour.move else bool(plan.count)
+        if self._error or not is_ready:
             window.show_none(command)
         elif detour.move:
             window.show_one(detour.as_move(self._actions_done(plan)), command)

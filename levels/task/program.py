@@ -4,7 +4,7 @@ level."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -105,8 +105,10 @@ class TaskConfig(Program):
         self, robot: RobotConfig | None, scene: SceneConfig
     ) -> Iterator[tuple[str, Any, str]]:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
-        for k, action in enumerate(self.action if robot is not None else ()):
-            for key, value, why in misfits(action, cast(RobotConfig, robot), scene):
+        if robot is None:
+            return
+        for k, action in enumerate(self.action):
+            for key, value, why in misfits(action, robot, scene):
                 yield f"action[{k}].{key}", value, why
 
 

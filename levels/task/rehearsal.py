@@ -51,12 +51,14 @@ class Rehearsal:
         move cannot be done.
         """
         ends_at = self.q if joints is None else joints
+        if tool is None:
+            tool = self.motion.ik.tool_at(ends_at)
         move = Move(
             id=len(self.moves) + 1,
             action=action,
             verb=verb,
             object=row,
-            tool=tool if tool is not None else self.motion.ik.tool_at(ends_at),
+            tool=tool,
             joints=ends_at,
             posture=verb is Verb.MOVE and joints is not None,
             by_s=0.0,
@@ -117,8 +119,10 @@ def finish_times(
         at_hand = max(planned, shown) if move.is_motion else shown
         room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0
         arrives = max(at_hand, room) + 2.0 * below
-        begun = max(arrives + needs.beginning, done[k - 1] if k else 0.0)
-        end = begun + (duration_s + needs.settling if move.is_motion else needs.gripping)
+        before = done[-1] if done else 0.0
+        begun = max(arrives + needs.beginning, before)
+        lasts_s = duration_s + needs.settling if move.is_motion else needs.gripping
+        end = begun + lasts_s
         # A move with a time is stretched to end just before it: the next one begins no sooner.
         done.append(max(end, move.by_s - 2.0 * below))
     return [time_s + 2.0 * below + periods.own_s for time_s in done]

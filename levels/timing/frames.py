@@ -129,13 +129,15 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
                 slack_ns = done - task.cost_ns
             elif is_last:
                 slack_ns = limit - end
+            ends_by = limit if is_last or end is None else end
+            until = "" if after is None else after.name
             yield FramePlace(
                 board=task.name,
                 offset_ns=begins - start,
                 job_ns=task.cost_ns,
-                limit_ns=(limit if is_last or end is None else end) - start,
+                limit_ns=ends_by - start,
                 slack_ns=slack_ns,
-                until="" if after is None else after.name,
+                until=until,
             )
             begins = limit if end is None else end
 
@@ -143,4 +145,5 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
 def _worked(spans: Sequence[Span], task: TimedTask, limit: int) -> tuple[int | None, int]:
     """Return the end of a job if it is not after `limit`, and its processor time until then."""
     done = sum(min(span.end_ns, limit) - span.start_ns for span in spans if span.start_ns < limit)
-    return (spans[-1].end_ns if done == task.cost_ns else None), done
+    end = spans[-1].end_ns if done == task.cost_ns else None
+    return end, done

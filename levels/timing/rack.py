@@ -73,6 +73,11 @@ class BoardTiming:
         plan."""
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
 
+    @property
+    def exchange_ns(self) -> int:
+        """The budget's time for reading the plan in each cycle; 0: no planner, or no budget."""
+        return self.budget.exchange_ns if self.has_planner and self.budget is not None else 0
+
 
 def spanned(names: Sequence[str]) -> str:
     """Return names as text; of three or more that are numbered in order the first and the last,
@@ -83,7 +88,11 @@ def spanned(names: Sequence[str]) -> str:
             rows[-1].append(name)
         else:
             rows.append([name])
-    return ", ".join(f"{row[0]} ... {row[-1]}" if len(row) > 2 else ", ".join(row) for row in rows)
+    return ", ".join(map(_shortened, rows))
+
+
+def _shortened(row: Sequence[str]) -> str:
+    return f"{row[0]} ... {row[-1]}" if len(row) > 2 else ", ".join(row)
 
 
 def _following(name: str) -> str:
@@ -311,10 +320,9 @@ class RackTiming:
         """Return the timing of a level that has a budget. Raises `KeyError`."""
         table = self.boards[board]
         budget = table.budget
-        plans = table.is_plan_budgeted
         if budget is None:
             raise KeyError(board)
-        return LevelTiming(
+        executor = LevelTiming(
             board=board,
             coupling=table.coupling,
             cycle_ns=table.every * self.tick_ns,
@@ -322,11 +330,20 @@ class RackTiming:
             read_ns=budget.read_ns + self.interrupted_ns(board),
             execution_ns=budget.process_ns,
             write_ns=budget.write_ns,
-            exchange_ns=budget.exchange_ns if table.has_planner else 0,
-            plan_ns=budget.plan_ns + self.interrupted_ns(f"{board}.planner") if plans else None,
-            update_ns=budget.update_ns if plans else 0,
-            within_cycles=table.within_cycles if plans else None,
-            plan_within_ns=table.plan_within_ns if plans else None,
+            exchange_ns=table.exchange_ns,
+            plan_ns=None,
+            update_ns=0,
+            within_cycles=None,
+            plan_within_ns=None,
+        )
+        if not table.is_plan_budgeted:
+            return executor
+        return replace(
+            executor,
+            plan_ns=budget.plan_ns + self.interrupted_ns(f"{board}.planner"),
+            update_ns=budget.update_ns,
+            within_cycles=table.within_cycles,
+            plan_within_ns=table.plan_within_ns,
         )
 
     def interrupted_ns(self, task: str) -> int:
@@ -338,7 +355,9 @@ class RackTiming:
     def slice_ticks(self, task: str) -> int:
         """Return the cycle of an executor, or the time slice of a planner's plan, ticks."""
         board = self.boards[task.removesuffix(".planner")]
-        return board.every * (1 if task == board.name else board.within_cycles)
+        if task == board.name:
+            return board.every
+        return board.every * board.within_cycles
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
@@ -368,12 +387,15 @@ class RackTiming:
             every_ns=board.every * self.tick_ns,
             phase_ns=board.phase * self.tick_ns,
             parts=_nonzero(
-                Part(Unit.EXCHANGE, budget.exchange_ns if board.has_planner else 0),
+                Part(Unit.EXCHANGE, board.exchange_ns),
                 Part(Unit.READ, budget.read_ns + self.interrupted_ns(board.name)),
                 Part(Unit.PROCESS, budget.process_ns),
                 Part(Unit.WRITE, budget.write_ns),
             ),
         )
+        if not board.has_planner:
+            return [executor]
+        ceiling = board.priority if board.is_critical else 0
         planner = replace(
             executor,
             name=f"{board.name}.planner",
@@ -385,9 +407,9 @@ class RackTiming:
                 Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical),
             ),
             within_cycles=board.within_cycles,
-            ceiling=board.priority if board.is_critical else 0,
+            ceiling=ceiling,
         )
-        return [executor, planner] if board.has_planner else [executor]
+        return [executor, planner]
 
     @cached_property
     def cores(self) -> dict[str, int]:

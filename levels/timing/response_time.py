@@ -71,13 +71,14 @@ def response_time(
     if cost and sum(Fraction(c, t) for c, t, _ in above) >= 1:
         return None
     periods = (period for _, period, _ in (*above, *sharing))
-    longest = max([cost, blocking, jitter, *periods])
+    if horizon is None:
+        horizon = 100 * max([cost, blocking, jitter, *periods])
 
     def work(until: int) -> int:
         turns = sum(min(_released(until, load), cost + turn) for load in sharing)
         return blocking + cost + turns + sum(_released(until, load) for load in above)
 
-    end = _fixed_point(work, blocking + cost, 100 * longest if horizon is None else horizon)
+    end = _fixed_point(work, blocking + cost, horizon)
     return None if end is None else end + jitter
 
 

@@ -211,7 +211,8 @@ def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
 def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
     for name, inbox in rack.inboxes.items():
         waiting = inbox.burst.waiting
-        relation = Relation(inf if waiting is None else waiting, "<=", inbox.depth)
+        most = inf if waiting is None else waiting
+        relation = Relation(most, "<=", inbox.depth)
         yield EquationVerdict.of(
             INBOX, name, relation, "interrupts that wait after a burst of all senders <= depth", "1"
         )

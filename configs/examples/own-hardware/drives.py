@@ -71,12 +71,16 @@ class Drives:
                 self._make_ready()
             if self._silent_ticks >= self._timeout_ticks:
                 self.brake()
-            for _ in range(0 if self.braked else STEPS):
-                inertia, bias = self._dynamics.terms(self.position, self.velocity)
-                friction = self._dynamics.friction(self.velocity)
-                self.velocity += self._step_s * solve(inertia, self.torque - bias - friction)
-                self.position += self._step_s * self.velocity
+            if not self.braked:
+                self._move()
             self._silent_ticks += 1
+
+    def _move(self) -> None:
+        for _ in range(STEPS):
+            inertia, bias = self._dynamics.terms(self.position, self.velocity)
+            friction = self._dynamics.friction(self.velocity)
+            self.velocity += self._step_s * solve(inertia, self.torque - bias - friction)
+            self.position += self._step_s * self.velocity
 
     def _make_ready(self) -> None:
         self._waited_ticks += 1

@@ -73,12 +73,13 @@ def _table(message: Message) -> dict[str, Any]:
         case OrderAction.HOME, _:
             return {"do": "home"}
         case OrderAction.TRANSFER, _:
+            yaw = message.yaw if message.turned else None
             return {
                 "do": "transfer",
                 "object": message.object,
                 "to": place,
                 "lift": message.lift,
-                "yaw": message.yaw if message.turned else None,
+                "yaw": yaw,
             }
         case OrderAction.GOTO, Goal.JOINTS:
             return {"do": "goto", "joints": message.joints[: message.count].tolist()}

@@ -97,11 +97,12 @@ class Motions:
             raise LevelError(
                 f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}"
             )
+        frame = self._bodies.index(body) if body else WORLD
         return self._request(
             kind=MotionKind.POSE,
             position=position,
             quaternion=quaternion,
-            body=self._bodies.index(body) if body else WORLD,
+            body=frame,
             live=live,
             touch=guard,
             **times,
@@ -113,12 +114,11 @@ class Motions:
 
     def grip(self, opening: float | None = None, force: float | None = None) -> int:
         """Bring the gripper to an opening, m, with at most `force`, N; default: close it."""
-        gripper = self._gripper
-        return self._request(
-            kind=MotionKind.GRIP,
-            opening=gripper.closed if opening is None else opening,
-            force=gripper.force if force is None else force,
-        )
+        if opening is None:
+            opening = self._gripper.closed
+        if force is None:
+            force = self._gripper.force
+        return self._request(kind=MotionKind.GRIP, opening=opening, force=force)
 
     def release(self) -> int:
         """Open the gripper."""
