@@ -166,17 +166,9 @@ class Journal:
         """Record an event that happens now, or happened at CLOCK_MONOTONIC `at_ns` and `tick`."""
         now_ns = time.time_ns()
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
-        self.keep(
-            Event(
-                stamp_ns,
-                self._tick if tick is None else tick,
-                kind,
-                board,
-                text,
-                code,
-                subject=subject,
-            )
-        )
+        if tick is None:
+            tick = self._tick
+        self.keep(Event(stamp_ns, tick, kind, board, text, code, subject=subject))
 
     def keep(self, event: Event) -> None:
         """Record an event and pass it on."""
@@ -295,9 +287,8 @@ class Ending:
         reading = self._observer.peek()
         if reading.value.state in (State.DONE, State.ERROR):
             return 0
-        ticks = self._segment.words[System.TICK] - (
-            self._observer.newest if reading.is_there else 0
-        )
+        newest = self._observer.newest if reading.is_there else 0
+        ticks = self._segment.words[System.TICK] - newest
         return ticks if ticks > self._silent else 0
 
 

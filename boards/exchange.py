@@ -36,7 +36,10 @@ def exchange_message(reads: Mapping[str, Source]) -> MessageType:
 
 def _labels(reads: Mapping[str, Source]) -> Iterator[str]:
     for port, source in reads.items():
-        yield from [port] if isinstance(source, str) else [f"{port}_{board}" for board in source]
+        if isinstance(source, str):
+            yield port
+        else:
+            yield from (f"{port}_{board}" for board in source)
 
 
 def _fields(label: str) -> tuple[Field, Field]:

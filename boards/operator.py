@@ -47,7 +47,8 @@ def describe(message: Message) -> str:
             f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
         )
     name = f" {message.name}" if message.name else ""
-    return what + name + (f" {Goal(goal).name.lower()}" if goal else "")
+    kind = f" {Goal(goal).name.lower()}" if goal else ""
+    return f"{what}{name}{kind}"
 
 
 def _numbers(values: np.ndarray) -> str:

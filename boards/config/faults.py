@@ -39,16 +39,21 @@ def injection(fault: FaultConfig, config: RackConfig, layout: Layout) -> Injecti
 def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: str) -> Injection:
     kind = KINDS[fault.kind]
     names = [process.name for process in layout.processes]
+    task = -1 if fault.board == CLOCK else names.index(fault.board)
+    seed = fault.seed
+    if seed is None:
+        # Two faults of one config must not draw the same random numbers.
+        seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
+    when = None if fault.when is None else condition(fault.when, layout)
     return Injection(
         kind=kind.number,
-        task=-1 if fault.board == CLOCK else names.index(fault.board),
+        task=task,
         mailbox=_mailbox(fault, kind, layout),
         tick=first_tick(fault, layout.clock_ns),
         ticks=_ticks(fault, layout),
         phase=int(fault.phase * PHASES),
-        # Two faults of one config must not draw the same random numbers.
-        seed=crc32(f"{config.seed} {place}".encode()) % SEEDS if fault.seed is None else fault.seed,
-        when=None if fault.when is None else condition(fault.when, layout),
+        seed=seed,
+        when=when,
         parameters=tuple(
             float(fault.parameters.get(p.name, p.default or 0.0)) for p in kind.parameters
         ),
@@ -59,12 +64,13 @@ def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
     """Return the index of the mailbox; -1: all that the task writes, or none."""
     if fault.mailbox is None and kind.where != "bus":
         return -1
-    named = (at for at, box in enumerate(layout.mailboxes) if box.name == fault.mailbox)
-    # One message is forged, in one mailbox: by default the first that has a reader.
-    own = (
-        at for at, box in enumerate(layout.mailboxes) if box.writer == fault.board and box.readers
-    )
-    return next(own if fault.mailbox is None else named, -1)
+    boxes = enumerate(layout.mailboxes)
+    if fault.mailbox is None:
+        # One message is forged, in one mailbox: by default the first that has a reader.
+        found = (at for at, box in boxes if box.writer == fault.board and box.readers)
+    else:
+        found = (at for at, box in boxes if box.name == fault.mailbox)
+    return next(found, -1)
 
 
 def _ticks(fault: FaultConfig, layout: Layout) -> int:

@@ -62,9 +62,10 @@ def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = Non
     A script contains `[[fault]]` tables and nothing else. A name means a script in the folder of
     the rack, `own`, if it has one of its own, else a bundled script. Raises `ConfigError`.
     """
-    path = _path(
-        name_or_path, "--faults", *([] if own is None or own == CONFIGS else [own]), FAULTS
-    )
+    folders = [FAULTS]
+    if own is not None and own != CONFIGS:
+        folders = [own, FAULTS]
+    path = _path(name_or_path, "--faults", *folders)
     script = _tables(path)
     wrong = [
         Mistake(
@@ -75,8 +76,10 @@ def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = Non
     ]
     if wrong:
         raise ConfigError(wrong)
-    own = tables.get("fault", [])
-    return {**tables, "fault": [*(own if isinstance(own, list) else []), *script.get("fault", [])]}
+    faults = tables.get("fault")
+    if not isinstance(faults, list):
+        faults = []
+    return {**tables, "fault": [*faults, *script.get("fault", [])]}
 
 
 def names(folder: Path = CONFIGS) -> list[str]:
@@ -159,11 +162,8 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
     known = [folder for folder in folders if not is_path or text in names(folder)]
-    files = [
-        *([file_at(Path(text))] if is_path else []),
-        *(_named(text, folder) for folder in known),
-        *([] if is_path else [_named(text, Path.cwd())]),
-    ]
+    named = [_named(text, folder) for folder in known]
+    files = [file_at(Path(text)), *named] if is_path else [*named, _named(text, Path.cwd())]
     found = next((file for file in files if file is not None), None)
     if found is None:
         known_names = names(folders[-1])

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -222,7 +223,12 @@ class LayoutMaker:
         board = self._config.board[place.board]
         every = self._wiring.every[place.board]
         wake = board.wake or self._config.clock.wake
-        is_planner = place.role == "planner"
+        within_cycles = 1
+        if place.role == "planner":
+            within_cycles = board.within_cycles
+            if wake == "poll":
+                # The planner of a polling executor must not poll too.
+                wake = "timer"
         return TaskSpec(
             name=place.name,
             board=place.board,
@@ -231,10 +237,9 @@ class LayoutMaker:
             core=obtained_core(place.core),
             priority=place.priority,
             every=every,
-            within_cycles=board.within_cycles if is_planner else 1,
+            within_cycles=within_cycles,
             depth=depth_for(self._kept, every),
-            # The planner of a polling executor must not poll too.
-            wake="timer" if wake == "poll" and is_planner else wake,
+            wake=wake,
             phase=board.phase,
         )
 
@@ -291,22 +296,30 @@ def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
     for field in kind.fields:
         dtype, offset = offsets[field.name][:2]
         scalar, shape = dtype.subdtype or (dtype, ())
-        is_group = isinstance(field.kind, MessageType)
+        type_name = np.dtype(scalar).str
+        inner: tuple[FieldSpec, ...] = ()
+        if isinstance(field.kind, MessageType):
+            type_name = f"V{scalar.itemsize}"
+            inner = _specs(field.kind, scalar)
+        unit, values = _unit(field.unit)
         specs.append(
             FieldSpec(
                 name=field.name,
-                kind=f"V{scalar.itemsize}" if is_group else np.dtype(scalar).str,
+                kind=type_name,
                 shape=tuple(shape),
                 offset=offset,
-                unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
+                unit=unit,
                 meaning=field.meaning,
-                fields=_specs(field.kind, scalar) if isinstance(field.kind, MessageType) else (),
-                values=(
-                    ()
-                    if isinstance(field.unit, str)
-                    else tuple((n.name.lower(), int(n)) for n in field.unit)
-                ),
+                fields=inner,
+                values=values,
                 length=field.length,
             )
         )
     return tuple(specs)
+
+
+def _unit(unit: str | type[IntEnum]) -> tuple[str, tuple[tuple[str, int], ...]]:
+    """Return the name of a unit, and the names of its numbers if it is an enum."""
+    if isinstance(unit, str):
+        return unit, ()
+    return unit.__name__, tuple((number.name.lower(), int(number)) for number in unit)

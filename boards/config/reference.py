@@ -19,7 +19,7 @@ from rack.boards.config.rules.mailboxes import exchange, ports
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.wiring import Wiring
 from rack.boards.errors import ConfigError, shown
-from rack.boards.faults.kind import KINDS
+from rack.boards.faults.kind import KINDS, Parameter
 
 UNIT = re.compile(
     r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N"
@@ -133,7 +133,8 @@ def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[Ke
     for key, found in inner.items():
         for entry, at in found:
             variant = at.variant.rpartition(" ")[2].strip('"')
-            below = ".".join(part for part in ("" if name == WHOLE else name, key, variant) if part)
+            parts = [key, variant] if name == WHOLE else [name, key, variant]
+            below = ".".join(filter(None, parts))
             yield from _walk(
                 entry, known, below, at._replace(path=f"{place.path}.{at.path}".lstrip("."))
             )
@@ -157,15 +158,18 @@ def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Pl
 
 def _key(name: str, entry: Schema, is_required: bool) -> Key:
     description = entry.get("description", "")
-    unit = UNIT.search(description)
+    found = UNIT.search(description)
+    unit = found[1] if found else ""
     given = entry.get("default")
     default = "" if given in (None, [], {}) else shown(given)
+    if is_required:
+        default = REQUIRED
     return Key(
         name=name,
         type=_type(entry),
-        unit=unit[1] if unit else "",
+        unit=unit,
         permitted=_permitted(entry),
-        default=REQUIRED if is_required else default,
+        default=default,
         meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
     )
 
@@ -205,7 +209,8 @@ def _permitted(entry: Schema) -> str:
 
 def _range(entry: Schema) -> str:
     """Return the permitted values of a type; for a list, those of its items."""
-    if values := entry.get("enum") or ([entry["const"]] if "const" in entry else []):
+    values = [entry["const"]] if "const" in entry else entry.get("enum")
+    if values:
         return ", ".join(map(shown, values))
     if (held := _held(entry)) is not None:
         count = (
@@ -244,21 +249,19 @@ def _summary(docstring: str) -> str:
     return text[:1].lower() + text[1:]
 
 
+def _key_of(parameter: Parameter) -> Key:
+    kind = "integer" if parameter.is_whole else "number"
+    unit = "" if parameter.unit == "1" else parameter.unit
+    default = REQUIRED if parameter.default is None else _number(parameter.default)
+    permitted = f"{_number(parameter.least)} to {_number(parameter.most)}"
+    return Key(parameter.name, kind, unit, permitted, default, parameter.meaning)
+
+
 def _fault_kinds() -> Iterator[KeyTable]:
     """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides
     the common ones."""
     for kind in KINDS:
-        keys = [
-            Key(
-                name=parameter.name,
-                type="integer" if parameter.is_whole else "number",
-                unit="" if parameter.unit == "1" else parameter.unit,
-                permitted=f"{_number(parameter.least)} to {_number(parameter.most)}",
-                default=REQUIRED if parameter.default is None else _number(parameter.default),
-                meaning=parameter.meaning,
-            )
-            for parameter in kind.parameters
-        ]
+        keys = [_key_of(parameter) for parameter in kind.parameters]
         if keys:
             yield KeyTable(
                 f"fault.{kind.name}",

@@ -134,10 +134,11 @@ class Resolved:
         if ends_run is not None:
             writer = self.layout.mailbox(ends_run).writer
             silent = max(silent, 8 * self.layout.task(writer).every)
+        stop_tick = 0 if seconds is None else max(1, self._ticks(seconds))
         return ClockWiring(
             lockstep=clock.mode == "lockstep",
             period_ns=round(tick_ns / clock.speed),
-            stop_tick=0 if seconds is None else max(1, self._ticks(seconds)),
+            stop_tick=stop_tick,
             ends_run=ends_run,
             linger=self._ticks(LINGER_S),
             silent=silent,
@@ -324,7 +325,9 @@ class _Examined:
         # What is on the host side, a bus adapter exchanges by itself.
         of_host = self._wiring.of_host
         from_host = self._wiring.from_host
-        critical = not is_executor and is_critical(self._config, layout, spec.board)
+        critical_priority = 0
+        if not is_executor and is_critical(self._config, layout, spec.board):
+            critical_priority = board.priority
         return TaskWiring(
             task=ports.task,
             target=reference(self._config, ports.place),
@@ -335,7 +338,7 @@ class _Examined:
             },
             outputs={port: box for port, box in ports.writes.items() if box not in of_host},
             context=self._contexts[spec.board],
-            critical_priority=board.priority if critical else 0,
+            critical_priority=critical_priority,
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
@@ -400,7 +403,9 @@ def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]
     """Yield place and table for the valid tables of a list; the mistakes of the others are already
     known."""
     entries = tables.get(key)
-    for at, entry in enumerate(entries if isinstance(entries, list) else []):
+    if not isinstance(entries, list):
+        return
+    for at, entry in enumerate(entries):
         with suppress(ValidationError):
             yield f"{key}[{at}]", kind.model_validate(entry)
 

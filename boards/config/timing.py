@@ -36,6 +36,8 @@ def rack_timing(
     goal_ms = config.timing.response_ms
     clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
     parts = (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else ()
+    goal_ns = None if goal_ms is None else goal_ms * NS_PER_MS
+    schedule = None if config.schedule is None else frames(config.schedule, config.clock_ns)
     return RackTiming(
         is_lockstep=config.clock.mode == "lockstep",
         speed=config.clock.speed,
@@ -46,9 +48,9 @@ def rack_timing(
         boards={name: _board(config, layout, name, found.get(name)) for name in config.board},
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
-        response_goal_ns=None if goal_ms is None else goal_ms * NS_PER_MS,
+        response_goal_ns=goal_ns,
         inboxes=inboxes(layout),
-        schedule=None if config.schedule is None else frames(config.schedule, config.clock_ns),
+        schedule=schedule,
     )
 
 
@@ -91,6 +93,8 @@ def without_interrupts(timing: RackTiming, found: Mapping[str, Budget]) -> dict[
 def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None) -> BoardTiming:
     board = config.board[name]
     within_ms = None if board.budget is None else board.budget.plan_within_ms
+    within_ns = None if within_ms is None else round(within_ms * NS_PER_MS)
+    planner_core = board.core if board.planner_core is None else board.planner_core
     return BoardTiming(
         name=name,
         above=tuple(upper for upper, lower in config.links() if lower == name),
@@ -100,12 +104,12 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
         within_cycles=board.within_cycles,
         core=board.core,
         priority=board.priority,
-        planner_core=board.core if board.planner_core is None else board.planner_core,
+        planner_core=planner_core,
         planner_priority=board.planner_priority,
         has_planner=board.planner is not None,
         is_critical=is_critical(config, layout, name),
         budget=budget,
-        plan_within_ns=None if within_ms is None else round(within_ms * NS_PER_MS),
+        plan_within_ns=within_ns,
         queues=tuple(box.name for box in layout.mailboxes if box.capacity and name in box.readers),
         phase=board.phase,
         reads=_reads(layout, name),

@@ -149,10 +149,10 @@ def _put(node: Any, keys: list[str], value: Any) -> Any:
     if isinstance(node, list):
         if key not in map(str, range(len(node))):
             raise LookupError(f"{shown(key)} is not an index of a list of {len(node)}")
-        return [
-            _put(item, rest, value) if place == int(key) else item
-            for place, item in enumerate(node)
-        ]
+        items = list(node)
+        items[int(key)] = _put(items[int(key)], rest, value)
+        return items
     if not isinstance(node, dict):
         raise LookupError(f"{shown(key)} cannot be set in {shown(node)}, which is not a table")
-    return {**node, key: _put(node.get(key, {} if rest else None), rest, value)}
+    empty: Tables | None = {} if rest else None
+    return {**node, key: _put(node.get(key, empty), rest, value)}

@@ -115,7 +115,8 @@ class TaskPorts:
 
 def table_of(place: TaskPlace) -> str:
     """Return the table of a task's board, or of a host board, as in "board.servo"."""
-    return f"{'host' if place.role == 'host' else 'board'}.{place.board}"
+    kind = "host" if place.role == "host" else "board"
+    return f"{kind}.{place.board}"
 
 
 def key_of(place: TaskPlace) -> str:
@@ -306,7 +307,9 @@ class Wiring:
         return {place: with_exchange(ports) for place, ports in found.items()}
 
     def _periods(self) -> Iterator[tuple[str, int]]:
-        for name in self.config.board if "clock" not in self.broken else ():
+        if "clock" in self.broken:
+            return
+        for name in self.config.board:
             with suppress(ClockError):
                 yield name, self.config.every(name)
 

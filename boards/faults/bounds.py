@@ -79,8 +79,9 @@ class BoundCase:
         """The affected mailboxes that the reader reads; without a `reader`, those that any task
         reads."""
         struck = struck_mailboxes(self.layout, self.injection.mailbox, self.board)
-        reader = self.reader
-        return tuple(m for m in struck if (reader in m.readers if reader else m.readers))
+        if self.reader:
+            return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
+        return tuple(mailbox for mailbox in struck if mailbox.readers)
 
     @property
     def is_planner(self) -> bool:
@@ -149,8 +150,12 @@ class Bound:
 def cycles(count: int) -> Bound:
     """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host
     board has none."""
+
+    def ticks(case: BoundCase) -> int | None:
+        return None if case.is_host else count * case.cycle
+
     text = counting(count, "cycle") if count else "the same cycle"
-    return Bound(text, lambda case: None if case.is_host else count * case.cycle)
+    return Bound(text, ticks)
 
 
 def cycles_and_time(count: int, time_ns: int) -> Bound:
@@ -176,9 +181,11 @@ def writes(count: int) -> Bound:
 def missing_writes(count: int) -> Bound:
     """Return a bound of `count` periods without a message; none for a planner, which writes at no
     fixed period."""
-    return Bound(
-        counting(count, "write"), lambda case: None if case.is_planner else count * case.write
-    )
+
+    def ticks(case: BoundCase) -> int | None:
+        return None if case.is_planner else count * case.write
+
+    return Bound(counting(count, "write"), ticks)
 
 
 def delayed(parameter: str) -> Bound:
@@ -226,4 +233,4 @@ NOT_ARMED = Bound("the launch fails", lambda case: None)
 def counting(number: float, noun: str) -> str:
     """Return a number with its noun, as in "1 tick" or "3 ticks"."""
     text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
-    return f"{text} {noun}{'' if text == '1' else 's'}"
+    return f"1 {noun}" if text == "1" else f"{text} {noun}s"

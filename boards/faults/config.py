@@ -22,7 +22,8 @@ def _seconds(value: Any) -> Any:
     found = DURATION.fullmatch(value)
     if found is None:
         raise ValueError('should be a time, as in "0.5s", "20ms" or 0.5')
-    return float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)
+    number = float(found[1])
+    return number * 1e-3 if found[2] == "ms" else number
 
 
 def _number(value: Any) -> Any:

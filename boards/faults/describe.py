@@ -37,17 +37,22 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
     kind = kind_of(entry)
     stage = entry.stage
-    has_begun = stage in (Stage.ACTIVE, Stage.OVER)
+    mailbox = ""
+    if entry[Entry.MAILBOX] >= 0:
+        mailbox = layout.mailboxes[entry[Entry.MAILBOX]].name
+    until = None
+    if stage in (Stage.ACTIVE, Stage.OVER) and entry[Entry.UNTIL] != NEVER:
+        until = entry[Entry.UNTIL]
     return {
         "fault": entry.index,
         "kind": kind.name,
         "board": board_of(entry, layout),
-        "mailbox": layout.mailboxes[entry[Entry.MAILBOX]].name if entry[Entry.MAILBOX] >= 0 else "",
+        "mailbox": mailbox,
         "parameters": kind.values(entry),
         "text": describe(entry, layout, joints),
         "stage": stage.name.lower(),
         "begins": entry[Entry.FROM],
-        "until": entry[Entry.UNTIL] if has_begun and entry[Entry.UNTIL] != NEVER else None,
+        "until": until,
         "ticks": entry[Entry.TICKS],
         "struck_tick": entry[Entry.STRUCK_TICK],
         "acted": entry[Entry.COUNT],
@@ -66,4 +71,6 @@ def describe(
             unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
             about.append(f"{parameter.name} {value:g}{unit}")
     details = ", ".join(text for text in about if text)
-    return f"{kind.name}{target}{f' ({details})' if details else ''}"
+    if details:
+        return f"{kind.name}{target} ({details})"
+    return f"{kind.name}{target}"

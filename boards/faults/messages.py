@@ -171,7 +171,8 @@ class HoldLock(MessageStep):
         is_killed = bool(self.entry.parameters[0])
         if isinstance(writer, LockWriter) and not self.entry[Entry.COUNT] and writer.lock.acquire():
             self.acts(message)
-            os.kill(os.getpid(), signal.SIGKILL if is_killed else signal.SIGSTOP)
+            number = signal.SIGKILL if is_killed else signal.SIGSTOP
+            os.kill(os.getpid(), number)
             writer.lock.release()
         self.onward(message)
 
@@ -218,11 +219,13 @@ class FaultyWriter:
         A delayed message becomes visible together with that of the cycle in which it is written, so
         that reads depend on ticks alone, even with faults.
         """
+        if basis is None:
+            basis = tick
         self.flush(tick, now)
         self._written = True
         visible_at = self._writer.visible_at(tick, now)
         for _ in self._writer.outgoing():
-            self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
+            self._first(Outgoing(tick, tick, visible_at, basis))
         self._show()
         return self._written and self._writer.is_in_time(tick, now)
 

@@ -141,7 +141,8 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
         # Wake on the clock's grid, at the first tick at which the fault can begin or at the next
         # one. If that tick has passed, or the run has not started, sleep briefly: at this priority
         # a busy wait would starve all others.
-        time.sleep(min(wait_ns * 1e-9 if wait_ns > 0 else LEAST_S, LOOK_S))
+        wait_s = wait_ns * 1e-9 if wait_ns > 0 else LEAST_S
+        time.sleep(min(wait_s, LOOK_S))
     end = clock.time_of(entry[Entry.UNTIL])
     entry.acted(clock.now())
     while time.monotonic_ns() < end and not clock.is_stopped:

@@ -132,7 +132,9 @@ class BusAdapter(Adapter):
 
     def _resume_counts(self, status: Reader) -> None:
         before = status.peek()
-        for port, count in self._counts.items() if before.is_there else ():
+        if not before.is_there:
+            return
+        for port, count in self._counts.items():
             count.resume(getattr(before.value, port), status.newest)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:

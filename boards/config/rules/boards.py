@@ -119,7 +119,8 @@ def circles(wiring: Wiring) -> Iterator[Mistake]:
         at = circle.index(lower)
         walk = " -> ".join([*circle[at:], *circle[:at], lower])
         why = f"the levels form a circle, {walk}; the {end} level has no {key}"
-        yield Mistake(f"board.{board}.{key}", upper if board == lower else lower, why)
+        other = upper if board == lower else lower
+        yield Mistake(f"board.{board}.{key}", other, why)
 
 
 def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
@@ -265,11 +266,14 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
         key = "rate_hz" if board.every is None else "every"
         below = [cycle for cycle in fitting if cycle < every]
         above = [cycle for cycle in fitting if cycle > every]
-        rates = " or ".join(
-            f"{cycle * tick_ms:g} ms,"
-            f" {f'{1e3 / (cycle * tick_ms):g} Hz' if key == 'rate_hz' else f'every {cycle}'}"
-            for cycle in (*below[-1:], *above[:1])
-        )
+        nearest = (*below[-1:], *above[:1])
+        if key == "rate_hz":
+            written = [
+                f"{cycle * tick_ms:g} ms, {1e3 / (cycle * tick_ms):g} Hz" for cycle in nearest
+            ]
+        else:
+            written = [f"{cycle * tick_ms:g} ms, every {cycle}" for cycle in nearest]
+        rates = " or ".join(written)
         why = (
             f"a cycle of {every * tick_ms:g} ms does not fit the schedule, a multiple of the minor"
             f" frame, {table.minor_ms:g} ms, that divides the major one, {table.major_ms:g} ms;"

@@ -92,12 +92,14 @@ class FaultRules:
                 " --lockstep"
             )
             yield self._mistake("kind", why)
-        for key in ("for", "cycles") if kind.once else ():
-            if self._value(key) is not None:
-                yield self._mistake(key, f"{kind.name} strikes once and has no duration; remove it")
-        for key in ("tick", "at", "when") if kind.where == "start" else ():
-            if self._value(key) is not None:
-                yield self._mistake(key, f"{kind.name} strikes as the board starts; remove it")
+        if kind.once:
+            yield from self._without(
+                ("for", "cycles"), f"{kind.name} strikes once and has no duration; remove it"
+            )
+        if kind.where == "start":
+            yield from self._without(
+                ("tick", "at", "when"), f"{kind.name} strikes as the board starts; remove it"
+            )
         if self.fault.phase and not kind.within_tick:
             takers = _listed(other.name for other in KINDS if other.within_tick)
             yield self._mistake(
@@ -182,7 +184,8 @@ class FaultRules:
             )
         elif kind.where == "lock":
             locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
-            if wanted not in locked if wanted is not None else not locked:
+            is_locked = bool(locked) if wanted is None else wanted in locked
+            if not is_locked:
                 why = (
                     f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use"
                     f" it: {_listed(locked)}"
@@ -196,6 +199,12 @@ class FaultRules:
         return {
             name: (object,) if executor is None else executor.faults for name, executor in found
         }
+
+    def _without(self, keys: Iterable[str], why: str) -> Iterator[Mistake]:
+        """Check that none of these keys is given."""
+        for key in keys:
+            if self._value(key) is not None:
+                yield self._mistake(key, why)
 
     def _value(self, key: str) -> object:
         return self.fault.lasts if key == "for" else getattr(self.fault, key)

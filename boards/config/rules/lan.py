@@ -177,7 +177,8 @@ def at_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
     if table is None or mistake.place == ITSELF:
         return mistake
     if mistake.place == f"{ITSELF}.executor":
-        return Mistake(PLACE, None, mistake.why if find_spec("zenoh") else INSTALL)
+        why = mistake.why if find_spec("zenoh") else INSTALL
+        return Mistake(PLACE, None, why)
     port = mistake.place.removeprefix(_MAILBOX)
     if port != mistake.place and port in table.imports:
         return Mistake(f"{PLACE}.import.{port}.type", table.imports[port].type, mistake.why)

@@ -135,8 +135,10 @@ def cell(wiring: Wiring) -> Iterator[Mistake]:
             found = str(error)
     for line in _unknown_names(config.robot, config.scene) or filter(None, [found]):
         place, colon, why = line.partition(": ")
-        is_key = colon and place.startswith(("robot", "scene"))
-        yield Mistake(place, None, why) if is_key else Mistake("robot", None, line)
+        if colon and place.startswith(("robot", "scene")):
+            yield Mistake(place, None, why)
+        else:
+            yield Mistake("robot", None, line)
 
 
 def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:

@@ -123,7 +123,8 @@ def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
     if is_host == is_of_host:
         return ""
     if (source := wiring.passed.get(mailbox)) is None:
-        return f"it is on the {'host' if is_of_host else 'real-time'} side; {PASS_IT}"
+        side = "host" if is_of_host else "real-time"
+        return f"it is on the {side} side; {PASS_IT}"
     writer = source.partition(".")[0]
     same = "host" if is_host else "real-time"
     return (
