@@ -194,16 +194,17 @@ def run_commands() -> None:
             if error.errno not in (errno.EAGAIN, errno.EMFILE):
                 raise
             fail(refusal(error), 1)
-        fail(f"{shown(str(error.filename))}: {error.strerror}", 2 if error.errno in USAGE else 1)
+        status = 2 if error.errno in USAGE else 1
+        fail(f"{shown(str(error.filename))}: {error.strerror}", status)
     except Exception as error:
         # The parser's own, of a wrong usage; it is not imported for this.
         if hasattr(error, "show"):
             error.show(usage := StringIO())
             fail(usage.getvalue().rstrip(), 2)
-        status = exit_status(error)
-        if status is None:
+        known = exit_status(error)
+        if known is None:
             raise
-        fail(str(error), status)
+        fail(str(error), known)
 
 
 def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
@@ -224,7 +225,8 @@ def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
         case "status", [] | [_]:
             from rack.tools.commands.answers import show_status
 
-            return partial(show_status, names[0] if names else None, as_json)
+            name = names[0] if names else None
+            return partial(show_status, name, as_json)
         case "report", [folder]:
             from rack.tools.timing.analysis.stored import show_report
 

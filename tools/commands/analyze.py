@@ -74,7 +74,9 @@ def analyze(
     """
     folder = run if out is None else out
     if response:
-        sys.exit(0 if show(Recording(run), folder, as_json) else 1)
+        if not show(Recording(run), folder, as_json):
+            sys.exit(1)
+        return
     progress = reading_progress(silent=as_json)
     analysis = Analysis.of(Recording(run), percentile, progress)
     found = document(analysis)
@@ -93,4 +95,5 @@ def analyze(
     else:
         shown = text(analysis, terminal_width()) if verbose else brief(analysis)
         print_wrapped(f"{shown}\n\n{files}")
-    sys.exit(0 if analysis.holds else 1)
+    if not analysis.holds:
+        sys.exit(1)

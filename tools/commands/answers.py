@@ -20,9 +20,10 @@ def list_racks(as_json: bool) -> None:
 
     found = [describe(name) for name in racks()]
     rows = [[str(rack[key]) for key in ("rack", "state", "detail")] for rack in found]
-    print_answer(
-        found, table(("rack", "state", ""), rows, terminal_width()) if rows else "no racks", as_json
-    )
+    if rows:
+        print_answer(found, table(("rack", "state", ""), rows, terminal_width()), as_json)
+    else:
+        print_answer(found, "no racks", as_json)
 
 
 def describe(name: str) -> dict[str, str | int | float]:
@@ -87,11 +88,8 @@ def only_rack() -> str:
     from rack.backplane.segment import racks
 
     running = racks()
-    if len(running) != 1:
-        names = ", ".join(running)
-        raise (
-            Failure(f"RACK is missing; racks: {names}", 2)
-            if running
-            else Failure("no rack is running")
-        )
+    if not running:
+        raise Failure("no rack is running")
+    if len(running) > 1:
+        raise Failure(f"RACK is missing; racks: {', '.join(running)}", 2)
     return running[0]

@@ -206,7 +206,8 @@ def response(
         out,
         as_json,
     )
-    raise typer.Exit(0 if found.held else 1)
+    if not found.held:
+        raise typer.Exit(1)
 
 
 @bench.command()
@@ -297,7 +298,8 @@ def boards(
         )
     runs = Runs(seconds, rounds, share)
     found = show(lambda progress: measure(counts, runs, against, progress), plot, as_json)
-    raise typer.Exit(0 if found.exact else 1)
+    if not found.exact:
+        raise typer.Exit(1)
 
 
 @bench.command()
@@ -382,7 +384,8 @@ def systems(
         plot,
         as_json,
     )
-    raise typer.Exit(0 if found.worked else 1)
+    if not found.worked:
+        raise typer.Exit(1)
 
 
 @bench.command()
@@ -406,7 +409,8 @@ def hand(
     from rack.tools.lab.benches.hand import measure
 
     found = show(lambda progress: measure(rounds, share, progress), plot, as_json)
-    raise typer.Exit(0 if found.worked else 1)
+    if not found.worked:
+        raise typer.Exit(1)
 
 
 @bench.command()

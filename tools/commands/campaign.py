@@ -138,8 +138,11 @@ def campaign(
         raise Failure(
             f"{config}: no board ends the run: give --seconds, the simulated time of a run", 2
         )
-    # No faultless time in real time where only lockstep, or only kills, were ordered.
-    default_s = 0.0 if lockstep or kills is not None else FAULTLESS_S
+    if faultless is None:
+        # No faultless time in real time where only lockstep, or only kills, were ordered.
+        faultless = 0.0 if lockstep or kills is not None else FAULTLESS_S
+    if kills:
+        injections = 0
     if sizes is None:
         sizes = 0 if kills or realtime else SIZES
     modes: tuple[bool, ...] = (True, False)
@@ -147,17 +150,18 @@ def campaign(
         modes = (True,)
     elif realtime:
         modes = (False,)
+    loads = (True,) if load else (False, True)
     order = Order(
         name=config,
         config=found,
-        injections=0 if kills else injections,
+        injections=injections,
         seed=seed,
         modes=modes,
         kinds=kinds,
         kills=kills or 0,
         sizes=sizes,
-        faultless_s=default_s if faultless is None else faultless,
-        loads=(True,) if load else (False, True),
+        faultless_s=faultless,
+        loads=loads,
         seconds=seconds,
     )
     goes_on = out is not None and (out / ORDER).is_file()
@@ -170,7 +174,8 @@ def campaign(
         report, text = _write(work, results, time.monotonic() - started)
     lacking = "" if can_draw() else f"; {NO_PICTURES}"
     print_json(report) if as_json else print(f"{text}\n{folder}/{lacking}")
-    sys.exit(1 if report["shortfalls"] or report["interrupted"] else 0)
+    if report["shortfalls"] or report["interrupted"]:
+        sys.exit(1)
 
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:

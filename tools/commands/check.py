@@ -122,7 +122,9 @@ def check(
     fitting = repair(judged)
     if fix:
         _print_fixed(fitting, as_json)
-        sys.exit(1 if fitting.left else 0)
+        if fitting.left:
+            sys.exit(1)
+        return
     lacking = shared_out(found)
     stock = inventory(found, judged.layout, lacking)
     forecast = Forecast.of(judged.timing, not lacking)
@@ -150,7 +152,8 @@ def check(
         else:
             lines.append("--verbose shows every task, mailbox and equation")
         print_wrapped("\n".join(lines))
-    sys.exit(0 if forecast.holds else 1)
+    if not forecast.holds:
+        sys.exit(1)
 
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
@@ -186,13 +189,13 @@ def _abilities(config: RackConfig) -> Abilities | None:
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
     """Print the config that fits on stdout, its changes on stderr."""
-    document = fitting.document()
+    config = None if fitting.left else fitting.end.config.text()
     if as_json:
-        print_json(document | {"config": None if fitting.left else fitting.end.config.text()})
+        print_json(fitting.document() | {"config": config})
         return
     print(*(fitting.lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
-    if not fitting.left:
-        print(fitting.end.config.text(), end="")
+    if config is not None:
+        print(config, end="")
 
 
 def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:

@@ -17,9 +17,8 @@ def clean(as_json: Json = False) -> None:
       rack clean
     """
     removed, in_use, strange = remove_leftovers()
-    lines = [
-        f"removed: {', '.join(removed) or 'nothing'}",
-        *([f"in use: {', '.join(in_use)}"] if in_use else []),
-    ]
+    lines = [f"removed: {', '.join(removed) or 'nothing'}"]
+    if in_use:
+        lines.append(f"in use: {', '.join(in_use)}")
     lines += [f"left alone: {line}" for line in strange]
     print_answer({"removed": removed, "in_use": in_use, "strange": strange}, lines, as_json)

@@ -79,12 +79,13 @@ def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
     terminal = console()
     is_drawn = terminal.is_terminal and not as_json
     live = Live(console=terminal, auto_refresh=False) if is_drawn else None
+    look_s = LOOK_S if is_drawn or as_json else PLAIN_S
     ended = threading.Event()
     is_over = False
     with INTERRUPT.orderly(ended.set), live or nullcontext():
         while not is_over:
             # Asked before the look: what is written until the end is shown.
-            is_over = segment.run_is_over or ended.wait(LOOK_S if is_drawn or as_json else PLAIN_S)
+            is_over = segment.run_is_over or ended.wait(look_s)
             found = [*messages.new()]
             if as_json:
                 for document in found:
@@ -121,7 +122,9 @@ class Messages:
     def new(self) -> Iterator[dict[str, Any]]:
         """Yield the messages written since the last look; at the first one the newest alone."""
         rows = self._ring.drain().rows
-        yield from map(self._document, rows if self._has_looked else rows[-1:])
+        if not self._has_looked:
+            rows = rows[-1:]
+        yield from map(self._document, rows)
         self._has_looked = True
 
     def _document(self, row: np.ndarray) -> dict[str, Any]:

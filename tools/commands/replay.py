@@ -108,10 +108,8 @@ def merge(runs: Sequence[Path], out: Path) -> list[str]:
     """
     for run in runs:
         if not run.is_dir():
-            raise Failure(
-                f"{run}: no such folder" if not run.exists() else f"{run}: not the folder of a run",
-                2,
-            )
+            why = "not the folder of a run" if run.exists() else "no such folder"
+            raise Failure(f"{run}: {why}", 2)
     placed = on_one_time_line([Recording(run) for run in runs])
     notes = [place.note for place in placed[1:]]
     # It takes half a second to import.

@@ -38,4 +38,5 @@ def report(run: RunFolder, against: Against = None, as_json: Json = False) -> No
 
     data, text = write_report(run, against)
     print_report(data, text, as_json)
-    sys.exit(0 if data["against"]["explained"] else 1)
+    if not data["against"]["explained"]:
+        sys.exit(1)

@@ -141,7 +141,8 @@ def check(model: ModelOrConfig, out: Picture = None, as_json: Json = False) -> N
         "picture": picture,
     }
     print_answer(document, _report(document), as_json)
-    sys.exit(1 if any(finding.fails for finding in examined.findings) else 0)
+    if any(finding.fails for finding in examined.findings):
+        sys.exit(1)
 
 
 def _examined(given: str, folder: Path) -> tuple[Examined, str]:
@@ -165,7 +166,8 @@ def _report(found: dict[str, Any]) -> Iterator[str]:
     yield from table(head, rows, terminal_width())
     yield f"reach {found['reach_m']} m, payload {found['payload_kg']} kg wherever it reaches"
     for finding in found["findings"]:
-        yield f"{'FAILS' if finding['fails'] else 'ok'}  {finding['about']}: {finding['text']}"
+        verdict = "FAILS" if finding["fails"] else "ok"
+        yield f"{verdict}  {finding['about']}: {finding['text']}"
     yield f"picture: {found['picture']}"
 
 

@@ -56,9 +56,8 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
         found = key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    print_answer(
-        [asdict(entry) for entry in found], _names(found) if name is None else _keys(found), as_json
-    )
+    lines = _names(found) if name is None else _keys(found)
+    print_answer([asdict(entry) for entry in found], lines, as_json)
 
 
 def _names(found: list[KeyTable]) -> Iterator[str]:
@@ -70,6 +69,7 @@ def _keys(found: list[KeyTable]) -> Iterator[str]:
     head = ["key", "unit", "type", "permitted", "default", "meaning"]
     for at, entry in enumerate(found):
         rows = [[k.name, k.unit, k.type, k.permitted, k.default, k.meaning] for k in entry.keys]
-        yield from ([""] if at else [])
+        if at:
+            yield ""
         yield f"{entry.heading}: {entry.meaning}"
         yield from table(head, rows, terminal_width(), DROPPED)

@@ -74,6 +74,7 @@ def step(
         print_answer({"rack": rack, "held": False}, f"rack '{rack}' runs on", as_json)
         return
     at = stepper.hold()
-    stepper.go(at + ticks if ticks is not None else stepper.after_cycles(at, cycles or 1, until))
+    end = stepper.after_cycles(at, cycles or 1, until) if ticks is None else at + ticks
+    stepper.go(end)
     found = stepper.look()
     print_answer(found.document(), found.text(), as_json)

@@ -111,7 +111,9 @@ def _seconds(option: str, text: str) -> float:
     found = DURATION.fullmatch(text)
     seconds = -1.0
     if found is not None:
-        seconds = float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)
+        seconds = float(found[1])
+        if found[2] == "ms":
+            seconds *= 1e-3
     if not 0.0 <= seconds <= MOST_S:
         why = f"not a time; permitted: as in 0.5s or 20ms, at most {MOST_S:g}s"
         raise Failure(f"{option} {text}: {why}", 2)
@@ -143,7 +145,8 @@ def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: 
             for written in tap.take():
                 strip.add(written)
                 lost += written.lost
-            view.show(segment.words[System.TICK] - (0 if is_over else strip.settles))
+            settles = 0 if is_over else strip.settles
+            view.show(segment.words[System.TICK] - settles)
     if lost:
         raise Failure(f"{lost} messages were overwritten before they could be shown")
 

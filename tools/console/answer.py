@@ -55,8 +55,10 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
     """Print an answer: as one JSON document, or as text for people, given whole or as lines."""
     if as_json:
         print_json(document)
+    elif isinstance(text, str):
+        print(text)
     else:
-        print(text if isinstance(text, str) else "\n".join(text))
+        print("\n".join(text))
 
 
 def fail(reason: str, status: int) -> NoReturn:

@@ -35,9 +35,8 @@ def picture(
         figure = Figure(figsize=(width_in, height_in), **settings)
         yield figure
         for path in paths:
-            figure.savefig(
-                path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None
-            )
+            metadata = {"Date": None} if path.suffix == ".svg" else None
+            figure.savefig(path, dpi=DPI, metadata=metadata)
 
 
 def paths_of(stem: Path) -> list[Path]:

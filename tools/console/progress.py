@@ -41,8 +41,9 @@ class Progress:
         """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its
         shortfalls."""
         self._bar.update(self._task, advance=seconds)
-        for line in () if self._bar.disable else shortfalls:
-            self._bar.console.print(line, style="red", highlight=False, markup=False)
+        if not self._bar.disable:
+            for line in shortfalls:
+                self._bar.console.print(line, style="red", highlight=False, markup=False)
         for line in (ended, *shortfalls):
             self._print(f"  {line}")
 

@@ -103,7 +103,7 @@ def decimal(value: float | None, digits: int = 3) -> str:
 
 def figure(found: Mapping[str, Any] | None, key: str, digits: int = 3) -> str:
     """Return one figure of a distribution; "-" where there is none."""
-    return decimal(None if found is None else found[key], digits)
+    return "-" if found is None else decimal(found[key], digits)
 
 
 def ms(time_ns: float | None) -> str:

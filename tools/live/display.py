@@ -189,12 +189,13 @@ class RackView:
         yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
-            why, *release = hold.parts
-            yield Text(
-                hold.line if len(hold.line) <= width else "\n  ".join([why, *release]), style=HELD
-            )
+            shown = hold.line
+            if len(shown) > width:
+                shown = "\n  ".join(hold.parts)
+            yield Text(shown, style=HELD)
         if snapshot.progress is not None:
-            yield _bar(snapshot.progress, width if terminal.is_terminal else 0)
+            bar_width = width if terminal.is_terminal else 0
+            yield _bar(snapshot.progress, bar_width)
 
 
 def _rows(
@@ -210,8 +211,13 @@ def _rows(
 
 
 def _cell(column: str, value: Any) -> str:
-    digits = 0 if column.endswith("_ticks") else 3 if column.endswith("_s") else 1
-    return decimal(value, digits) if isinstance(value, float | None) else str(value)
+    if not isinstance(value, float | None):
+        return str(value)
+    if column.endswith("_ticks"):
+        return decimal(value, 0)
+    if column.endswith("_s"):
+        return decimal(value, 3)
+    return decimal(value, 1)
 
 
 def line_of(snapshot: Snapshot) -> str:
@@ -305,5 +311,6 @@ def is_shown(event: Event) -> bool:
 
 def event_line(event: Event) -> str:
     """Return an event as one line."""
+    tick = f"tick {event.tick} " if event.code else ""
     board = f"{event.board}: " if event.board else ""
-    return f"{f'tick {event.tick} ' if event.code else ''}{event.kind}: {board}{event.text}"
+    return f"{tick}{event.kind}: {board}{event.text}"

@@ -25,8 +25,9 @@ def folder_of(wanted: Path | None, rack: str) -> Path:
     """
     if wanted is None:
         name = f"{rack}-{time.strftime('%Y%m%d-%H%M%S')}"
-        taken = len(list(RUNS.glob(f"{name}*")))
-        return RUNS / (f"{name}-{taken + 1}" if taken else name)
+        if taken := len(list(RUNS.glob(f"{name}*"))):
+            name = f"{name}-{taken + 1}"
+        return RUNS / name
     if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
         raise Failure(f"--out {wanted}: exists already and is not an empty folder", 2)
     return wanted

@@ -56,10 +56,14 @@ def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
     # The process that runs a host board locks this word, and the kernel unlocks it.
     runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
     state = TaskState(block[Block.STATE])
+    shown = state.name.lower() if runs else AWAY
+    if state == TaskState.ENDED:
+        shown = DONE
+    pid = block[Block.PID] if runs else 0
     return HostRow(
         board=host.name,
-        pid=block[Block.PID] if runs else 0,
-        state=DONE if state == TaskState.ENDED else state.name.lower() if runs else AWAY,
+        pid=pid,
+        state=shown,
         sent=sum(head[Box.HEAD] for head in _heads(segment, host.name)),
         restarts=restarts(segment, host.name),
     )
@@ -85,12 +89,13 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
         if status.is_there:
             counts = getattr(status.value, entry)
             age = int(counts["age"])
+            age_ms = None if age < 0 else age * tick_ms
             found.append(
                 EntryRow(
                     entry=f"{mailbox.partition('.')[0]}.{entry}",
                     source=source,
                     **{name: int(counts[name]) for name in ENTRY_COUNTS},
-                    age_ms=None if age < 0 else age * tick_ms,
+                    age_ms=age_ms,
                 )
             )
     return tuple(found)

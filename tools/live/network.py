@@ -144,13 +144,16 @@ class Network:
 
 
 def _peer(rack: str, at: Any) -> PeerRow:
-    is_known = at.uncertainty > 0.0
+    clock_ms = within_ms = None
+    if at.uncertainty > 0.0:
+        clock_ms = at.offset * 1e3
+        within_ms = at.uncertainty * 1e3
     return PeerRow(
         peer=rack,
         state=Presence(at.presence).name.lower(),
         since_tick=at.since,
         launches=at.launches,
         losses=at.losses,
-        clock_ms=at.offset * 1e3 if is_known else None,
-        within_ms=at.uncertainty * 1e3 if is_known else None,
+        clock_ms=clock_ms,
+        within_ms=within_ms,
     )

@@ -57,6 +57,10 @@ class Queues:
         return tuple(found)
 
 
+def _last(counts: np.ndarray) -> int:
+    return int(counts[-1]) if len(counts) else 0
+
+
 def queues(recording: Recording) -> list[dict[str, Any]]:
     """Return what went through every queue: messages `sent`, `refused` (None: not recorded), most
     that ever waited.
@@ -75,9 +79,9 @@ def queues(recording: Recording) -> list[dict[str, Any]]:
             {
                 "mailbox": box.name,
                 "capacity": box.capacity,
-                "sent": int(sent[-1]) if len(sent) else 0,
-                "taken": int(taken[-1]) if len(taken) else 0,
-                "waiting": int((taken + unread - before).max()) if len(taken) else 0,
+                "sent": _last(sent),
+                "taken": _last(taken),
+                "waiting": int((taken + unread - before).max(initial=0)),
                 "refused": refused.get(box.name),
             }
         )

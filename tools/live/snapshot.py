@@ -146,11 +146,13 @@ class RackMonitor:
         """Return the rack as it is now."""
         words = self._segment.words
         layout = self._segment.layout
-        lost = GONE if self._segment.is_mirror else DEAD
+        run = GONE if self._segment.is_mirror else DEAD
+        if self._segment.launcher_is_alive:
+            run = Run(words[System.STATE]).name.lower()
         tick = words[System.TICK]
         return Snapshot(
             rack=layout.rack,
-            run=Run(words[System.STATE]).name.lower() if self._segment.launcher_is_alive else lost,
+            run=run,
             tick=tick,
             time_s=tick * layout.clock_ns * 1e-9,
             clock_skipped=words[System.CLOCK_SKIPPED],

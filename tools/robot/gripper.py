@@ -92,10 +92,13 @@ def fit_fingers(
     ]
     force = sum(used)
     remove(spec, actuators[1:])
-    if not drives:
+    if drives:
+        motor = actuators[0].name
+    else:
+        motor = MOTOR
         add_motor(spec, MOTOR, mujoco.mjtTrn.mjTRN_JOINT, driven, force)
     config = GripperConfig(
-        actuator=drives[0][0].name if drives else MOTOR,
+        actuator=motor,
         joint=driven,
         open=round(own.open, 5),
         closed=round(own.closed, 5),
@@ -137,7 +140,9 @@ def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
     is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
     lever = 1.0 if is_slide else max(LEAST_LEVER_M, norm(centre - data.xanchor[joint]))
     sideways = abs(inward) < SIDEWAYS * norm(motion) * norm(middle - centre)
-    return _Finger(*((low, high) if inward > 0.0 else (high, low)), lever, sideways)
+    if inward > 0.0:
+        return _Finger(low, high, lever, sideways)
+    return _Finger(high, low, lever, sideways)
 
 
 def _above(model: mujoco.MjModel, body: int, hand: int) -> set[int]:
@@ -150,7 +155,9 @@ def _above(model: mujoco.MjModel, body: int, hand: int) -> set[int]:
 
 def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
     geoms = geoms_of(model, below(model, np.array([body])))
-    return np.asarray(data.geom_xpos[geoms].mean(axis=0) if len(geoms) else data.xipos[body])
+    if not len(geoms):
+        return np.asarray(data.xipos[body])
+    return np.asarray(data.geom_xpos[geoms].mean(axis=0))
 
 
 def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:

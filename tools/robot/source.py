@@ -139,8 +139,9 @@ def copy_model(source: Source, path: Path) -> None:
         for element in root.iterfind(f"asset/{kind}"):
             for attribute in [name for name in element.attrib if name.startswith("file")]:
                 own = folder / compiler.get(key, "") / element.get(attribute, "")
-                is_taken = own.name in names.values() and own not in names
-                names.setdefault(own, f"{len(names)}-{own.name}" if is_taken else own.name)
+                if own not in names:
+                    is_taken = own.name in names.values()
+                    names[own] = f"{len(names)}-{own.name}" if is_taken else own.name
                 element.set(attribute, names[own])
     for key in ("meshdir", "texturedir"):
         compiler.set(key, "assets")

@@ -176,7 +176,8 @@ class AttachedRack:
     def record(self, folder: str | Path | None = None) -> Path:
         """Record the rack, from the two seconds that its rings still hold until this is closed;
         return the folder, by default runs/<rack>-<time>."""
-        path = folder_of(None if folder is None else Path(folder), self._segment.rack)
+        wanted = None if folder is None else Path(folder)
+        path = folder_of(wanted, self._segment.rack)
         path.mkdir(parents=True, exist_ok=True)
         (path / CONFIG).write_text(self._segment.config)
         recorder = RecorderProcess()

@@ -193,10 +193,10 @@ class Change:
             yield f"every {ticks[0]} -> {ticks[1]} ({cycles}{self._response()})"
         if new.slice_ns is not None:
             age = f"a plan every {new.slice_ns * 1e-6:g} ms"
-            same = new.within_cycles == old.within_cycles
-            yield (
-                age if same else f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
-            )
+            if new.within_cycles == old.within_cycles:
+                yield age
+            else:
+                yield f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
 
     def _response(self) -> str:
         """Return the change of the system's response time, as text."""

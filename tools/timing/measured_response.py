@@ -84,11 +84,12 @@ def _way(
     ]
     seen = np.concatenate([ms for ms, _, _ in found]) if found else np.zeros(0)
     beyond = list(chain(*(each for _, each, _ in found)))
+    holds = not beyond if len(seen) else None
     return {
         "levels": list(levels[start:]),
         "measured_ms": distribution(seen),
         "bound_ms": bound_ms,
-        "holds": not beyond if len(seen) else None,
+        "holds": holds,
         "beyond": beyond,
         "unseen": sum(unseen for _, _, unseen in found),
     }

@@ -221,6 +221,7 @@ def _commands(
     answers = recording.signal(status, "answer")
     refused = set(orders[answers == Answer.REFUSED].tolist())
     for serial, what, tick, seen, stamp in zip(serials, whats, given, visible, stamps, strict=True):
+        fate: Fate = "refused" if int(serial) in refused else "run over"
         command = AnsweredCommand(
             serial=int(serial),
             level=level,
@@ -229,7 +230,7 @@ def _commands(
             sampled=path.samples_at(int(seen)),
             predicted=path.acts_at(int(seen)),
             acts=None,
-            fate="refused" if int(serial) in refused else "run over",
+            fate=fate,
         )
         yield command, int(stamp)
 

@@ -53,7 +53,9 @@ class Repair:
         found: list[str] = []
         for changes in self.steps:
             start = "then, with the first of these" if found else "to make it fit"
-            found.append(f"{start}{', one of these, cheapest first' if len(changes) > 1 else ''}:")
+            if len(changes) > 1:
+                start += ", one of these, cheapest first"
+            found.append(f"{start}:")
             found += [f"  {change.text}" for change in changes]
         if self.left:
             failing = ", ".join(

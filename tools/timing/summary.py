@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.verdicts import EQUATIONS, EquationVerdict
-from rack.tools.console.tables import ms
 from rack.tools.timing.repair import Repair
-from rack.tools.timing.tables import verdict_table
+from rack.tools.timing.tables import side_text, verdict_table
 
 if TYPE_CHECKING:
     # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
@@ -74,8 +73,8 @@ def _margin(verdict: EquationVerdict) -> str:
     what = verdict.equation
     if what in EQUATIONS:
         what = f"eq. {what}".replace("eq. fig.", "fig.")
-    sides = (verdict.left, verdict.right)
-    left, right = (ms(side) if verdict.unit == "ns" else f"{side:.3g}" for side in sides)
+    left = side_text(verdict.left, verdict.unit)
+    right = side_text(verdict.right, verdict.unit)
     unit = " ms" if verdict.unit == "ns" else ""
     part = verdict.margin / verdict.right
     rest = f"{part:.0%} left" if part >= 0.0 else f"{-part:.0%} too much"

@@ -195,30 +195,30 @@ def _level_row(level: LevelTiming) -> list[str]:
         level.write_ns,
         level.exchange_ns,
     )
-    plan = (
-        level.planning_ns,
-        level.plan_ns,
-        level.update_ns if level.plan_ns is not None else None,
-    )
+    update_ns = None if level.plan_ns is None else level.update_ns
+    plan = (level.planning_ns, level.plan_ns, update_ns)
     cycles = "-" if level.within_cycles is None else str(level.within_cycles)
     times = [ms(time) for time in (*own, level.residual_ns, *plan)]
     return [level.board, level.coupling, *times, cycles, ms(level.slice_ns)]
 
 
 def _verdict_row(verdict: EquationVerdict) -> list[str]:
-    sides = (verdict.left, verdict.right, verdict.margin)
-    result = _result(verdict.holds)
-    left, right, margin = (ms(side) if verdict.unit == "ns" else f"{side:.3g}" for side in sides)
+    unit = verdict.unit
     return [
         verdict.equation,
         verdict.subject,
-        left,
+        side_text(verdict.left, unit),
         verdict.sign,
-        right,
-        margin,
-        result,
+        side_text(verdict.right, unit),
+        side_text(verdict.margin, unit),
+        _result(verdict.holds),
         verdict.meaning,
     ]
+
+
+def side_text(value: float, unit: str) -> str:
+    """Return a side of an equation: a time in ms, anything else with three digits."""
+    return ms(value) if unit == "ns" else f"{value:.3g}"
 
 
 def _response_row(response: TaskResponse) -> list[str]:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.components import PlayState
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import RackConfig, rack_timing
@@ -56,13 +57,12 @@ GRID_M = 0.25
 
 def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
     """Return the blueprint of a view; `live` follows the newest data."""
+    play = PlayState.Following if live else PlayState.Paused
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed", timeline=SIM_TIME, play_state="following" if live else "paused"
-        ),
+        rrb.TimePanel(state="collapsed", timeline=SIM_TIME, play_state=play),
         auto_views=False,
         auto_layout=False,
     )

@@ -229,12 +229,9 @@ class Marks:
         """Write a ball at each joint with a text, the text at those that say something."""
         for name, place in self._joints.items():
             text = texts.get(name)
-            balls = rr.Points3D(
-                [] if text is None else [place],
-                radii=self._radius,
-                colors=[LOST],
-                labels=[text] if text else None,
-            )
+            places = [] if text is None else [place]
+            labels = [text] if text else None
+            balls = rr.Points3D(places, radii=self._radius, colors=[LOST], labels=labels)
             self._stream.at(when, (*group, name), balls)
 
 

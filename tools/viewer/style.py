@@ -106,7 +106,9 @@ def style_lane(
     The viewer picks a colour for any other state.
     """
     shades = packed(colours.values())
-    shown = [name if labels is None else labels[name] for name in colours]
+    shown = list(colours)
+    if labels is not None:
+        shown = [labels[name] for name in colours]
     stream.static(entity, rr.StateConfiguration(values=list(colours), labels=shown, colors=shades))
 
 

@@ -190,7 +190,8 @@ class Campaign:
         for place, is_loaded in enumerate(self.order.loads):
             if INTERRUPT.number:
                 return
-            with load() if is_loaded else nullcontext("") as under:
+            burden = load() if is_loaded else nullcontext("")
+            with burden as under:
                 runs = tuple(self._calm(place, under))
             seconds = sum(run.ticks for run in runs) / self._second
             results.faultless.append(Faultless(under, seconds, runs))

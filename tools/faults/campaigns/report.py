@@ -278,11 +278,12 @@ def _rate(found: EventRate | None) -> str:
 def _kind_row(kind: str, figures: KindFigures) -> list[str]:
     counts = (figures.injected, figures.detected, figures.within_bound, figures.recovered)
     lowest = [share[0] for share in figures.wilson.values() if share is not None]
+    worst = f"{min(lowest):.1%}" if lowest else "-"
     bounds = (figures.bound_ticks or {}).values()
     return [
         kind,
         *map(str, counts),
-        f"{min(lowest):.1%}" if lowest else "-",
+        worst,
         *_median_max(figures.ticks),
         "-".join(dict.fromkeys(map(str, bounds))) or "-",
         *_median_max(figures.ms),

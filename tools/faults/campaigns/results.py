@@ -51,11 +51,12 @@ def result_of(trial: Trial) -> TrialResult:
     outcome = trial.outcome
     verdict = _verdict(trial)
     ended = _ended(trial)
+    ticks, digest = (outcome.ticks, outcome.digest) if outcome else (0, "")
     return TrialResult(
         plan=trial.plan,
         ended=ended,
-        ticks=outcome.ticks if outcome else 0,
-        digest=outcome.digest if outcome else "",
+        ticks=ticks,
+        digest=digest,
         violations=trial.arm.violations,
         touches=trial.arm.touches,
         left=trial.left,
@@ -72,9 +73,10 @@ def result_of(trial: Trial) -> TrialResult:
 def keep(trial: Trial, path: Path) -> None:
     """Judge a trial, and write it with all that happened in it to a file, which exists whole or not
     at all."""
+    outcome = asdict(trial.outcome) if trial.outcome else None
     document = {
         "finding": asdict(result_of(trial)),
-        "outcome": asdict(trial.outcome) if trial.outcome else None,
+        "outcome": outcome,
         "refused": trial.refused,
         "levels": trial.levels,
         "events": [asdict(event) for event in trial.events],
@@ -125,11 +127,12 @@ class Faultless:
 
     def document(self) -> dict[str, Any]:
         """Return the figures as plain data."""
+        an_hour = asdict(self.rate) if self.rate else None
         return {
             "load": self.load,
             "seconds": round(self.seconds, 3),
             "trips": self.trips,
-            "trips_per_hour": asdict(self.rate) if self.rate else None,
+            "trips_per_hour": an_hour,
             "tripped": [asdict(event) for run in self.runs for event in run.unexplained],
             "misses": self.misses,
         }

@@ -64,9 +64,9 @@ class ChainFigures(MissesBeyond):
         cycle was missed."""
         took = {*self.responses}
         least = self.boards
-        return {*self.lockstep_responses} == {least} and (
-            min(took) >= least if self.missed else took == {least}
-        )
+        if {*self.lockstep_responses} != {least}:
+            return False
+        return min(took) >= least if self.missed else took == {least}
 
 
 @dataclass(frozen=True)
@@ -139,16 +139,20 @@ class Boards(BenchResult):
 
     def _row(self, one: ChainFigures) -> list[str]:
         cycles = ", ".join(map(str, sorted({*one.responses, *one.lockstep_responses})))
+        if not one.exact:
+            cycles += " INEXACT"
+        held = "held" if one.held else "not held"
         costs = [one.lockstep_us[tree] for tree in self.trees]
+        ratio = [f"{costs[0] / costs[1]:.2f}"] if len(costs) > 1 else []
         return [
             f"{one.boards}",
             f"{one.processor_us:.1f}",
             f"{one.processor_us / one.boards:.1f}",
             *one.cells(),
-            "held" if one.held else "not held",
-            f"{cycles}{'' if one.exact else ' INEXACT'}",
+            held,
+            cycles,
             *(f"{cost:.1f}" for cost in costs),
-            *([f"{costs[0] / costs[1]:.2f}"] if len(costs) > 1 else []),
+            *ratio,
         ]
 
     def plot(self, folder: Path) -> list[Path]:

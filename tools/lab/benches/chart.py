@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -108,7 +108,8 @@ def _draw(axes: Axes, panel: Diagram, has_rows: bool) -> None:
     axes.set_title(panel.title, fontsize="small", loc="left")
     axes.set_xlabel(panel.x_label)
     axes.set_ylabel(panel.y_label)
-    axes.grid(axis="x" if has_rows else "both", color=PALE, linewidth=0.4)
+    which: Literal["x", "both"] = "x" if has_rows else "both"
+    axes.grid(axis=which, color=PALE, linewidth=0.4)
     axes.spines[["top", "right"]].set_visible(False)
     if any(one.label and len(one.x) for one in panel.series):
         # Above rows, which it would hide.
@@ -142,7 +143,8 @@ def _scale(axes: Axes, which: str, values: Sequence[float], wide: float) -> None
     if low and high > wide * low:
         set_scale = axes.set_xscale if which == "x" else axes.set_yscale
         set_scale("symlog", linthresh=low)
-        set_limits(0.0 if min(values) == 0.0 else low / 1.6, 1.6 * high)
+        begin = 0.0 if min(values) == 0.0 else low / 1.6
+        set_limits(begin, 1.6 * high)
     else:
         set_limits(0.0, 1.15 * high or 1.0)
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))

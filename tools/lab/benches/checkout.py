@@ -50,9 +50,8 @@ class RackCommand:
         done = finished(called, argv, bound_s, self.environment)
         if done.returncode:
             reasons = [line for line in done.stderr.splitlines() if line.strip()]
-            raise Failure(
-                f"{called}: {reasons[-1] if reasons else f'exit status {done.returncode}'}"
-            )
+            why = reasons[-1] if reasons else f"exit status {done.returncode}"
+            raise Failure(f"{called}: {why}")
         return done.stdout
 
     def tick_us(self, config: object, *options: object, bound_s: float) -> float:

@@ -51,12 +51,13 @@ def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Compar
     contestants, absent = _contestants(runs.share)
     core = max(os.sched_getaffinity(0))
     is_fifo = permits_fifo()
+    priority = PRIORITY if is_fifo else 0
     cost_s = (runs.seconds + LAUNCH_S) * runs.rounds * len(contestants)
     progress.total(cost_s * len(rates_hz))
     samples = []
     for rate_hz in rates_hz:
         progress.begin(f"{rate_hz:g} Hz")
-        grid = WakeGrid.at((core,), rate_hz, runs.seconds, PRIORITY if is_fifo else 0)
+        grid = WakeGrid.at((core,), rate_hz, runs.seconds, priority)
         turns = {who: partial(_attempt, who, one, grid) for who, one in contestants.items()}
         for who, found in interleaved(turns, runs.rounds).items():
             reasons = [late for late in found if isinstance(late, str)]
@@ -120,7 +121,8 @@ def _attempt(
 ) -> np.ndarray | str:
     """Return a contestant's lateness, or why it did not run."""
     try:
-        with cores_kept_awake() if who.endswith(AWAKE) else nullcontext("") as refusal:
+        kept = cores_kept_awake() if who.endswith(AWAKE) else nullcontext("")
+        with kept as refusal:
             return refusal or contestant(grid)
     except Failure as failure:
         return str(failure)

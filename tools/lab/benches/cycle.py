@@ -173,7 +173,8 @@ def measure(
             for command in commands
         }
         interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
-        return costs(runs.found, commands[-1].name if len(commands) > 1 else None)
+        other = commands[-1].name if len(commands) > 1 else None
+        return costs(runs.found, other)
 
 
 class CycleRuns:
@@ -201,8 +202,8 @@ class CycleRuns:
         options += ["--out", folder / "run"]
         command.run("run", config, *options, bound_s=BOUND_S + 10.0 * self._seconds)
         for board, trace in traces_of(Recording(folder / "run")).items():
-            case = f"{EMPTY if kind.config == EMPTY else board}, {kind.mode}"
-            self.found.traces[case, command.name].append(trace)
+            what = EMPTY if kind.config == EMPTY else board
+            self.found.traces[f"{what}, {kind.mode}", command.name].append(trace)
         if kind.lockstep and kind.config != EMPTY and command.name == THIS:
             for who, pace in ((ROW, ReplayPace()), (PACED, self._pace)):
                 times_us = apart(replay, folder / "run", pace, REPLAYED_TICKS)

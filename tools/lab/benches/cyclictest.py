@@ -57,9 +57,10 @@ class WakeGrid:
 
 def absent_cyclictest() -> tuple[Absent, ...]:
     """Return what `cyclictest` lacks; nothing if it can run."""
-    refused = Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)")
     absent = absent_program(CYCLICTEST, CYCLICTEST, "rt-tests")
-    return absent or (() if permits_fifo() else (refused,))
+    if absent or permits_fifo():
+        return absent
+    return (Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)"),)
 
 
 def misses_count(absent: Sequence[Absent]) -> Iterator[str]:

@@ -93,6 +93,7 @@ def _times(
     sent = (
         int(serials[-1] - serials[0] + 1) - recording.lost.get(box.name, 0) if len(serials) else 0
     )
+    overtaken = int(read[-1]) + 1 - len(read) if len(read) else 0
     return ExchangeTimes(
         mailbox=box.name,
         writer=box.writer,
@@ -102,7 +103,7 @@ def _times(
         age_ms=distribution((cycles[known] - found.released[newest[known]]) * clock_ns * MS),
         sent=sent,
         lost=max(0, sent - len(found.released)),
-        overtaken=int(read[-1]) + 1 - len(read) if len(read) else 0,
+        overtaken=overtaken,
     )
 
 
@@ -135,6 +136,7 @@ def _arrivals(
         if is_lockstep
         else np.rint(stamps * recording.rack_config.clock.speed)
     )
-    own = f"{recording.layout.task(reader).board}.plan" == box.name
+    is_own = f"{recording.layout.task(reader).board}.plan" == box.name
+    read_at = rows["start_ns"] if is_own else rows["plan_ns"]
     cycles = np.maximum(np.searchsorted(rows["tick"], reads, side="right") - 1, 0)
-    return _Arrivals(released, at_ns, stamps, rows["start_ns" if own else "plan_ns"][cycles])
+    return _Arrivals(released, at_ns, stamps, read_at[cycles])

@@ -177,6 +177,7 @@ class HandBench(BenchResult):
 
 def _rack_row(one: HandFigures) -> Sequence[str]:
     times = (one.exchange_ms, one.process_ms, one.handler_ms)
+    ended = "failed" if one.failure else "done"
     return [
         one.name,
         decimal(one.shift_mm, 2),
@@ -184,5 +185,5 @@ def _rack_row(one: HandFigures) -> Sequence[str]:
         *(f"{time:.1f}" for time in times),
         f"{one.missed}",
         f"{one.cycles}",
-        "failed" if one.failure else "done",
+        ended,
     ]

@@ -152,10 +152,8 @@ class Absent:
     @property
     def line(self) -> str:
         """All of it as one line."""
-        return (
-            f"absent: {self.who}:"
-            f" {self.reason}{'; to install: ' if self.install else ''}{self.install}"
-        )
+        hint = f"; to install: {self.install}" if self.install else ""
+        return f"absent: {self.who}: {self.reason}{hint}"
 
 
 def absent_package(who: str, module: str) -> tuple[Absent, ...]:
@@ -328,7 +326,9 @@ class Comparison(BenchResult):
             is_baseline = self.baselines.get(case) == sample.who
             colour = BASELINE if is_baseline else PALETTE[0]
             ratio = self.ratio(sample)
-            note = shown(sample.median) + ("" if ratio is None else f"  ({ratio:.2f})")
+            note = shown(sample.median)
+            if ratio is not None:
+                note += f"  ({ratio:.2f})"
             series.append(Series("", [sample.median], [row], "o", colour, notes=[note]))
         return Diagram(own[0].unit, series, title=case)
 
@@ -361,7 +361,8 @@ def interleaved(
     found: dict[_Name, list[_Result]] = {name: [] for name in contestants}
     for turn, name in turns(list(contestants), rounds):
         if progress is not None:
-            label = ", ".join(map(str, name if isinstance(name, tuple) else (name,)))
+            words = name if isinstance(name, tuple) else (name,)
+            label = ", ".join(map(str, words))
             progress.begin(f"{label}: round {turn + 1} of {rounds}")
         found[name].append(contestants[name]())
         if progress is not None:

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rack.boards.faults.bounds import counting
 from rack.tools.lab.benches.chart import PALETTE, Diagram, Series, draw
 from rack.tools.lab.benches.harness import Absent, BenchResult, Comparison, Sample, plain
 from rack.tools.lab.benches.lan_ends import LEASE_MS, ORDER_BYTES, STATUS_BYTES
@@ -46,7 +47,7 @@ class Point(NamedTuple):
     def case(self) -> str:
         """All of it but the contestant, in words."""
         rate = f", {self.rate_hz:g} Hz" if self.rate_hz else ""
-        return f"{self.what}, {self.racks} rack{'s' if self.racks > 1 else ''}{rate}"
+        return f"{self.what}, {counting(self.racks, 'rack')}{rate}"
 
 
 @dataclass

@@ -175,9 +175,8 @@ class _Member:
                 self.process.wait(ANSWER_S)
             self._errors.seek(0)
             said = self._errors.read().decode(errors="replace").strip().splitlines()
-            raise Failure(
-                f"{self._name}: ended: {said[-1] if said else 'it says nothing'}"
-            ) from None
+            why = said[-1] if said else "it says nothing"
+            raise Failure(f"{self._name}: ended: {why}") from None
 
     def end(self) -> None:
         """Kill it."""

@@ -84,9 +84,10 @@ def _table(task: LanTask) -> LanTable:
         name: {"from": f"{name}/{_mailbox(task.machine)}", "type": "none:NONE", "max_age_ms": 1000}
         for name in others
     }
-    endpoint = f"{'tls' if task.certificates else 'tcp'}/{task.addresses[COORDINATOR]}:{PORT}"
+    transport = "tls" if task.certificates else "tcp"
+    way = "listen" if task.is_coordinator else "connect"
     table = {
-        "listen" if task.is_coordinator else "connect": [endpoint],
+        way: [f"{transport}/{task.addresses[COORDINATOR]}:{PORT}"],
         "lease_ms": LEASE_MS,
         "insecure": not task.certificates,
         "certificates": task.certificates or None,

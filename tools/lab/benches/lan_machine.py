@@ -82,9 +82,11 @@ class Machine:
         self._sent = 0
         module, _, name = ENDS[task.who].partition(":")
         kind: type[End] = getattr(import_module(module), name)
-        echo = self._count if task.is_coordinator else self._answer
+        echo = None
+        if task.echoes:
+            echo = self._count if task.is_coordinator else self._answer
         self._size = ORDER_BYTES if task.is_coordinator else STATUS_BYTES
-        self._end = kind(task, self._notice, echo if task.echoes else None)
+        self._end = kind(task, self._notice, echo)
 
     def find(self) -> None:
         """Wait until all others are there. Raises `TimeoutError`."""

@@ -24,6 +24,7 @@ from rack.backplane.mailbox.protocols import open_reader, open_writer
 from rack.backplane.message import Field, Message, command
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
+from rack.boards.faults.bounds import counting
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import (
@@ -61,7 +62,7 @@ class Case(NamedTuple):
     @property
     def name(self) -> str:
         """The case, in words."""
-        return f"{self.size}, {self.readers} reader{'s' if self.readers > 1 else ''}"
+        return f"{self.size}, {counting(self.readers, 'reader')}"
 
     @property
     def lengths(self) -> dict[str, int]:
@@ -196,10 +197,12 @@ def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
     tasks = tuple(
         TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers))
     )
-    # Each reader is alone with its inbox: every message is served before the next one is sent.
-    interrupt = InterruptSpec(
-        1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:])
-    )
+    interrupt = None
+    if protocol == "interrupt":
+        # Each reader is alone with its inbox: every message is served before the next one is sent.
+        interrupt = InterruptSpec(
+            1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:])
+        )
     box = MailboxSpec(
         name="writer.command",
         writer="writer",
@@ -212,6 +215,6 @@ def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
         version=MESSAGE.version,
         size=MESSAGE.dtype(case.lengths).itemsize,
         fields=field_specs(MESSAGE, case.lengths),
-        interrupt=interrupt if protocol == "interrupt" else None,
+        interrupt=interrupt,
     )
     return Layout(rack, 2_500_000, tasks, (box,))

@@ -179,7 +179,8 @@ def _cable(machine: int) -> str:
 
 
 def _ip(commands: Iterable[str], namespace: str | None = None) -> None:
-    _call(["ip", *(["-netns", namespace] if namespace else []), "-batch", "-"], commands)
+    where = ["-netns", namespace] if namespace else []
+    _call(["ip", *where, "-batch", "-"], commands)
 
 
 def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
@@ -236,13 +237,15 @@ def _end(names: Sequence[str]) -> None:
 def _inside(names: Sequence[str]) -> dict[int, int]:
     """Return the processes in namespaces, each with its parent."""
     spaces = set()
-    found = {}
+    found: dict[int, int] = {}
     for name in names:
         try:
             spaces.add((NAMESPACES / name).stat().st_ino)
         except FileNotFoundError:
             continue
-    for path in Path("/proc").glob("[0-9]*") if spaces else ():
+    if not spaces:
+        return found
+    for path in Path("/proc").glob("[0-9]*"):
         try:
             if (path / "ns/net").stat().st_ino in spaces:
                 found[int(path.name)] = int(

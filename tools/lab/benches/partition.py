@@ -15,6 +15,7 @@ import numpy as np
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, load, loads, rack_timing, resolve, wire
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
+from rack.boards.faults.bounds import counting
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.trace_times import (
     Distribution,
@@ -47,7 +48,7 @@ class Partition:
     @property
     def name(self) -> str:
         """The partition, in words."""
-        return f"{self.coupling}, {self.cores} core{'s' if self.cores > 1 else ''}"
+        return f"{self.coupling}, {counting(self.cores, 'core')}"
 
     def of(self, config: RackConfig) -> RackConfig:
         """Return the rack in this partition, in real time. Raises `ConfigError` if the rack does
@@ -212,15 +213,14 @@ def _level(
     board: str, layout: Layout, responses: Mapping[str, TaskResponse], runs: Sequence[Recording]
 ) -> LevelFigures:
     tasks = {task.name: task for task in layout.tasks}
-    planner = tasks.get(f"{board}.planner")
+    executor = _task(tasks[board], layout.clock_ns, responses, runs)
+    if f"{board}.planner" not in tasks:
+        return LevelFigures(board, executor, planner=None, plan_age_ms=None)
+    planner = _task(tasks[f"{board}.planner"], layout.clock_ns, responses, runs)
     plan = f"{board}.plan"
     ages = [plan_ages_ms(run, board) for run in runs if plan in run.mailboxes]
-    return LevelFigures(
-        level=board,
-        executor=_task(tasks[board], layout.clock_ns, responses, runs),
-        planner=None if planner is None else _task(planner, layout.clock_ns, responses, runs),
-        plan_age_ms=distribution(np.concatenate(ages)) if ages else None,
-    )
+    age_ms = distribution(np.concatenate(ages)) if ages else None
+    return LevelFigures(board, executor, planner, age_ms)
 
 
 def _task(
@@ -234,15 +234,18 @@ def _task(
     missed, _ = counts(cycles)
     slice_ns = task.every * task.within_cycles * tick_ns
     response = responses.get(task.name)
-    predicted_ns = None if response is None else response.response_ns
+    fits = None if response is None else response.holds
+    predicted_ms = None
+    if response is not None and response.response_ns is not None:
+        predicted_ms = response.response_ns * 1e-6
     return TaskFigures(
         slice_ms=slice_ns * 1e-6,
         cycles=len(cycles),
         missed=missed,
         skipped=skipped,
         residual_ms=distribution(residual_ns(cycles, slice_ns) * 1e-6),
-        predicted_ms=None if predicted_ns is None else predicted_ns * 1e-6,
-        fits=None if response is None else response.holds,
+        predicted_ms=predicted_ms,
+        fits=fits,
     )
 
 

@@ -84,7 +84,8 @@ class Replay:
         data = mujoco.MjData(self.cell.model)
         mujoco.mj_setState(model, data, self.start, STATE)
         found: list[float] = []
-        with pinned(pace.core, pace.priority) if pace.priority else nullcontext():
+        alone = pinned(pace.core, pace.priority) if pace.priority else nullcontext()
+        with alone:
             due_ns = time.monotonic_ns()
             for number, control in enumerate(self.controls[:ticks], self.first_tick + 1):
                 due_ns += pace.period_ns

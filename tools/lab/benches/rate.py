@@ -98,7 +98,9 @@ class RateFigures(MissesBeyond):
     @property
     def verdict(self) -> str:
         """The same in a word, or why a run failed."""
-        return self.failure or ("held" if self.held else "not held")
+        if self.failure:
+            return self.failure
+        return "held" if self.held else "not held"
 
 
 @dataclass(frozen=True)
@@ -145,10 +147,8 @@ class Rates(BenchResult):
         yield from misses_count(self.absent)
         highest = self.highest_held_hz
         bound = f"missed at most {BEYOND:.1%} beyond cyclictest"
-        yield (
-            f"highest rate held: {'none of these' if highest is None else f'{highest:g} Hz'}"
-            f" ({bound})"
-        )
+        rate = "none of these" if highest is None else f"{highest:g} Hz"
+        yield f"highest rate held: {rate} ({bound})"
 
     @staticmethod
     def _row(one: RateFigures) -> list[str]:
@@ -204,14 +204,16 @@ def _figures(
 ) -> RateFigures:
     settled = np.concatenate([run.settled(board) for run in runs])
     ended = [run.outcome for run in runs if not run.outcome.worked]
+    failure = ""
+    if ended:
+        failure = f"{ended[0].cause}: {'; '.join(ended[0].faults) or ended[0].reason}"
+    processor_us = float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0
     return RateFigures(
         rate_hz=rate_hz,
         cycles=sum(run.cycles(board).due for run in runs),
         missed=missed_share(run.cycles(board) for run in runs),
         late=late,
         lateness_us=distribution(lateness_ns(settled) * 1e-3),
-        processor_us=float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0,
-        failure=(
-            f"{ended[0].cause}: {'; '.join(ended[0].faults) or ended[0].reason}" if ended else ""
-        ),
+        processor_us=processor_us,
+        failure=failure,
     )

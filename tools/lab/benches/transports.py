@@ -202,7 +202,8 @@ def _zenoh(listen: str, connect: str) -> Any:
     for key in ("scouting/multicast", "scouting/gossip", "transport/shared_memory"):
         config.insert_json5(f"{key}/enabled", "false")
     for key, place in (("listen", listen), ("connect", connect)):
-        config.insert_json5(f"{key}/endpoints", json.dumps([place] if place else []))
+        places = [place] if place else []
+        config.insert_json5(f"{key}/endpoints", json.dumps(places))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

@@ -64,13 +64,8 @@ class CoreSharing:
             )
         for name, ns in self.others_ns.items():
             if ns > least:
-                yield (
-                    ns,
-                    (
-                        f"{'its previous cycle' if name == BEFORE else name} had the core for"
-                        f" {brief_ms(ns)} ms"
-                    ),
-                )
+                what = "its previous cycle" if name == BEFORE else name
+                yield (ns, f"{what} had the core for {brief_ms(ns)} ms")
         if self.nobody_ns > least:
             yield (
                 self.nobody_ns,

@@ -65,7 +65,8 @@ def _scale(axes: Axes, low: float, high: float) -> None:
     """Draw the scale, in parts of a cycle, and mark the end of the cycle."""
     axes.set_xscale("log")
     axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 300 * low else (1.0, 2.0, 5.0)))
+    labelled = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0)
+    axes.xaxis.set_major_locator(LogLocator(subs=labelled))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda part, _: f"{100 * part:g} %"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.axvline(1.0, color=END, linewidth=1.4)

@@ -41,10 +41,9 @@ class Rule:
 def rules_for(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> list[Rule]:
     """Return the equations put to the cycles of a task; `found` are the cycles of the run, by
     task."""
-    is_executor = found[name].task.role == "executor"
-    return list(
-        _executor_rules(name, found, rack) if is_executor else _planner_rules(name, found, rack)
-    )
+    if found[name].task.role == "executor":
+        return list(_executor_rules(name, found, rack))
+    return list(_planner_rules(name, found, rack))
 
 
 def _executor_rules(name: str, found: Mapping[str, Cycles], rack: RackTiming) -> Iterator[Rule]:

@@ -90,16 +90,14 @@ def _head(analysis: Analysis) -> Iterator[str]:
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.fails]
     yield f"{config.name}: {_ended(analysis)}"
-    yield (
-        f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
-        if failing
-        else f"all {len(pairs)} equations held"
-    )
-    if failing:
+    if not failing:
+        yield f"all {len(pairs)} equations held"
+    else:
+        yield f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
         yield f"failed: {_named(failing)}"
         if analysis.percentile > MOSTLY:
             mostly = [pair for pair in analysis.mostly if pair.fails]
-            yield f"failed in more than 1 of 100 cycles: {_named(mostly) if mostly else 'none'}"
+            yield f"failed in more than 1 of 100 cycles: {_named(mostly) or 'none'}"
     if differing := [pair for pair in pairs if pair.disagrees]:
         yield f"not as predicted: {_named(differing)}"
     yield from tightest([pair.measured for pair in pairs if pair.measured is not None])
@@ -173,12 +171,10 @@ def _level_row(name: str, side: str, timing: LevelTiming) -> list[str]:
         timing.write_ns,
         timing.communication_ns,
     )
-    times = [
-        decimal(None if ns is None else ns * 1e-6)
-        for ns in (*parts, timing.residual_ns, timing.planning_ns)
-    ]
+    times = [decimal(ns * 1e-6) for ns in (*parts, timing.residual_ns)]
+    plan = "-" if timing.planning_ns is None else decimal(timing.planning_ns * 1e-6)
     d = "-" if timing.within_cycles is None else str(timing.within_cycles)
-    return [name, side, f"{timing.cycle_ns * 1e-6:g}", *times, d]
+    return [name, side, f"{timing.cycle_ns * 1e-6:g}", *times, plan, d]
 
 
 def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
@@ -201,22 +197,27 @@ def _pair_row(pair: Pair) -> list[str]:
     predicted = pair.predicted
     measured = pair.measured
     verdict = measured or predicted
+    meaning = "" if verdict is None else verdict.meaning
+    differs = "not as predicted" if pair.disagrees else ""
+    margin = "-" if measured is None else _number(measured.margin, measured.unit)
+    sides, result = _sides(measured)
     return [
         pair.equation,
         pair.subject,
         *_sides(predicted),
-        *(_sides(measured)[:1]),
-        "-" if measured is None else _number(measured.margin, measured.unit),
-        _sides(measured)[1],
-        "not as predicted" if pair.disagrees else "",
-        "" if verdict is None else verdict.meaning,
+        sides,
+        margin,
+        result,
+        differs,
+        meaning,
     ]
 
 
 def _sides(verdict: EquationVerdict | None) -> tuple[str, str]:
     if verdict is None:
         return "-", ""
-    return _relation(verdict), "ok" if verdict.holds else "FAILS"
+    result = "ok" if verdict.holds else "FAILS"
+    return _relation(verdict), result
 
 
 def _relation(relation: EquationVerdict | Broken) -> str:

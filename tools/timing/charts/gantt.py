@@ -114,7 +114,8 @@ def gantt_of(
         return Gantt(name, panels, (), column_for(end - start, schedule.shortest_ns))
     still = f"{name} ran in lockstep: time stood still while its tasks computed"
     if schedule is None:
-        raise Failure(f"{still}; {NO_BUDGET}" if run is not None else f"{name}: {NO_BUDGET}", 2)
+        why = f"{name}:" if run is None else f"{still};"
+        raise Failure(f"{why} {NO_BUDGET}", 2)
     start, end = options.window(options.task(schedule.tasks), None, 0, schedule.shown_ns)
     notes = () if run is None else (f"{still}; only the schedule is shown",)
     return Gantt(

@@ -194,9 +194,8 @@ def _spans(traced: Sequence[_Traced]) -> Iterator[Span]:
             # A critical section runs at its ceiling: equal priorities cannot preempt it, but it
             # starts after them.
             is_locked = unit is Unit.UPDATE and task.ceiling > task.priority
-            levels[-(task.ceiling if is_locked else task.priority), is_locked].append(
-                (task, release, unit, stretch)
-            )
+            priority = task.ceiling if is_locked else task.priority
+            levels[-priority, is_locked].append((task, release, unit, stretch))
         if task.role == "executor":
             waking[-task.priority] += found.waking()
     busy: list[Stretch] = []

@@ -84,12 +84,13 @@ def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
 
 def _lane(core: int, tasks: list[TimedTask]) -> Lane:
     planner = next((task for task in tasks if task.role == "planner"), None)
-    executor = next((task for task in tasks if task.role != "planner"), None)
+    executor = next((task.name for task in tasks if task.role != "planner"), None)
+    planner_name = None if planner is None else planner.name
     return Lane(
         core=core,
         board=tasks[0].board,
-        executor=executor.name if executor is not None else None,
-        planner=planner.name if planner is not None else None,
+        executor=executor,
+        planner=planner_name,
         priority=max(task.priority for task in tasks),
         cycle_ns=tasks[0].every_ns,
         slice_ns=(planner or tasks[0]).period_ns,
@@ -155,7 +156,8 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
             _order(found, lane, (begin, begin + length), detail)
             for begin, found in zip(borders, of_cycles, strict=True)
         )
-        (counted.plans if is_plan else counted.cycles)[" | ".join(orders)] += 1
+        counter = counted.plans if is_plan else counted.cycles
+        counter[" | ".join(orders)] += 1
     return counted
 
 

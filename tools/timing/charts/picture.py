@@ -102,7 +102,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_xticks([time / NS_PER_MS for time in times], [ms(time) for time in times])
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
-    axes.set_title(panel.kind, fontsize=9, loc="left", pad=14 if panel.frames else None)
+    pad = 14 if panel.frames else None
+    axes.set_title(panel.kind, fontsize=9, loc="left", pad=pad)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
 

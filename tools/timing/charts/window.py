@@ -107,7 +107,8 @@ def window_options(
     from_ns, to_ns = (
         None if value is None else round(value * NS_PER_MS) for value in (from_ms, to_ms)
     )
-    return WindowOptions(from_ns, to_ns, None if cycles is None else _cycles(cycles), level)
+    numbers = None if cycles is None else _cycles(cycles)
+    return WindowOptions(from_ns, to_ns, numbers, level)
 
 
 def _cycles(text: str) -> tuple[int, int]:

@@ -113,7 +113,8 @@ class _System:
                 poses = self._poses.measure(folder / "poses")
             except Failure as why:
                 unmoved = str(why)
-            progress.end(parts["three poses"], unmoved if poses is None else poses.verdict)
+            verdict = unmoved if poses is None else poses.verdict
+            progress.end(parts["three poses"], verdict)
         killed = kills.failure and f"killing each board: {kills.failure}"
         failures = [text for text in (failure, killed, unmoved) if text]
         return SystemFigures(
@@ -130,8 +131,10 @@ class _System:
         config = self._config.model_copy(update={"command": (*self._config.command, *commands)})
         run, recording = record(config, self._runs.seconds, folder, self._runs.share)
         grid = self._grid()
-        late = overdue([cyclictest(grid)] if self._is_compared else [], grid.period_ns)
-        return self._figures(run, recording, late), "" if run.worked else run.failure()
+        wakes = [cyclictest(grid)] if self._is_compared else []
+        late = overdue(wakes, grid.period_ns)
+        failure = "" if run.worked else run.failure()
+        return self._figures(run, recording, late), failure
 
     @property
     def _fastest(self) -> list[str]:
@@ -151,6 +154,9 @@ class _System:
         cycles = cycles_of(recording)
         response = system_response(recording) or {"command": {}, "status": {}}
         command = response["command"]
+        hold = None if self._hold is None else held(recording, self._hold)
+        loads = core_loads(recording, cycles, self._timing) if cycles else {}
+        board_shares = board_loads(recording, cycles, self._timing) if cycles else {}
         return RealTimeFigures(
             missed=missed_share(counts),
             late=late,
@@ -160,9 +166,9 @@ class _System:
             status_ms=response["status"].get("measured_ms"),
             command_age_ms=ages_ms(recording, self._timing, down=True),
             status_age_ms=ages_ms(recording, self._timing, down=False),
-            hold=None if self._hold is None else held(recording, self._hold),
+            hold=hold,
             plans=plan_latencies(recording, cycles),
             bus=bus_traffic(run.tasks, run.outcome.ticks, self._layout),
-            loads=core_loads(recording, cycles, self._timing) if cycles else {},
-            board_loads=board_loads(recording, cycles, self._timing) if cycles else {},
+            loads=loads,
+            board_loads=board_shares,
         )

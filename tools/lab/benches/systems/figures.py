@@ -49,6 +49,7 @@ def prediction(config: RackConfig) -> SystemPrediction:
     slots = {task.slot for task in layout.tasks}
     started = [host for host in config.host.values() if not host.external]
     rates = (1e9 / (every * timing.clock_ns) for every in hierarchy.cycles)
+    fits = forecast.holds if forecast.levels else None
     return SystemPrediction(
         levels=hierarchy.levels,
         boards=len(slots),
@@ -61,7 +62,7 @@ def prediction(config: RackConfig) -> SystemPrediction:
         command_ms=forecast.system.command_ms,
         status_ms=forecast.system.status_ms,
         loads=dict(sorted(forecast.loads.items())),
-        fits=forecast.holds if forecast.levels else None,
+        fits=fits,
     )
 
 

@@ -88,9 +88,7 @@ def _detection(kill: KillEvents) -> KillDetection:
         and event.board.partition(".")[0] != board
     )
     first = min(others, key=lambda event: event.tick, default=None)
-    return KillDetection(
-        board=strike.board,
-        rack=None if died is None else died.tick - strike.tick,
-        neighbour=None if first is None else first.tick - strike.tick,
-        by="" if first is None else first.board,
-    )
+    by_rack = None if died is None else died.tick - strike.tick
+    if first is None:
+        return KillDetection(strike.board, by_rack, neighbour=None, by="")
+    return KillDetection(strike.board, by_rack, first.tick - strike.tick, first.board)

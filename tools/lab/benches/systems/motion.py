@@ -120,8 +120,10 @@ def poses_config(name: str) -> Path | None:
     )
     if own is None:
         return None
-    is_main = own.stem == own.parent.name
-    return file_at(own.parent / ("three-poses.toml" if is_main else f"{own.stem}-three-poses.toml"))
+    motion = "three-poses.toml"
+    if own.stem != own.parent.name:
+        motion = f"{own.stem}-{motion}"
+    return file_at(own.parent / motion)
 
 
 class StopRun(NamedTuple):
@@ -158,12 +160,14 @@ class PosesBench:
         error = moved.position[moving] - moved.target[moving]
         begins = int(moved.tick[moving][0])
         rests = rests_at(moved.tick, moved.velocity)
+        if rests is None:
+            rests = int(moved.tick[-1])
         second = self._layout.clock_ns * 1e-9
         still = moved.position[moved.speed <= REST_RAD_S]
         near = [np.abs(still - pose).max(axis=1).min() < NEAR_RAD for pose in three_poses()]
         return PosesRun(
             begins_s=begins * second,
-            lasts_s=((rests if rests is not None else int(moved.tick[-1])) - begins) * second,
+            lasts_s=(rests - begins) * second,
             rms_mrad=1e3 * float(np.sqrt(np.mean(error**2))),
             peak_mrad=1e3 * float(np.abs(error).max()),
             tool_mm=1e3 * self._tool_error(moved.position[moving], moved.target[moving]),
@@ -206,7 +210,8 @@ class PosesBench:
         velocity = after["message"]["velocity"]
         rests = rests_at(after["tick"], velocity)
         speed = float(np.abs(velocity[0]).max())
-        return Stop(by, speed, None if rests is None else (rests - run.tick) * tick_s * 1e3)
+        rest_ms = None if rests is None else (rests - run.tick) * tick_s * 1e3
+        return Stop(by, speed, rest_ms)
 
 
 def _latch(segment: Segment) -> None:

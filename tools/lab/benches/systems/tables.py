@@ -142,7 +142,8 @@ def _accesses(count: float, size: float) -> tuple[str, str]:
 
 def _late(one: SystemFigures) -> Iterator[Sequence[str]]:
     rates = one.predicted.rates_hz
-    yield [one.rack, f"{max(rates):.4g}" if rates else "-", *one.realtime.cells(2)]
+    fastest = f"{max(rates):.4g}" if rates else "-"
+    yield [one.rack, fastest, *one.realtime.cells(2)]
 
 
 def _killed(one: SystemFigures) -> Iterator[Sequence[str]]:
