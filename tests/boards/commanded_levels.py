@@ -55,10 +55,7 @@ class CountParams(Table):
 
 
 class Lower(Executor):
-    """Counts, unless it is held from above or here; twice as fast while it is set to `twice`.
-
-    It is home once it counts by nine.
-    """
+    """Counts, unless it is held from above or here; twice as fast while it is set to `twice`."""
 
     inputs = {
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
@@ -68,7 +65,6 @@ class Lower(Executor):
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
-        Operation.GOTO: (Goal.HOME,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
         Operation.SET: (),
     }
@@ -85,10 +81,15 @@ class Lower(Executor):
         self.orders.take(read.operator, self._set)
         held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
         write.status.count += 0 if held else self.step * self.given.by
-        if self.orders.standing is not Operation.GOTO or self.given.by == 9:
+        if self.is_there:
             self.orders.done()
         self.orders.report(write.status, read.command.value.operator)
         write.status.state = State.EXECUTING
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the command in force is done: at once."""
+        return True
 
     def _set(self, command: Message) -> None:
         if command.what == Operation.MODIFY:
@@ -102,3 +103,14 @@ class Lower(Executor):
         """Begin without orders."""
         self.given = read_params(CountParams, self.context.params)
         self.orders = Orders(self.commands)
+
+
+class Homing(Lower):
+    """Goes home, too, which is done once it counts by nine."""
+
+    commands = {**Lower.commands, Operation.GOTO: (Goal.HOME,)}
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the command in force is done."""
+        return self.orders.standing is not Operation.GOTO or self.given.by == 9

@@ -30,7 +30,7 @@ from tests.tools.command_line import BOUND_S, ROOT, rack
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
     """Start a rack that runs until it is stopped; return when it does."""
-    path.write_text(COMMANDED)
+    path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -217,7 +217,7 @@ def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
         row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)
     }
     assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
-    assert rows["lower"]["takes"] == "hold, resume, goto home, modify twice on|off, set by"
+    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off, set by, goto home"
 
 
 @pytest.mark.slow
