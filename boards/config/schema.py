@@ -17,6 +17,7 @@ from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Role, Wake
 from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
+from rack.boards.config.record import RecordConfig
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
@@ -517,10 +518,9 @@ class RackConfig(Table):
     supervision: SupervisionConfig = Field(
         SupervisionConfig(), description="restarts of lost boards"
     )
+    record: RecordConfig | None = Field(None, description="flight recorder: what is kept of a run")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
-    command: tuple[CommandConfig, ...] = Field(
-        (), description="operator commands, each at its tick"
-    )
+    command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at a tick")
 
     @model_validator(mode="after")
     def _with_adapters(self) -> Self:

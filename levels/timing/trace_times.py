@@ -66,9 +66,11 @@ def residual_ns(rows: np.ndarray, slice_ns: int) -> np.ndarray:
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
-def gaps_ns(rows: np.ndarray) -> np.ndarray:
-    """Return the time from each start to the next one, shape (n - 1,)."""
-    return np.diff(rows["start_ns"])
+def gaps_ns(rows: np.ndarray, stretches: np.ndarray | None = None) -> np.ndarray:
+    """Return the time from each start to the next one, shape (n - 1,); less with the number of the
+    recording's stretch for each row: what was between two stretches is unknown."""
+    gaps = np.diff(rows["start_ns"])
+    return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
 def is_missed(rows: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from rack.backplane.words import System
+from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
 from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.answer import Failure, print_answer
@@ -19,11 +20,12 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, View
 from rack.tools.live.folder import folder_of
 from rack.tools.live.watched import WatchedRack, watched
+from rack.tools.recording.occasions import Keeping
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
-from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
+from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.spool import save as save_run
+from rack.tools.recording.run_files import save as save_run
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
@@ -95,12 +97,16 @@ def record(
         if save:
             print_answer(*_saved(found[0], folder), as_json)
             return
+        segment = found[0].segment
+        clock_ns = segment.layout.clock_ns
+        begun = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
         notes = _record_together(found, folder) if others else _record(found[0], folder, view)
+        lasted_s = (segment.words[System.TICK] - begun) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
-    print_answer(
-        {"rack": rack, "folder": str(folder), "notes": notes}, f"recorded into {folder}", as_json
-    )
+    answer = {"rack": rack, "folder": str(folder), "notes": notes, **sizes(folder, lasted_s)}
+    line = f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
+    print_answer(answer, line, as_json)
 
 
 def _saved(rack: WatchedRack, folder: Path) -> tuple[dict[str, Any], str]:
@@ -134,7 +140,9 @@ def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None =
         rack.follow(mailbox.name)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).write_text(segment.config)
-    view = SafeSink(lambda: ViewSink(segment, folder, port), notes.append)
+    view = None
+    if port is not None or Keeping.of(segment) is None:
+        view = SafeSink(lambda: ViewSink(segment, folder, port), notes.append)
     return Recorder(segment, folder, view, rack.refresh if segment.is_mirror else None)
 
 

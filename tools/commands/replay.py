@@ -45,6 +45,8 @@ def replay(runs: Runs, out: Out = None) -> None:
     each other; how uncertain that is stands in the log. Recordings that did not run together are
     refused.
 
+    A run without run.rrd, as of a flight recorder ([record] keep), is first made into a file.
+
     \b
     Examples:
       rack replay runs/nasrem-20250101-120000
@@ -57,7 +59,7 @@ def replay(runs: Runs, out: Out = None) -> None:
     parts = [part for run in runs for part in _parts(run)]
     if out is not None:
         _make(parts, out)
-    elif len(parts) == 1:
+    elif len(parts) == 1 and not (parts[0] / CONFIG).exists():
         raise Failure(f"{parts[0]}: nothing to replay: it has no run.rrd", 2)
     elif has_screen():
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-replay-") as folder:

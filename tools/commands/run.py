@@ -164,6 +164,7 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> None:
     """Make the report and print it; a recording that cannot be read does not fail the run."""
+    from rack.tools.recording.recorder_process import size_of, size_text
     from rack.tools.timing.analysis.report import unrecorded, write_report
     from rack.tools.timing.analysis.stored import print_report
 
@@ -173,3 +174,6 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
     except (Failure, OSError) as error:
         print(f"no report: {error}", file=sys.stderr)
     print_report(*(report or (unrecorded(config, result.document()), result.text())), as_json)
+    if folder is not None and not as_json:
+        lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
+        print(f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}")

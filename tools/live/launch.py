@@ -212,14 +212,24 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     Return "complete" or what is missing, and the rows missing by task and by mailbox.
     """
     # Here, not above: its libraries would delay the launch.
+    from rack.tools.recording.occasions import Keeping
     from rack.tools.recording.recording import Recording
+    from rack.tools.recording.run_files import tally
 
     try:
-        found = Recording(folder)
-        missing = found.missing(segment)
+        keeping = Keeping.of(segment)
+        # A run that was interrupted has no time to make tables of what a flight recorder kept.
+        left = None if keeping is None else tally(folder)
+        if keeping is None or left is None:
+            missing = Recording(folder).missing(segment)
+        else:
+            missing = left.missing(segment)
+            if not missing and (absent := keeping.absent(segment, left.kept, ticks)):
+                first, last = absent[0]
+                return f"ticks {first:,} to {last:,} had to be kept, and are not there", {}
         if not missing:
             return "complete", {}
-        gaps = found.gaps({name: rows for name, (rows, _) in missing.items()}, ticks)
+        gaps = Recording(folder).gaps({name: rows for name, (rows, _) in missing.items()}, ticks)
     except Failure as error:
         return f"{why}; {error}", {}
     most, name = max((found, name) for name, found in missing.items())

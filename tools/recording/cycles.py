@@ -33,7 +33,8 @@ class Cycles:
     X, W of an executor; 0, reading, P, U of a planner. `is_judged` excludes the start-up of a
     process, and the `stalled` cycles: those in which the core may have been away (see `stalls_of`);
     bool, shape (n,). `core` and `priority` are those that the task obtained; `overhead_ns` is the
-    processor time of a cycle outside its parts, for waking up and closing it.
+    processor time of a cycle outside its parts, for waking up and closing it. `stretches` are those
+    of the recording, shape (n,), see `Recording.stretch_of`.
     """
 
     task: TaskSpec
@@ -44,6 +45,7 @@ class Cycles:
     is_judged: np.ndarray
     stalled: int
     overhead_ns: int
+    stretches: np.ndarray
 
     @property
     def exchange_ns(self) -> np.ndarray:
@@ -103,9 +105,9 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
             whole = settled & (away[core].within(rows["start_ns"], rows["end_ns"]) == 0)
             judged = whole if whole.any() else settled
             stalled = int(settled.sum() - judged.sum())
-            found[task.name] = Cycles(
-                task, core, priority, rows, parts, judged, stalled, overhead_ns(rows)
-            )
+            stretches = recording.stretch_of(rows["tick"])
+            times = (rows, parts, judged, stalled, overhead_ns(rows), stretches)
+            found[task.name] = Cycles(task, core, priority, *times)
     return found
 
 

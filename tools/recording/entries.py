@@ -59,6 +59,8 @@ def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording)
         )
         wanted = f"{box.message} {box.version}, {box.size} bytes"
         raise Failure(f"--entries {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
+    if recording.kept:
+        raise Failure(f"--entries {recording.folder}: {recording.kept_text}", 2)
     if lost := recording.lost.get(box.name):
         raise Failure(
             f"--entries {recording.folder}: {box.name}: its recorder lost {lost} messages", 2

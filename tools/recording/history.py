@@ -190,9 +190,13 @@ def first_difference(one: Recording, other: Recording) -> Difference | None:
     """Return where two runs diverge, up to the end of the shorter one; None when all that both
     wrote is equal.
 
-    Raises `Failure` when the two have no mailbox in common, or either lost rows.
+    Raises `Failure` when the two have no mailbox in common, or either lacks rows.
     """
     for recording in (one, other):
+        if recording.kept:
+            raise Failure(
+                f"{recording.folder}: {recording.kept_text}; the two runs cannot be compared"
+            )
         lost = sum(recording.lost.values())
         if lost:
             raise Failure(

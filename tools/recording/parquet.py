@@ -91,11 +91,13 @@ class CyclesFile:
         lost: Mapping[str, int],
         cores: CoreRecord = UNMEASURED,
         gaps: Sequence[tuple[str, int, int]] = (),
+        kept: Sequence[tuple[int, int]] = (),
     ) -> None:
         """Finish the file; store as metadata the rows lost by task and by mailbox, what the machine
-        did to its cores, and the gaps."""
+        did to its cores, the gaps, and the ticks of the stretches that a flight recorder kept."""
         self._flush()
         metadata = {"lost": json.dumps(lost), "cores": cores.text(), "gaps": json.dumps(gaps)}
+        metadata |= {"kept": json.dumps(kept)}
         self._writer.add_key_value_metadata(metadata)
         self._writer.close()
 

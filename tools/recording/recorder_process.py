@@ -31,6 +31,8 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
+RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd")
+"""Endings of the files of a recording."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, as on a full disk: another one could not
@@ -218,11 +220,23 @@ def recorded_by(pid: int) -> Path | None:
 
 
 def size_of(folder: Path) -> int:
-    """Return the bytes of a run's files."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    """Return the bytes of what is recorded of a run, without reports and pictures."""
+    size = 0
+    for file in folder.rglob("*"):
+        # A flight recorder removes some.
+        with suppress(FileNotFoundError):
+            if file.suffix in RECORDED and file.is_file():
+                size += file.stat().st_size
+    return size
 
 
 def size_text(size: int, lasted_s: float) -> str:
     """Return the bytes of a recording, and of a second of it, as text."""
     rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
     return f"{size * 1e-6:.1f} MB{rate}"
+
+
+def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
+    """Return the bytes of a recording, and of a second of it, for programs."""
+    size = size_of(folder)
+    return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}

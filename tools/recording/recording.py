@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,14 +34,8 @@ from rack.tools.recording.parquet import (
     columns_of,
     config_check,
 )
-from rack.tools.recording.spool import mend, rings
-
-
-class Missing(NamedTuple):
-    """Rows of a ring that a recording lacks, of how many that were written."""
-
-    rows: int
-    written: int
+from rack.tools.recording.run_files import Missing, mend
+from rack.tools.recording.spool import STRETCHES, rings
 
 
 class Gap(NamedTuple):
@@ -60,6 +55,8 @@ class Gap(NamedTuple):
         )
 
 
+SHOWN = 20
+"""Stretches of which a text says from when to when they are."""
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """Errors of reading a damaged file, or a file of another kind."""
 
@@ -69,7 +66,7 @@ class Recording:
     be read.
 
     The spool of a recorder that was killed is first turned into readable files, with a note on
-    stderr.
+    stderr; so are the stretches that a flight recorder kept.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -77,7 +74,8 @@ class Recording:
         self.config = self._text(CONFIG)
         """The resolved config, as TOML text."""
         with _naming(folder):
-            if mend(folder):
+            is_flight = (folder / STRETCHES).is_dir()
+            if mend(folder) and not is_flight:
                 _note(
                     f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
                     " signals"
@@ -179,6 +177,33 @@ class Recording:
         with _naming(self.folder / "cycles.parquet"):
             return dict(json.loads(self._metadata[b"lost"]))
 
+    @cached_property
+    def kept(self) -> list[tuple[int, int]]:
+        """The ticks of the stretches that a flight recorder kept, [first, end); none if it removed
+        nothing."""
+        with _naming(self.folder / "cycles.parquet"):
+            found = [tuple(ends) for ends in json.loads(self._metadata.get(b"kept", b"[]"))]
+        return [] if len(found) == 1 and found[0][0] == 0 else found
+
+    def stretch_of(self, ticks: np.ndarray) -> np.ndarray:
+        """Return the number of the stretch of each tick, shape (n,): what lies between two of them
+        is unknown. All are of one where everything was kept."""
+        # Some rows are later than the end of their stretch, or of releases before its begin.
+        second = round(1e9 / self.layout.clock_ns)
+        borders = [
+            end + min((first - end) // 2, second) for (_, end), (first, _) in pairwise(self.kept)
+        ]
+        return np.searchsorted(borders, ticks, side="right")
+
+    @property
+    def kept_text(self) -> str:
+        """It as text; empty if nothing was removed."""
+        tick_s = self.layout.clock_ns * 1e-9
+        spans = [f"{first * tick_s:.1f} s to {end * tick_s:.1f} s" for first, end in self.kept]
+        more = [f"{len(spans) - SHOWN} more stretches"] if len(spans) > SHOWN else []
+        text = " and ".join([*spans[:SHOWN], *more])
+        return f"kept {text}; the rest was not kept, as [record] keep says" if text else ""
+
     def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
         """Return where rows are missing, in order; gaps that overlap are one.
 
@@ -233,14 +258,10 @@ class Recording:
                 serials = self.signal(name, "serial")
                 rows = len(serials)
                 at = int(serials[-1]) if rows else 0
-            ring.resume(at)
-            written = at + ring.waiting
-            left, overwritten = ring.drain()
             # Messages that every reader rejects are absent and not lost; those lost last are
             # overwritten.
-            if count := min(lost, at - rows) + overwritten + len(left):
-                found[name] = Missing(count, written)
-        return found
+            found[name] = Missing.of(ring, at, min(lost, at - rows))
+        return {name: missing for name, missing in found.items() if missing.rows}
 
     @cached_property
     def cores(self) -> CoreRecord:

@@ -6,20 +6,25 @@ times a second. A restarted recorder continues from the spool; `mend` makes the 
 the spool of a recorder that is gone. The spool is removed when the files are complete. A truncated
 last frame is dropped. The rings hold two seconds, so a recorder that is back within that time loses
 nothing.
+
+A flight recorder (`[record] keep`) writes no parquet files: frames go to stretches, files that are
+removed again unless something happened near them. The head of each says what was taken before it,
+so the tables can be made from any of them. They are made when the run is opened: ten minutes of the
+NASREM rack take half a minute.
 """
 
 from __future__ import annotations
 
 import fcntl
 import json
+import os
 import struct
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from shutil import copyfile, rmtree
-from typing import IO, NamedTuple
+from typing import IO, NamedTuple, Self
 
 import numpy as np
 import pyarrow as pa
@@ -30,19 +35,21 @@ from rack.backplane.ring import Ring
 from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import RECORD, trace_ring
 from rack.tools.console.answer import Failure
-from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CONFIG, SIGNALS, CyclesFile, SignalTables
 from rack.tools.recording.recorder_process import SPOOL
 
-CYCLES = "cycles.parquet"
-EVENTS = "events.jsonl"
-MENDED = "-mended"
 MAGIC = b"RACKSPL2"
 FLUSH_S = 0.25
 _HEAD = struct.Struct("<8sII")
 """Magic, size and CRC of the layout and launch that follow as JSON."""
 _FRAME = struct.Struct("<IIIII")
 """Ring, rows, rows lost before them, size and CRC of the data that follow."""
+STRETCHES = "stretches"
+_STRETCH = struct.Struct("<8sqII")
+"""Magic, the tick at which it ended, size and CRC of the rest of its head, which follows as
+JSON."""
+_ENDED = struct.Struct("<q")
+OPEN = -1
+"""End of a stretch that is being written, or whose recorder was killed."""
 
 
 class Frame(NamedTuple):
@@ -53,76 +60,59 @@ class Frame(NamedTuple):
     lost: int
 
 
-class RunFiles:
-    """cycles.parquet and signals/ of a folder, being written.
+class Packed(NamedTuple):
+    """A frame as it is in a file: `data` are the rows, compressed."""
 
-    By ring, `lost` counts the rows lost, and `taken` is the number of its last record so far.
-    `gaps` holds where they were lost: ring, first and last tick without rows.
+    ring: str
+    dtype: np.dtype
+    rows: int
+    lost: int
+    data: bytes
+
+    def unpacked(self) -> Frame:
+        """Return it with its rows."""
+        size = self.rows * self.dtype.itemsize
+        data = pa.decompress(self.data, size, "zstd", asbytes=True)
+        return Frame(self.ring, np.frombuffer(data, self.dtype), self.lost)
+
+
+class StretchHead(NamedTuple):
+    """The head of a stretch: its number from 1, and what its recorder had taken before it.
+
+    It holds what ended from tick `begin` to before `end`. By ring, `taken` is the number of the
+    last record before it, and `rows` counts the rows.
     """
 
-    def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
-        self.tasks = [task.name for task in layout.tasks]
-        self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
-        self.taken = dict(self.lost)
-        self.gaps: list[tuple[str, int, int]] = []
-        self._reached = dict.fromkeys(self.lost, (-1, 0))
-        """Of each ring the newest tick, and the rows lost by then."""
-        self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
-        self._signals = SignalTables(folder / f"{SIGNALS}{suffix}", layout)
+    number: int
+    begin: int
+    taken: dict[str, int]
+    rows: dict[str, int]
+    end: int = OPEN
 
-    def add(self, frame: Frame) -> None:
-        """Add rows of a ring."""
-        name, rows, lost = frame
-        self.lost[name] += lost
-        self.taken[name] += lost + len(rows)
-        if len(rows):
-            tick, before = self._reached[name]
-            if self.lost[name] > before:
-                self.gaps.append((name, tick + 1, int(rows["tick"][0]) - 1))
-            self._reached[name] = int(rows["tick"][-1]), self.lost[name]
-        if name in self.tasks:
-            self._cycles.add(name, rows)
-        elif len(rows):
-            self._signals.add(name, rows)
-            # Messages that every reader rejects were left out.
-            self.taken[name] = int(rows["serial"][-1])
+    def create(self, folder: Path) -> IO[bytes]:
+        """Create its file, to be written; the kernel has at once whatever is written."""
+        folder.mkdir(exist_ok=True)
+        text = json.dumps(self[:-1]).encode()
+        file = self.path(folder).open("wb", buffering=0)
+        file.write(_STRETCH.pack(MAGIC, self.end, len(text), zlib.crc32(text)) + text)
+        return file
 
-    def close(self, cores: CoreRecord = UNMEASURED) -> None:
-        """Finish all files; the trace keeps what the machine did to its cores."""
-        self._signals.close()
-        self._cycles.close(self.lost, cores, self.gaps)
+    def path(self, folder: Path) -> Path:
+        """Return its file in the folder of stretches."""
+        return folder / f"{self.number:08}.spool"
 
-
-def mend(folder: Path) -> bool:
-    """Make the files from the spool of a killed recorder; return False where there is none.
-
-    Raises `Failure` when that recorder is still running, or its spool cannot be read.
-    """
-    path = folder / SPOOL
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        _lock(file, path)
-        layout, launch = _read_head(file, path)
-        files = RunFiles(folder, layout, launch, MENDED)
-        for frame in _read_frames(file, layout):
-            files.add(frame)
-    files.close()
-    rmtree(folder / SIGNALS, ignore_errors=True)
-    for name in (CYCLES, SIGNALS):
-        (folder / f"{name}{MENDED}").replace(folder / name)
-    path.unlink()
-    return True
-
-
-def save(folder: Path, into: Path) -> None:
-    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
-    on."""
-    into.mkdir(parents=True, exist_ok=True)
-    for name in (CONFIG, EVENTS, SPOOL):
-        if (folder / name).is_file():
-            copyfile(folder / name, into / name)
-    mend(into)
+    @classmethod
+    def read(cls, file: IO[bytes]) -> Self | None:
+        """Read it; None if its recorder was killed as it began."""
+        head = file.read(_STRETCH.size)
+        if len(head) < _STRETCH.size or not head.startswith(MAGIC):
+            return None
+        _, end, size, crc = _STRETCH.unpack(head)
+        text = file.read(size)
+        if zlib.crc32(text) != crc:
+            return None
+        number, begin, taken, rows = json.loads(text)
+        return cls(number, begin, taken, rows, end)
 
 
 class Spool:
@@ -136,18 +126,20 @@ class Spool:
         self.path = folder / SPOOL
         # Readable as well, and unbuffered: the kernel has at once whatever is written.
         self._file = self.path.open("a+b", buffering=0)
+        self._out: IO[bytes] = self._file
+        self._folder = folder
         self._layout = layout
         self._rings = {name: place for place, name in enumerate(_dtypes(layout))}
         self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._rings}
         self._lost = dict.fromkeys(self._rings, 0)
         self._flush_at = 0.0
         try:
-            _lock(self._file, self.path)
+            if not locked(self._file):
+                raise Failure(f"{self.path}: another recorder is running there")
             if not self.path.stat().st_size:
                 text = json.dumps({"layout": asdict(layout), "launch": launch}).encode()
                 self._file.write(_HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text)
-            self._file.seek(0)
-            if (found := _read_head(self._file, self.path)) != (layout, launch):
+            if (found := read_head(self._file, self.path)) != (layout, launch):
                 raise Failure(
                     f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'"
                 )
@@ -155,13 +147,28 @@ class Spool:
             self.close()
             raise
 
-    def resume(self, take: Callable[[Frame], None]) -> None:
-        """Hand over the frames that another recorder left, and continue after them."""
+    def resume(self) -> Iterator[StretchHead | Packed]:
+        """Yield what another recorder left, and continue after it."""
         whole = self._file.tell()
-        for frame in _read_frames(self._file, self._layout):
-            take(frame)
+        for packed in _read_frames(self._file, self._layout):
+            yield packed
             whole = self._file.tell()
         self._file.truncate(whole)
+        # What was taken before a stretch is in its head. That of the newest one may be cut off.
+        yield from read(self._file, self._folder, self._layout, newest=2)
+
+    def divert(self, stretch: StretchHead, end: int) -> Path:
+        """Finish the stretch that is being written, which ends at a tick, and write what is added
+        from now on into another; return its file."""
+        self.flush(now=True)
+        self._seal(end)
+        self._out = stretch.create(self._folder / STRETCHES)
+        return stretch.path(self._folder / STRETCHES)
+
+    def _seal(self, end: int) -> None:
+        if self._out is not self._file:
+            os.pwrite(self._out.fileno(), _ENDED.pack(end), len(MAGIC))
+            self._out.close()
 
     def add(self, ring: str, rows: np.ndarray, lost: int) -> None:
         """Add rows from a ring."""
@@ -180,7 +187,7 @@ class Spool:
         self._flush_at = time.monotonic() + FLUSH_S
         waiting = b"".join(self._packed())
         while waiting:
-            waiting = waiting[self._file.write(waiting) :]
+            waiting = waiting[self._out.write(waiting) :]
         return True
 
     def _packed(self) -> Iterator[bytes]:
@@ -201,12 +208,15 @@ class Spool:
         self.path.unlink()
         self.close()
 
-    def close(self) -> None:
-        """Close the spool and leave it to another recorder."""
+    def close(self, end: int = OPEN) -> None:
+        """Close the spool and leave it to another recorder; its stretch, if any, ends at a tick."""
+        self._seal(end)
         self._file.close()
 
 
-def _read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
+def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
+    """Return what the head of a spool says of the rack; its frames follow. Raises `Failure`."""
+    file.seek(0)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size or not head.startswith(MAGIC):
         raise Failure(f"{path}: not a recorder's spool", 2)
@@ -218,16 +228,34 @@ def _read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
     return layout_of(head["layout"]), Launch(*head["launch"])
 
 
-def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Frame]:
+def read(
+    file: IO[bytes], folder: Path, layout: Layout, newest: int | None = None
+) -> Iterator[StretchHead | Packed]:
+    """Yield the frames of a spool, which is open after its head, then its stretches with theirs, or
+    the `newest` ones."""
+    yield from _read_frames(file, layout)
+    paths = stretch_files(folder)
+    for path in paths if newest is None else paths[-newest:]:
+        with path.open("rb") as part:
+            if (stretch := StretchHead.read(part)) is not None:
+                yield stretch
+                yield from _read_frames(part, layout)
+
+
+def stretch_files(folder: Path) -> list[Path]:
+    """Return the files of the stretches in a folder, oldest first."""
+    return sorted((folder / STRETCHES).glob("*.spool"))
+
+
+def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Packed]:
     rings = list(_dtypes(layout).items())
     while len(head := file.read(_FRAME.size)) == _FRAME.size:
         place, count, lost, size, crc = _FRAME.unpack(head)
-        packed = file.read(size)
-        if len(packed) < size or zlib.crc32(packed) != crc or place >= len(rings):
+        data = file.read(size)
+        if len(data) < size or zlib.crc32(data) != crc or place >= len(rings):
             return
         name, dtype = rings[place]
-        data = pa.decompress(packed, count * dtype.itemsize, "zstd", asbytes=True)
-        yield Frame(name, np.frombuffer(data, dtype), lost)
+        yield Packed(name, dtype, count, lost, data)
 
 
 def rings(segment: Segment) -> dict[str, Ring]:
@@ -244,8 +272,10 @@ def _dtypes(layout: Layout) -> dict[str, np.dtype]:
     return traces | {mailbox.name: row_dtype(mailbox) for mailbox in layout.timed}
 
 
-def _lock(file: IO[bytes], path: Path) -> None:
+def locked(file: IO[bytes]) -> bool:
+    """Lock a file; return False if another process has locked it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise Failure(f"{path}: another recorder is running there") from None
+        return False
+    return True

@@ -121,8 +121,8 @@ def _along(
     acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     seen = np.ones(len(ms), bool)
-    if recording.lost.get(mailbox):
-        # The first message with the information may be among those that the recorder lost.
+    if recording.lost.get(mailbox) or recording.kept:
+        # The first message with the information may be among those that are not recorded.
         gaps = np.cumsum(np.diff(recording.signal(mailbox, "serial"), prepend=0) > 1)
         seen = gaps[at[1:]] == gaps[at[:-1]]
     beyond = [

@@ -46,7 +46,12 @@ def write_merged(
         stream = Stream(recording, Timelines(own.clock_ns, own.launch, place), roots[own.rack])
         writer = RackWriter(stream, ran[own.rack])
         last = own.ticks[1] + 1
+        if kept := own.recording.kept_text:
+            stream.say(Moment(0, own.epoch_ns), "recorder", f"recorder: {kept}", "WARN")
         for tick, taken in _blocks(own.recording, last, block_of(own.recording.layout)):
+            if kept and not taken:
+                writer.skip(tick)
+                continue
             lost = own.recording.lost if tick == last else {}
             writer.write(taken, tick, lost)
             stream.flush()

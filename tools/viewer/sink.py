@@ -30,6 +30,7 @@ from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WREN
 from rack.levels.systems.hand.messages import GRASP_STATUS, HAND_STATUS, STREAMED_DOWN
 from rack.levels.systems.joint_boards.messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.systems.trajectory.messages import MOTION_STATUS
+from rack.tools.recording.occasions import Keeping
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, Marks, PlannedPath, Poses, Pushes, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
@@ -150,12 +151,18 @@ class RackWriter:
         self._hierarchy.advance()
         self._losses.advance(tick, lost)
 
+    def skip(self, tick: int) -> None:
+        """Go on at a tick: nothing is recorded of what was before."""
+        for age in self._ages.values():
+            age.skip(tick)
+
 
 class ViewSink:
     """Writes run.rrd of one rack into `folder`, a long run in parts; with a port, also serves it to
     a viewer.
 
-    The server of a viewer cannot change files: what it shows live is one part, however long.
+    The server of a viewer cannot change files: what it shows live is one part, however long. Of a
+    rack with a flight recorder there is no file.
     """
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
@@ -166,7 +173,8 @@ class ViewSink:
             RackViews(layout, ran.config, ran.cell).everything(), live=port is not None
         )
         run = f"{folder.name}-{launch.created_ns}"
-        recording = new_recording(folder.name, run, next_file(folder), view, port)
+        file = next_file(folder) if Keeping.of(segment) is None else None
+        recording = new_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)
         self._load = RecorderLoad(self._stream)

@@ -182,10 +182,10 @@ class Sampled:
 
 
 def new_recording(
-    name: str, run: str, file: Path, blueprint: rrb.Blueprint, port: int | None = None
+    name: str, run: str, file: Path | None, blueprint: rrb.Blueprint, port: int | None = None
 ) -> rr.RecordingStream:
-    """Return a recording to be written into a file, and served on a port of this machine, if one is
-    given.
+    """Return a recording to be written into a file, and served on a port of this machine, as far as
+    they are given.
 
     Files of one `run` are shown as one recording.
     """
@@ -194,7 +194,9 @@ def new_recording(
     recording = rr.RecordingStream(APPLICATION, recording_id=run)
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
-    sinks: list[rr.FileSink | rr.GrpcServerSink] = [rr.FileSink(str(file))]
+    sinks: list[rr.FileSink | rr.GrpcServerSink] = []
+    if file is not None:
+        sinks.append(rr.FileSink(str(file)))
     if port is not None:
         # A server, not a client: a client without its viewer would block the file as well.
         sinks.append(rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=SERVER_MEMORY))

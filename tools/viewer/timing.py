@@ -185,6 +185,12 @@ class Age:
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))
 
+    def skip(self, tick: int) -> None:
+        """Go on at a tick, with no message from before."""
+        self._upto = tick - 1
+        self._visible_at = self._visible_at[:0]
+        self._made = self._made[:0]
+
     def advance(self, tick: int) -> None:
         """Write the ages at all releases before `tick`; every message visible before it has been
         taken."""

@@ -149,6 +149,7 @@ def test_run_prints_one_json_document_and_nothing_else(
         "run.rrd",
         "signals",
     ]
+    assert report["bytes_per_s"] == report["bytes"] > 0
     again = rack("report", tmp_path / "run", "--json")
     assert json.loads(again.stdout) == report
     # The same document without a recording: what only a recording knows is null.

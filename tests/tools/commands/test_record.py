@@ -59,7 +59,10 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
                 continue
             answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
     assert recorder.returncode == 0
-    assert answer == {"rack": rack_name, "folder": str(tmp_path / "run"), "notes": []}
+    written = sum(path.stat().st_size for path in (tmp_path / "run").rglob("*") if path.is_file())
+    assert answer.pop("bytes_per_s") > 0
+    folder = str(tmp_path / "run")
+    assert answer == {"rack": rack_name, "folder": folder, "notes": [], "bytes": written}
     assert rack.outcome is not None
     report, _ = write_report(tmp_path / "run")
     assert report["rack"] == rack_name

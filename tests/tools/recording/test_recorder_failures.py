@@ -32,8 +32,10 @@ from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording import recorder_process
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
+from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.spool import SPOOL, Spool, mend
+from rack.tools.recording.run_files import mend
+from rack.tools.recording.spool import Spool
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.analysis.tables import text as analysis_text

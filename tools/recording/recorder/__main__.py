@@ -36,6 +36,7 @@ def main() -> None:
     os.nice(NICENESS)
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
+    from rack.tools.recording.occasions import Keeping
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
     from rack.tools.recording.recorder_process import UNWRITABLE
 
@@ -49,12 +50,15 @@ def main() -> None:
     # A run in real time need not wait for the libraries of the viewer, unless the user wants to
     # look on from the start.
     in_background = port is None and not segment.words[System.LOCKSTEP]
-    view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
+    view = None
+    # A flight recorder writes no file of the viewer; `rack replay` makes it of what is kept.
+    if port is not None or Keeping.of(segment) is None:
+        view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
     try:
         with Recorder(segment, Path(folder), view) as recorder:
             _tell("recording")
             recorder.follow(until=sys.stdin.fileno())
-            if sys.stdin.readline():
+            if sys.stdin.readline() and view is not None:
                 view.hurry()
     except OSError as error:
         # The text of pyarrow's own errors is long.

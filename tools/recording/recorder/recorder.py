@@ -17,7 +17,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
-from rack.tools.recording.spool import Frame, RunFiles, Spool, rings
+from rack.tools.recording.occasions import Keeping
+from rack.tools.recording.recorder.flight import FlightRecorder
+from rack.tools.recording.run_files import RunFiles, Tally
+from rack.tools.recording.spool import Frame, Spool, rings
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
@@ -83,7 +86,7 @@ class SafeSink:
         if self._opening.is_alive():
             self._tell(
                 "run.rrd is missing: the run was interrupted before the libraries of the viewer"
-                " were loaded"
+                " were loaded; 'rack replay' makes it"
             )
         else:
             self._hand_over()
@@ -141,10 +144,16 @@ class Recorder:
         # The spool first: it fails where another recorder is running, and leaves that one's files
         # alone.
         self._spool = Spool(folder, layout, segment.launch)
-        self._files = RunFiles(folder, layout, segment.launch)
-        self._spool.resume(self._files.add)
+        keeping = Keeping.of(segment)
+        self._files = RunFiles(folder, layout, segment.launch) if keeping is None else None
+        self._tally = self._files or Tally(layout)
+        for found in self._spool.resume():
+            self._tally.take(found)
+        self._flight = (
+            None if keeping is None else FlightRecorder(segment, keeping, self._spool, self._tally)
+        )
         self._rings = rings(segment)
-        for name, taken in self._files.taken.items():
+        for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)
         # Lockstep has no deadlines that the machine could break; the cores of another machine are
         # not seen.
@@ -174,7 +183,9 @@ class Recorder:
         for name, ring in self._rings.items():
             rows, lost = ring.drain()
             self._spool.add(name, rows, lost)
-            self._files.add(Frame(name, rows, lost))
+            self._tally.add(Frame(name, rows, lost))
+            if self._flight is not None:
+                self._flight.look(name, rows, lost)
             if self._view is not None:
                 self._view.add(name, rows)
         if self._is_follower:
@@ -184,10 +195,12 @@ class Recorder:
         is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
         if self._spool.flush(now=is_late):
             self._safe_tick = tick
+        if self._flight is not None:
+            self._flight.advance(tick)
         if self._cores is not None:
             self._cores.look()
         if self._view is not None:
-            self._view.advance(tick, self._files.lost)
+            self._view.advance(tick, self._tally.lost)
         self._report_progress()
 
     def _report_progress(self) -> None:
@@ -217,8 +230,11 @@ class Recorder:
         """Finish the files; the rack continues without a follower."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
-        self._spool.flush(now=True)
-        self._files.close(UNMEASURED if self._cores is None else self._cores.record())
-        self._spool.remove()
+        if self._flight is not None:
+            self._flight.close()
+        if self._files is not None:
+            self._spool.flush(now=True)
+            self._files.close(UNMEASURED if self._cores is None else self._cores.record())
+            self._spool.remove()
         if self._view is not None:
-            self._view.close(self._words[System.TICK] + 1, self._files.lost)
+            self._view.close(self._words[System.TICK] + 1, self._tally.lost)

@@ -40,6 +40,7 @@ def document(analysis: Analysis) -> Document:
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
         "gaps": [gap._asdict() for gap in recording.gaps()],
         "untraced": recording.untraced(),
+        "kept": recording.kept_text or None,
         "holds": analysis.holds,
         "levels": {name: _level(analysis, name) for name in config.board},
         "tasks": {
@@ -106,7 +107,7 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
     judged = cycles.is_judged
     is_lockstep = rack.is_lockstep
     rows = cycles.rows[judged]
-    gaps = gaps_ns(cycles.rows[judged])
+    gaps = gaps_ns(rows, cycles.stretches[judged])
     missed, skipped = counts(rows)
     return {
         "role": cycles.task.role,

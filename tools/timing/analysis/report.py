@@ -40,6 +40,7 @@ from rack.tools.recording.history import (
     misses,
     steal,
 )
+from rack.tools.recording.recorder_process import sizes
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
 from rack.tools.timing.analysis.report_markdown import markdown
@@ -71,6 +72,7 @@ def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str
     """
     recording = Recording(folder)
     report = report_of(recording)
+    report |= sizes(folder, report["simulated_s"])
     if against is not None:
         report["against"] = _compared(recording, Recording(against), report["misses"])
     text = markdown(report)
@@ -116,6 +118,7 @@ def report_of(recording: Recording) -> Report:
         "rows_lost": {name: count for name, count in recording.lost.items() if count},
         "gaps": [gap._asdict() for gap in recording.gaps()],
         "untraced": recording.untraced(),
+        "kept": recording.kept_text or None,
     }
 
 
@@ -126,7 +129,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
         *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
         *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
         *("task", "motion", "hand", "force", "queues", "interrupts"),
-        *("rows_lost", "gaps", "untraced"),
+        *("rows_lost", "gaps", "untraced", "kept", "bytes", "bytes_per_s"),
     )
     layout = wire(config)
     tasks = {
@@ -179,12 +182,12 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
     is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
     cycles = recording.trace(task.name)
+    stretches = recording.stretch_of(cycles["tick"])
+    period_ns = layout.clock_ns if is_lockstep else tick_ns(config)
     entry: Report = {
         **_about(task, layout),
         **recording.ended.get("tasks", {}).get(task.name, {}),
-        **task_times(
-            task, cycles, layout.clock_ns if is_lockstep else tick_ns(config), is_lockstep
-        ),
+        **task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
     }
     if task.role == "executor" and f"{task.board}.plan" in recording.mailboxes:
         entry["plan_age_ms"] = distribution(plan_ages_ms(recording, task.board))
@@ -198,7 +201,13 @@ def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
     made = recording.signal(plan, "tick")
     visible_at = recording.signal(plan, "visible_at")
     ticks = recording.trace(board)["tick"]
-    return plan_ages(ticks, made, visible_at) * (recording.layout.clock_ns * 1e-6)
+    own = recording.stretch_of(ticks)
+    plans = recording.stretch_of(made)
+    found = [
+        plan_ages(ticks[own == at], made[plans == at], visible_at[plans == at])
+        for at in np.unique(plans)
+    ]
+    return np.concatenate(found) * (recording.layout.clock_ns * 1e-6)
 
 
 def _about(task: TaskSpec, layout: Layout) -> Report:
@@ -206,7 +215,12 @@ def _about(task: TaskSpec, layout: Layout) -> Report:
 
 
 def task_times(
-    task: TaskSpec, cycles: np.ndarray, period_ns: int, is_lockstep: bool = False
+    task: TaskSpec,
+    cycles: np.ndarray,
+    period_ns: int,
+    is_lockstep: bool = False,
+    *,
+    stretches: np.ndarray | None = None,
 ) -> Report:
     """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec +
     t_comm + t_residual).
@@ -214,10 +228,10 @@ def task_times(
     `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and
     preemption. `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its
     R is their time slice. In lockstep a tick lasts as long as its tasks take: everything relative
-    to a release or a time slice is None.
+    to a release or a time slice is None. `stretches` are as in `gaps_ns`.
     """
     slice_ns = task.every * task.within_cycles * period_ns
-    gaps = gaps_ns(cycles)
+    gaps = gaps_ns(cycles, stretches)
     by_the_clock: Report = {
         "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
         "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),

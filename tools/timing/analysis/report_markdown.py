@@ -98,6 +98,8 @@ def _blocks(report: Report) -> Iterator[str | Grid]:
     yield from _machine(report)
     if report["recording"] != "complete":
         yield f"- recording: {report['recording']}"
+    if report["kept"]:
+        yield f"- {report['kept']}"
     if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
         yield f"- the recorder lost rows: {lost}"
         yield from (f"- {Gap(**gap)}" for gap in report["gaps"])

@@ -124,6 +124,8 @@ def _head(analysis: Analysis) -> Iterator[str]:
         if count
     )
     yield from map(str, analysis.recording.gaps())
+    if kept := analysis.recording.kept_text:
+        yield kept
 
 
 def _ended(analysis: Analysis) -> str:

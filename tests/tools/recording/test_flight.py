@@ -1,0 +1,260 @@
+"""The flight recorder: a bounded folder, in which the last stretch and what surrounds an occasion
+stay, and every row that had to be kept is proved to be there."""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards import Rack
+from rack.boards.config import RackConfig, load
+from rack.tools.commands.replay import merge, replay
+from rack.tools.console.answer import Failure
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.live.snapshot import Snapshot
+from rack.tools.recording.history import first_difference
+from rack.tools.recording.occasions import Keeping
+from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.recorder.recorder import Recorder
+from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.run_files import save, tally
+from rack.tools.recording.spool import STRETCHES
+from rack.tools.timing.analysis.report import write_report
+from rack.tools.viewer.parts import FILE
+from rack.tools.viewer.reading import read
+from rack.tools.viewer.sink import ViewSink
+from rack.tools.viewer.window import free_port
+from tests.tools.command_line import rack
+from tests.tools.recording.test_recorder_failures import Held
+
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+
+SECOND = 400
+"""Ticks."""
+KEEP_S, AROUND_S = 4, 1
+RECORD = f'record={{ keep = "{KEEP_S} s", before = "{AROUND_S} s", after = "{AROUND_S} s" }}'
+FAULT_S = 20
+FAULT = f"fault=[{{ kind = 'drop', board = 'lower', at = {FAULT_S}.0, for = '0.1s' }}]"
+LONG_S = 60.0
+LEEWAY = 4
+"""Stretches that are not whole seconds, and those at the borders."""
+
+
+class Measuring(Display):
+    """Counts the stretches in a folder, second by second."""
+
+    period_s = 0.05
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.counts: dict[int, int] = {}
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Count."""
+        stretches = len([*(self._folder / STRETCHES).glob("*")])
+        self.counts[snapshot.tick // SECOND] = stretches
+
+
+@pytest.fixture
+def config(small: Path, rack_name: str) -> RackConfig:
+    """A rack of two levels that count, with a flight recorder and a fault."""
+    return load(small, [f"name={rack_name}", RECORD, FAULT])
+
+
+def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    folder, display = tmp_path / "run", Measuring(tmp_path / "run")
+    result = run_rack(config, LONG_S, folder, display)
+    assert (result.worked, result.recording) == (True, "complete")
+    late = {second: count for second, count in display.counts.items() if second > 2 * KEEP_S}
+    # The fault's end and the message that was missed by its reader are occasions, too.
+    assert max(late.values()) <= KEEP_S + 2 * AROUND_S + 1 + LEEWAY
+    assert max(late.values(), default=0) > KEEP_S - LEEWAY
+    assert not (folder / "cycles.parquet").exists()
+    recording = Recording(folder)
+    assert not (folder / STRETCHES).exists()
+    around, last = recording.kept
+    ticks = recording.trace("lower")["tick"]
+    for first, end in (
+        ((FAULT_S - AROUND_S) * SECOND, (FAULT_S + AROUND_S) * SECOND),
+        (result.outcome.ticks - KEEP_S * SECOND, result.outcome.ticks),
+    ):
+        assert np.isin(np.arange(first, end), ticks).all()
+        assert any(begin <= first and end <= until for begin, until in (around, last))
+    assert len(ticks) < (KEEP_S + 2 * AROUND_S + LEEWAY) * SECOND
+    assert not any(recording.lost.values())
+    assert recording.gaps() == []
+
+
+def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    run_rack(config, LONG_S, folder, Display())
+    report, text = write_report(folder)
+    recording = Recording(folder)
+    assert recording.kept_text.startswith("kept ")
+    assert recording.kept_text.endswith("; the rest was not kept, as [record] keep says")
+    assert report["kept"] == recording.kept_text
+    assert f"- {recording.kept_text}\n" in text
+    assert (report["rows_lost"], report["gaps"], report["untraced"]) == ({}, [], {})
+    # No plan was as old as the stretch that is missing.
+    assert report["tasks"]["lower"]["plan_age_ms"]["max"] < 100
+    merge([folder], folder / FILE)
+    with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
+        first_difference(recording, recording)
+
+
+def test_a_run_that_is_shorter_than_what_is_kept_is_as_any_other(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    names = [f"name={rack_name}"]
+    for folder, settings in (("whole", names), ("flight", [*names, RECORD])):
+        assert run_rack(load(small, settings), 3.0, tmp_path / folder, Display()).worked
+    whole, flight = (Recording(tmp_path / name) for name in ("whole", "flight"))
+    assert (flight.kept, flight.kept_text) == ([], "")
+    assert first_difference(whole, flight) is None
+    for name in ("lower", "upper", *whole.mailboxes):
+        assert len(flight.rows(name)) == len(whole.rows(name))
+
+
+def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    display = Held(config.name, signal.SIGKILL, tick=25 * SECOND)
+    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
+    assert display.struck
+    assert (result.worked, result.recording) == (True, "complete")
+    recording = Recording(tmp_path / "run")
+    ticks = recording.trace("lower")["tick"]
+    # What the first one had not removed stays.
+    assert np.isin(np.arange((FAULT_S - AROUND_S) * SECOND, 25 * SECOND), ticks).all()
+    assert not any(recording.lost.values())
+
+
+def fly(rack: Rack, folder: Path, seconds: float) -> Recorder:
+    """Run a rack, and record it in this process; return the recorder, to be closed."""
+    folder.mkdir()
+    (folder / CONFIG).write_text(rack.config.text())
+    recorder = Recorder(rack.segment, folder)
+    rack.start(seconds)
+    while rack.watch(0.002):
+        recorder.drain()
+    recorder.drain()
+    return recorder
+
+
+def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
+    """Return the rings of which rows lack, and the ticks that had to be kept and are not there."""
+    left, keeping = tally(folder), Keeping.of(segment)
+    assert left is not None
+    assert keeping is not None
+    absent = keeping.absent(segment, left.kept, segment.words[System.STOP_TICK])
+    return {*left.missing(segment)}, [tuple(ends) for ends in absent]
+
+
+def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    early = config.model_copy(
+        update={"fault": tuple(fault.model_copy(update={"at": 2.0}) for fault in config.fault)}
+    )
+    folder = tmp_path / "run"
+    with Rack(early) as rack:
+        segment = rack.segment
+        fly(rack, folder, seconds=10.0).close()
+        assert what_lacks(segment, folder) == (set(), [])
+        stretches = sorted((folder / STRETCHES).iterdir())
+        around, last = stretches[1], stretches[-2]
+        for path in (around, last):
+            whole = path.read_bytes()
+            path.unlink()
+            lacking, absent = what_lacks(segment, folder)
+            # A file that is gone is not damage of another: it counts as removed, which it must not.
+            assert not lacking
+            assert absent
+            path.write_bytes(whole)
+        whole = last.read_bytes()
+        last.write_bytes(whole[: len(whole) * 2 // 3])
+        lacking, absent = what_lacks(segment, folder)
+        assert lacking
+        assert not absent
+
+
+def test_rows_that_a_flight_recorder_did_not_take_are_missing(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    tmp_path.joinpath(CONFIG).write_text(config.text())
+    with Rack(config) as rack:
+        Recorder(rack.segment, tmp_path).close()
+        rack.run(0.5)
+        lacking, absent = what_lacks(rack.segment, tmp_path)
+    assert {"lower", "lower.status", "upper"} <= lacking
+    assert absent
+
+
+def test_what_is_kept_is_saved_while_the_run_goes_on(config: RackConfig, tmp_path: Path) -> None:
+    run, saved = tmp_path / "run", tmp_path / "saved"
+    with Rack(config) as rack:
+        recorder = fly(rack, run, seconds=6.0)
+        left = sorted(path.name for path in (run / STRETCHES).iterdir())
+        save(run, saved)
+        recorder.close()
+        assert left[:3] == sorted(path.name for path in (run / STRETCHES).iterdir())[:3]
+    part, whole = Recording(saved), Recording(run)
+    assert not (saved / SPOOL).exists()
+    assert not (saved / STRETCHES).exists()
+    ticks = part.trace("lower")["tick"]
+    assert len(ticks) > SECOND
+    assert np.isin(ticks, whole.trace("lower")["tick"]).all()
+
+
+def test_a_viewer_is_served_and_its_file_is_not_written(config: RackConfig, tmp_path: Path) -> None:
+    (tmp_path / CONFIG).write_text(config.text())
+    with Rack(config) as rack:
+        view = ViewSink(rack.segment, tmp_path, free_port())
+        with Recorder(rack.segment, tmp_path, view) as recorder:
+            rack.run(0.5)
+            recorder.drain()
+    assert not (tmp_path / FILE).exists()
+    assert len(Recording(tmp_path).trace("lower")) == SECOND // 2
+
+
+def test_a_run_ends_with_where_it_is_recorded_and_how_big_it_is(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    name = ("--set", f"name={rack_name}", "--set", RECORD)
+    done = rack("run", small, "--seconds", 2, *name, "--out", run)
+    assert done.returncode == 0, done.stderr
+    last = done.stdout.splitlines()[-1]
+    assert re.fullmatch(rf"recorded into {run}: [0-9.]+ MB, [0-9.]+ MB/s", last)
+
+
+def test_the_viewers_file_is_made_of_what_was_kept_and_its_log_says_so(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    folder, made = tmp_path / "run", tmp_path / "made.rrd"
+    run_rack(config, LONG_S, folder, Display())
+    assert not (folder / FILE).exists()
+    replay([folder], made)
+    recording = Recording(folder)
+    shown = read(made, "/signals/lower.status/count")
+    assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
+    # No age is shown where nothing was kept.
+    ages = read(made, "/ages/lower.status").ticks
+    assert len(ages)
+    (_, gone), (back, _) = recording.kept
+    assert not ((ages > gone + SECOND) & (ages < back - SECOND)).any()
+    logged = RrdReader(str(made)).stream().filter(content="/log/recorder").to_chunks()
+    assert recording.kept_text in str([chunk.to_record_batch().to_pydict() for chunk in logged])

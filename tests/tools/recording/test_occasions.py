@@ -1,0 +1,58 @@
+"""Which occasions a flight recorder keeps for good, and which it does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rack.backplane.message import State
+from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.tools.recording.occasions import Keeping, Occasions
+from rack.tools.recording.spool import rings
+
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+
+
+def traced(flags: list[int]) -> np.ndarray:
+    """Return records of a task, ticks 100 and so on, by their flags."""
+    rows = np.zeros(len(flags), RECORD)
+    rows["tick"] = 100 + np.arange(len(flags))
+    rows["flags"] = flags
+    return rows
+
+
+def test_misses_holds_and_all_alarms_but_commands_are_occasions(
+    small: Path, rack_name: str
+) -> None:
+    record = "record={ keep = '10 s', before = '1 s', after = '2 s' }"
+    with Rack(load(small, [f"name={rack_name}", record])) as rack:
+        segment = rack.segment
+        occasions = Occasions(segment)
+        assert list(occasions.alarms()) == []
+        assert list(occasions.within("lower", traced([0, 0]))) == []
+        missed = traced([0, Flag.MISSED, 0, 1 << SKIPPED_SHIFT])
+        assert list(occasions.within("lower", missed)) == [101, 103]
+        rack.run(0.1)
+        status = rings(segment)["lower.status"].drain().rows.copy()
+        status["message"]["state"] = State.EXECUTING
+        assert list(occasions.within("lower.status", status)) == []
+        # It begins, lasts over the end of what was drained, and ends.
+        status["message"]["state"][-3:] = State.HOLDING
+        assert list(occasions.within("lower.status", status)) == [int(status["tick"][-3])]
+        status["message"]["state"][:2] = State.HOLDING
+        status["message"]["state"][-3:] = State.EXECUTING
+        assert list(occasions.within("lower.status", status)) == [int(status["tick"][2])]
+        bell = AlarmWriter(segment, "upper")
+        for tick, alarm in ((7, Alarm.COLLISION), (8, Alarm.COMMANDED), (9, Alarm.REJOINED)):
+            bell.ring(tick, alarm)
+        assert list(occasions.alarms()) == [7, 9]
+        assert list(occasions.alarms()) == []
+        keeping = Keeping.of(segment)
+        assert keeping is not None
+        assert keeping.around(100) == (0, 900)
+        assert keeping.around(1000) == (600, 1800)

@@ -1,0 +1,217 @@
+"""What a recorder leaves in the folder of a run: cycles.parquet and signals/, made as rows come, or
+later from its spool."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from shutil import copyfile, rmtree
+from typing import NamedTuple, Self
+
+from rack.backplane.layout import Layout
+from rack.backplane.ring import Ring
+from rack.backplane.segment import Launch, Segment
+from rack.tools.console.answer import Failure
+from rack.tools.recording.cores import UNMEASURED, CoreRecord
+from rack.tools.recording.parquet import CONFIG, SIGNALS, CyclesFile, SignalTables
+from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.spool import (
+    OPEN,
+    STRETCHES,
+    Frame,
+    Packed,
+    StretchHead,
+    locked,
+    read,
+    read_head,
+    rings,
+    stretch_files,
+)
+
+CYCLES = "cycles.parquet"
+EVENTS = "events.jsonl"
+MENDED = "-mended"
+
+
+class Missing(NamedTuple):
+    """Rows of a ring that a recording lacks, of how many that were written."""
+
+    rows: int
+    written: int
+
+    @classmethod
+    def of(cls, ring: Ring, taken: int, lost: int) -> Self:
+        """Return it for the ring of a rack that has ended, from which `taken` records were taken,
+        and `lost` of them were not."""
+        ring.resume(taken)
+        written = taken + ring.waiting
+        left, overwritten = ring.drain()
+        return cls(lost + overwritten + len(left), written)
+
+
+class Tally:
+    """What a recorder has taken of a rack's rings, or left of it on disk.
+
+    By ring, `lost` counts the rows lost, `rows` those taken, and `taken` is the number of its last
+    record so far. `kept` holds the ticks of the stretches kept, [first, end), of a flight recorder.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.tasks = [task.name for task in layout.tasks]
+        self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
+        self.taken = dict(self.lost)
+        self.rows = dict(self.lost)
+        self.kept: list[tuple[int, int]] = []
+        self.number = 0
+        self._newest = -1
+
+    def take(self, found: StretchHead | Packed) -> None:
+        """Take what is in a spool."""
+        if isinstance(found, StretchHead):
+            self.begin(found)
+        else:
+            self.add(found.unpacked())
+
+    def begin(self, stretch: StretchHead) -> None:
+        """Go on with a stretch; others before it may have been removed."""
+        follows = stretch.number == self.number + 1
+        if follows:
+            # Rows are missing only if the file before is damaged.
+            for name, rows in stretch.rows.items():
+                self.lost[name] += rows - self.rows[name]
+        self.taken.update(stretch.taken)
+        self.rows.update(stretch.rows)
+        if follows and self.kept:
+            self.kept[-1] = self.kept[-1][0], stretch.end
+        else:
+            self.end()
+            self.kept.append((stretch.begin, stretch.end))
+        self.number = stretch.number
+
+    def add(self, frame: Frame) -> None:
+        """Add rows of a ring."""
+        name, rows, lost = frame
+        self.count(name, len(rows), lost)
+        if len(rows):
+            self._newest = int(rows["tick"][-1])
+            if name not in self.tasks:
+                # Messages that every reader rejects were left out.
+                self.taken[name] = int(rows["serial"][-1])
+
+    def count(self, name: str, rows: int, lost: int) -> None:
+        """Count rows of a ring, and those lost before them."""
+        self.lost[name] += lost
+        self.rows[name] += rows
+        self.taken[name] += lost + rows
+
+    def end(self) -> None:
+        """End the last stretch where its recorder was killed."""
+        if self.kept and self.kept[-1][1] == OPEN:
+            first = self.kept[-1][0]
+            self.kept[-1] = first, max(first, self._newest + 1)
+
+    def missing(self, segment: Segment) -> dict[str, Missing]:
+        """Return what was written into the rings of a rack that has ended, and was lost or never
+        taken, by task and by mailbox."""
+        found = {
+            name: Missing.of(ring, self.taken[name], self.lost[name])
+            for name, ring in rings(segment).items()
+        }
+        return {name: missing for name, missing in found.items() if missing.rows}
+
+
+class RunFiles(Tally):
+    """cycles.parquet and signals/ of a folder, being written.
+
+    `gaps` holds where rows were lost: ring, first and last tick without rows.
+    """
+
+    def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
+        super().__init__(layout)
+        self.gaps: list[tuple[str, int, int]] = []
+        self._reached = dict.fromkeys(self.lost, (-1, 0))
+        """Of each ring the newest tick, and the rows lost by then."""
+        self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
+        self._signals = SignalTables(folder / f"{SIGNALS}{suffix}", layout)
+
+    def begin(self, stretch: StretchHead) -> None:
+        """Go on with a stretch: what is not there before it was removed, not lost."""
+        if stretch.number != self.number + 1:
+            self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
+        super().begin(stretch)
+
+    def add(self, frame: Frame) -> None:
+        """Add rows of a ring."""
+        super().add(frame)
+        name, rows, _ = frame
+        if len(rows):
+            tick, before = self._reached[name]
+            if self.lost[name] > before:
+                self.gaps.append((name, tick + 1, int(rows["tick"][0]) - 1))
+            self._reached[name] = int(rows["tick"][-1]), self.lost[name]
+        if name in self.tasks:
+            self._cycles.add(name, rows)
+        elif len(rows):
+            self._signals.add(name, rows)
+
+    def close(self, cores: CoreRecord = UNMEASURED) -> None:
+        """Finish all files; the trace keeps what the machine did to its cores."""
+        self.end()
+        self._signals.close()
+        self._cycles.close(self.lost, cores, self.gaps, self.kept)
+
+
+def mend(folder: Path) -> bool:
+    """Make the files from the spool that a killed recorder left, or a flight recorder; return False
+    where there is none.
+
+    Raises `Failure` when that recorder is still running, or its spool cannot be read.
+    """
+    path = folder / SPOOL
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if not locked(file):
+            raise Failure(f"{path}: another recorder is running there")
+        layout, launch = read_head(file, path)
+        files = RunFiles(folder, layout, launch, MENDED)
+        for found in read(file, folder, layout):
+            files.take(found)
+    files.close()
+    rmtree(folder / SIGNALS, ignore_errors=True)
+    for name in (CYCLES, SIGNALS):
+        (folder / f"{name}{MENDED}").replace(folder / name)
+    # First: without it what is left of the stretches is not taken for a run.
+    path.unlink()
+    rmtree(folder / STRETCHES, ignore_errors=True)
+    return True
+
+
+def tally(folder: Path) -> Tally | None:
+    """Return what a flight recorder has left in a folder, by the heads and checks of its frames;
+    None where none has. Raises `Failure` when it cannot be read."""
+    path = folder / SPOOL
+    if not path.is_file() or not (folder / STRETCHES).is_dir():
+        return None
+    with path.open("rb") as file:
+        layout, _ = read_head(file, path)
+        found = Tally(layout)
+        for one in read(file, folder, layout):
+            if isinstance(one, StretchHead):
+                found.begin(one)
+            else:
+                found.count(one.ring, one.rows, one.lost)
+    found.end()
+    return found
+
+
+def save(folder: Path, into: Path) -> None:
+    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
+    on."""
+    stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
+    for name in (CONFIG, EVENTS, SPOOL, *stretches):
+        (into / name).parent.mkdir(parents=True, exist_ok=True)
+        # The flight recorder may have removed it meanwhile.
+        with suppress(FileNotFoundError):
+            copyfile(folder / name, into / name)
+    mend(into)
