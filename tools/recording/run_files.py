@@ -3,18 +3,20 @@ later from its spool."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import time
+from contextlib import closing, suppress
 from pathlib import Path
 from shutil import copyfile, rmtree
-from typing import NamedTuple, Self
+from typing import IO, NamedTuple, Self
 
+from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import CONFIG, SIGNALS, CyclesFile, SignalTables
-from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.recorder_process import LOOK_S, SPOOL
 from rack.tools.recording.spool import (
     OPEN,
     STRETCHES,
@@ -31,6 +33,8 @@ from rack.tools.recording.spool import (
 CYCLES = "cycles.parquet"
 EVENTS = "events.jsonl"
 MENDED = "-mended"
+FINISH_S = 20.0
+"""Longest wait for a recorder that finishes without its launcher."""
 
 
 class Missing(NamedTuple):
@@ -171,8 +175,10 @@ def mend(folder: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        if not locked(file):
-            raise Failure(f"{path}: another recorder is running there")
+        _lock(file, path)
+        if not path.is_file():
+            # The recorder has finished its files meanwhile.
+            return False
         layout, launch = read_head(file, path)
         files = RunFiles(folder, layout, launch, MENDED)
         for found in read(file, folder, layout):
@@ -215,3 +221,20 @@ def save(folder: Path, into: Path) -> None:
         with suppress(FileNotFoundError):
             copyfile(folder / name, into / name)
     mend(into)
+
+
+def _lock(file: IO[bytes], path: Path) -> None:
+    """Lock a spool; where its launcher was killed, wait for its recorder to finish."""
+    deadline = time.monotonic() + FINISH_S
+    while not locked(file):
+        if _is_running(*read_head(file, path)):
+            raise Failure(f"{path}: another recorder is running there")
+        if time.monotonic() > deadline:
+            raise Failure(f"{path}: its recorder has not finished within {FINISH_S:g} s")
+        time.sleep(LOOK_S)
+
+
+def _is_running(layout: Layout, launch: Launch) -> bool:
+    with suppress(SegmentError), closing(Segment.attach(layout.rack)) as segment:
+        return segment.launch == launch and not segment.run_is_over
+    return False

@@ -11,6 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -531,6 +532,23 @@ def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path
             Recorder(rack.segment, tmp_path)
         with pytest.raises(Failure, match="another recorder is running there"):
             mend(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_run_is_opened_once_the_recorder_of_a_launcher_that_was_killed_has_finished(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    (tmp_path / CONFIG).write_text(config.text())
+    with Rack(config) as rack, ThreadPoolExecutor(1) as pool:
+        recorder = Recorder(rack.segment, tmp_path)
+        rack.run(0.5)
+        opened = pool.submit(Recording, tmp_path)
+        with pytest.raises(TimeoutError):
+            opened.result(3 * recorder_process.LOOK_S)
+        recorder.drain()
+        recorder.close()
+        assert len(opened.result(WATCHDOG_S).trace("lower")) == 200
+    assert not (tmp_path / SPOOL).exists()
 
 
 def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(

@@ -34,6 +34,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
+    launcher = os.getppid()
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
     from rack.tools.recording.occasions import Keeping
@@ -58,7 +59,14 @@ def main() -> None:
         with Recorder(segment, Path(folder), view) as recorder:
             _tell("recording")
             recorder.follow(until=sys.stdin.fileno())
-            if sys.stdin.readline() and view is not None:
+            if segment.run_is_over:
+                # No board is left to give way to; but only root may take its niceness back.
+                with suppress(PermissionError):
+                    os.nice(-NICENESS)
+            # Nobody waits for the viewer's file if the launcher was killed. On a loaded machine its
+            # libraries alone may take a minute; `rack replay` makes it.
+            is_hurried = sys.stdin.readline() or os.getppid() != launcher
+            if is_hurried and view is not None:
                 view.hurry()
     except OSError as error:
         # The text of pyarrow's own errors is long.
