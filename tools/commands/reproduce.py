@@ -61,9 +61,13 @@ def reproduce(
     DIR/paper.json has everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and
     `rack analyze` read them.
 
-    It takes about six minutes on two cores. Do not use the machine meanwhile: real-time figures
-    suffer. What is finished is kept, also if the command is interrupted or killed: given again, it
-    continues. A change of configs, program or machine makes the experiments anew that depend on it.
+    Every ruling results from comparisons of measured values, which the page lists. A claim is not
+    judged by a run that does not show it, such as one in which a level made no plan.
+
+    It takes about fourteen minutes on two cores. Do not use the machine meanwhile: real-time
+    figures suffer. What is finished is kept, also if the command is interrupted or killed: given
+    again, it continues. A change of configs, program or machine makes the experiments anew that
+    depend on it.
 
     Exit status: 0 every experiment was made, and no claim failed; 1 otherwise; 2 usage error.
 

@@ -29,7 +29,9 @@ from rack.tools.console.progress import Progress
 from rack.tools.console.tables import figure, table
 from rack.tools.lab.benches.harness import BenchResult, interleaved
 from rack.tools.lab.benches.observed import record
+from rack.tools.recording.cycles import cycles_of
 from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.analysis import core_loads
 from rack.tools.timing.analysis.report import plan_ages_ms
 
 LAUNCH_S = 3.0
@@ -117,10 +119,12 @@ class LevelFigures:
 
 @dataclass(frozen=True)
 class PartitionFigures:
-    """The measurements of one partition."""
+    """The measurements of one partition; `loads` are the parts of each core's time that its tasks
+    used in the last run."""
 
     partition: str
     levels: tuple[LevelFigures, ...]
+    loads: dict[int, float]
 
 
 @dataclass(frozen=True)
@@ -205,7 +209,9 @@ def _figures(
     rack = rack_timing(config, layout)
     responses = {response.task: response for response in rack.responses}
     return PartitionFigures(
-        partition.name, tuple(_level(name, layout, responses, runs) for name in config.board)
+        partition.name,
+        tuple(_level(name, layout, responses, runs) for name in config.board),
+        core_loads(runs[-1], cycles_of(runs[-1]), rack),
     )
 
 

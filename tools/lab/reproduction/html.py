@@ -40,7 +40,7 @@ MEANINGS = {
     Ruling.HOLDS: "Prediction and measurement agree with the paper.",
     Ruling.BOUNDED: "It holds, with limits that the text names, of this machine or of the claim.",
     Ruling.CONTRADICTS: "What the paper says in one place excludes what it says in another.",
-    Ruling.UNTESTABLE: "This machine lacks what a test needs, or was too busy; the text says what.",
+    Ruling.UNTESTABLE: "Machine, program or run lack what a test needs; the text says what.",
     Ruling.FAILS: "Prediction or measurement contradicts the paper.",
     Ruling.UNMADE: "Its experiments have not been made, or could not be finished.",
 }
@@ -131,7 +131,8 @@ def opening(page: Page) -> Iterator[str]:
     yield (
         "This page goes through the paper section by section. Each claim, equation and figure is"
         " given in the paper's words, followed by our prediction from the timing model, our"
-        " measurement on real processes, and a ruling. No number is written by hand: predictions"
+        " measurement on real processes, and a ruling: the result of the comparisons listed with"
+        " it. No number is written by hand: predictions"
         " are computed from the configs of this project's racks, measurements come from the runs"
         " listed at the end. Times are in ms unless a unit is given."
     )

@@ -19,13 +19,13 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
     WayResponse,
 )
 from rack.tools.lab.reproduction.sections import timing
-from rack.tools.lab.reproduction.sections.equations import PaperEquation, judged
+from rack.tools.lab.reproduction.sections.equations import PaperEquation
 from rack.tools.lab.reproduction.sections.page import Columns, Findings, Listing, Ruling
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
 WAY = WayResponse(4.0, Percentiles(1.0, 2.0, 3.0), ())
 RUN = NasremRun(
-    *(800, 0, 0, {}, (), {}, {}, {}),
+    *("task done", 800, {}, (), {}, {}),
     SystemResponse(("task", "servo"), 4.0, 4.0, WAY, WAY),
     *((), {}, {}),
 )
@@ -68,5 +68,5 @@ def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(
     holds: bool, mostly: bool, ruling: Ruling
 ) -> None:
     run = NASREM.document(replace(RUN, verdicts=(verdict(holds, mostly),)))
-    found = judged(timing.FITS, Findings({"nasrem": run}, NOWHERE))
-    assert found.ruling is ruling
+    (fits, *_) = timing.RESPONSE.statements
+    assert fits.tested(Findings({"nasrem": run}, NOWHERE)).ruling is ruling

@@ -59,7 +59,7 @@ def document(late: int, jobs: int = 100) -> Document:
     """Return what a run of a figure leaves, with so many late plans."""
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
     patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
-    run = FigureRun(counts, patterns, {}, {"measured": Path("pictures/x.svg")})
+    run = FigureRun(counts, patterns, {}, 0, 0, {"measured": Path("pictures/x.svg")})
     return gantt.FIG2.experiment.document(run)
 
 

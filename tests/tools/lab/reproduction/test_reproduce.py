@@ -45,6 +45,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.alone
 @pytest.mark.slow
 def test_a_killed_command_leaves_no_half_result_and_goes_on(killed: Path) -> None:
     assert not list((killed / KEPT).iterdir())

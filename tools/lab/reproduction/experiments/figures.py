@@ -8,9 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.trace_times import plans
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
@@ -35,21 +38,26 @@ MS = 1e-6
 
 @dataclass(frozen=True)
 class FigureRack:
-    """A figure of the paper: its config, drawn over so many cycles, with another X, ms, if
-    given."""
+    """A figure of the paper: its config, drawn over so many cycles, with another X, ms, or another
+    protocol for the plan, if given."""
 
     config: str
     cycles: int
     process_ms: float | None = None
+    protocol: str = ""
 
     @property
     def label(self) -> str:
         """Name of its experiment and of its pictures."""
+        if self.protocol:
+            return f"{self.config}-{self.protocol}"
         return self.config if self.process_ms is None else f"{self.config}-x{self.process_ms:g}"
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The settings with which its executor takes this X."""
+        """The settings with which its executor takes this X, or its plan this way."""
+        if self.protocol:
+            return (f'protocol.mailbox={{ "{LEVEL}.plan" = "{self.protocol}" }}',)
         return () if self.process_ms is None else settings_of(self.config, self.process_ms)
 
     def loaded(self) -> RackConfig:
@@ -117,11 +125,17 @@ class PatternCount(NamedTuple):
 @dataclass(frozen=True)
 class FigureRun:
     """A run of a figure: jobs of its tasks, the most frequent patterns of each lane, for plans and
-    for cycles, and the hypervisor's part of each core, percent."""
+    for cycles, and the hypervisor's part of each core, percent.
+
+    Releases of the executor `met` so many updates of the plan; it began within so many,
+    `preempted`.
+    """
 
     tasks: dict[str, Count]
     patterns: tuple[PatternCount, ...]
     steal: dict[str, float]
+    met: int
+    preempted: int
     pictures: dict[str, Path]
 
     def late(self, task: str) -> float:
@@ -137,6 +151,8 @@ def _run(figure: FigureRack, workshop: Workshop) -> FigureRun:
     need_real_time(cores=2 if is_loose else 1)
     run = _least_disturbed(figure, workshop)
     start = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
+    executor = run.recording.trace(LEVEL)
+    updates = plans(run.recording.trace(PLANNER))
     panel = run.panel(start, start + figure.window_ns, lambda part: None)
     drawn = save([panel], f"{figure.label}: a run", workshop.picture(f"{figure.label}-run"))
     return FigureRun(
@@ -148,8 +164,16 @@ def _run(figure: FigureRack, workshop: Workshop) -> FigureRun:
             for most in counts.most_common(COMMON)
         ),
         steal=steal(run.recording)["percent"],
+        met=_within(updates, executor["release_ns"]),
+        preempted=_within(updates, executor["start_ns"]),
         pictures={"measured": workshop.shown(drawn)},
     )
+
+
+def _within(updates: np.ndarray, times_ns: np.ndarray) -> int:
+    """Return how many updates of a plan have one of these times in them."""
+    begun, ended = (np.searchsorted(times_ns, updates[at]) for at in ("process_ns", "end_ns"))
+    return int(np.count_nonzero(ended > begun))
 
 
 def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:

@@ -10,10 +10,14 @@ from pydantic import TypeAdapter
 
 from rack.boards.config import load
 from rack.tools.faults.judge import Judgement, faults
-from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import (
+    Experiment,
+    Workshop,
+    need_real_time,
+)
 
 NAME = "nasrem"
-LASTS_S = 13.0
+LASTS_S = 34.0
 
 
 @dataclass(frozen=True)
@@ -30,19 +34,20 @@ class LossesRun:
 
 
 def losses_of(script: str, about: str) -> Experiment[LossesRun]:
-    """Return a run of the rack's whole task in lockstep with a script of faults."""
+    """Return a run of the rack's whole task in real time with a script of faults."""
     return Experiment(
         script,
         about,
         LASTS_S,
         LossesRun,
-        lambda: {"config": load(NAME, ["clock.mode=lockstep"], script).text()},
+        lambda: {"config": load(NAME, (), script).text()},
         partial(_run, script),
     )
 
 
 def _run(script: str, workshop: Workshop) -> LossesRun:
-    config = workshop.config(NAME, ["clock.mode=lockstep"], script)
+    need_real_time()
+    config = workshop.config(NAME, (), script)
     result, recording = workshop.run(script, config)
     report = faults(recording.events, recording.layout)
     return LossesRun(

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from rack.boards.config import loads
-from rack.boards.config.schema import Mode
-from rack.levels.timing.equations import response_ticks
+import numpy as np
+
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import partition, switch
-from rack.tools.lab.benches.boards import responses_of
-from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import Runs, observe
+from rack.tools.lab.benches.observed import Runs
 from rack.tools.lab.benches.response import ResponseBench, ResponseRuns
 from rack.tools.lab.benches.systems.bench import measure, systems
+from rack.tools.lab.benches.systems.motion import poses_config
 from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
@@ -24,78 +22,79 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     inputs,
     need_real_time,
 )
+from rack.tools.recording.history import counted, misses
 
-LEVELS = 5
-"""Levels of the pipeline: "it would take 5 control cycles"."""
-RATE_HZ = 400
-PIPELINE_S = 2.0
 COMMANDS = 16
 TWINS = 1
 SEED = 1
-PARTITION_S = 4.0
+PARTITION_S = 12.0
+"""By half of it every level has planned in lockstep; on one processor it takes longer."""
 SYSTEM_S = 4.0
-SYSTEM_LASTS_S = 35.0
+SYSTEM_LASTS_S = 15.0
+POSES_LAST_S = 19.0
+"""About how long a rack takes, and how much longer one with a PUMA."""
+TASKS_S = {
+    "rccl": 17.5,
+    "hic": 14.2,
+    "condor": 14.3,
+    "ibm": 28.1,
+    "chimera": 31.9,
+    "penn": 26.2,
+    "brown": 8.2,
+}
+"""The systems, with the simulated time of their tasks; experiments of their own run the tasks of
+NASREM and of the state tables."""
 LAUNCH_S = 3.0
 NAME = "nasrem"
 
 
-def _switch(workshop: Workshop) -> switch.SwitchCost:
+@dataclass(frozen=True)
+class SwitchRun:
+    """The context switch of this machine, and the one that the config assumes, us."""
+
+    cost: switch.SwitchCost
+    assumed_us: float
+
+
+def _switch(workshop: Workshop) -> SwitchRun:
     need_real_time(cores=2)
-    return switch.measure()
+    assumed_us = 1e3 * workshop.config(NAME).timing.context_switch_ms
+    return SwitchRun(switch.measure(), assumed_us)
 
 
 SWITCH = Experiment(
     "switch",
     "the context switch",
     switch.WAKES * switch.PERIOD_S + LAUNCH_S,
-    switch.SwitchCost,
-    lambda: {"wakes": switch.WAKES},
+    SwitchRun,
+    inputs(NAME, wakes=switch.WAKES),
     _switch,
 )
 
 
 @dataclass(frozen=True)
-class PipelineRun:
-    """How many messages took how many cycles down the levels, in lockstep and in real time."""
+class ResponseRun:
+    """Commands of an operator in lockstep, with twins that show which torque rests on one, and in
+    real time."""
 
-    predicted: int
-    lockstep: dict[int, int]
-    realtime: dict[int, int]
-
-
-def _pipeline(workshop: Workshop) -> PipelineRun:
-    predicted = response_ticks([1] * LEVELS)
-    return PipelineRun(predicted, _cycles(workshop, "lockstep"), _cycles(workshop, "realtime"))
+    lockstep: ResponseBench
+    realtime: ResponseBench
 
 
-def _cycles(workshop: Workshop, mode: Mode) -> dict[int, int]:
-    """Return how many messages took how many cycles."""
-    chain = Chain(LEVELS, RATE_HZ, mode)
-    last = f"{chain.names[-1]}.status"
-    config = loads(chain.text()).model_copy(update={"name": workshop.rack})
-    run = observe(config, PIPELINE_S, workshop.share, [last])
-    return responses_of([run.messages[last]])
-
-
-PIPELINE = Experiment(
-    "pipeline",
-    "a message down five levels",
-    2 * (PIPELINE_S + LAUNCH_S),
-    PipelineRun,
-    lambda: {"levels": LEVELS, "rate": RATE_HZ, "seconds": PIPELINE_S},
-    _pipeline,
-)
-
-
-def _response(workshop: Workshop) -> ResponseBench:
-    return ResponseRuns(NAME, "lockstep", SEED, Progress()).measure(COMMANDS, TWINS)
+def _response(workshop: Workshop) -> ResponseRun:
+    need_real_time()
+    lockstep, realtime = (
+        ResponseRuns(workshop.source(NAME), mode, SEED, Progress()).measure(COMMANDS, twins)
+        for mode, twins in (("lockstep", TWINS), ("realtime", 0))
+    )
+    return ResponseRun(lockstep, realtime)
 
 
 RESPONSE = Experiment(
     "response",
     "holds and resumes by an operator",
-    30.0,
-    ResponseBench,
+    80.0,
+    ResponseRun,
     inputs(NAME, commands=COMMANDS, twins=TWINS, seed=SEED),
     _response,
 )
@@ -103,7 +102,7 @@ RESPONSE = Experiment(
 
 def _partition(workshop: Workshop) -> partition.Partitions:
     need_real_time(cores=2)
-    return partition.measure(NAME, PARTITION_S, 1, Progress())
+    return partition.measure(workshop.source(NAME), PARTITION_S, 1, Progress())
 
 
 PARTITION = Experiment(
@@ -121,7 +120,7 @@ def system_experiment(name: str) -> Experiment[Systems]:
     return Experiment(
         f"system-{name}",
         f"{name} next to the other systems",
-        SYSTEM_LASTS_S,
+        SYSTEM_LASTS_S + POSES_LAST_S * (poses_config(name) is not None),
         Systems,
         inputs(name, seconds=SYSTEM_S),
         partial(_system, name),
@@ -129,7 +128,7 @@ def system_experiment(name: str) -> Experiment[Systems]:
 
 
 def _system(name: str, workshop: Workshop) -> Systems:
-    return measure([name], Runs(SYSTEM_S, 1, workshop.share), Progress())
+    return measure([workshop.source(name)], Runs(SYSTEM_S, 1, workshop.share), Progress())
 
 
 def compared(each: Sequence[Systems]) -> Systems:
@@ -141,3 +140,40 @@ def compared(each: Sequence[Systems]) -> Systems:
 
 SYSTEMS = tuple(system_experiment(name) for name in systems())
 """Every rack that models a system, NASREM first."""
+
+
+@dataclass(frozen=True)
+class TaskRun:
+    """A system's whole task in real time: how it ended, the part of all cycles missed or skipped,
+    and the messages in each mailbox."""
+
+    ended: str
+    lasted_s: float
+    missed: float
+    messages: dict[str, int]
+
+
+def _task(name: str, workshop: Workshop) -> TaskRun:
+    need_real_time()
+    result, recording = workshop.run(f"task-{name}", workshop.config(name))
+    cycles = sum(map(len, recording.cycles.values()))
+    boxes = {box: recording.signal(box, "serial") for box in recording.mailboxes}
+    return TaskRun(
+        ended=result.outcome.cause,
+        lasted_s=result.outcome.ticks * recording.layout.clock_ns * 1e-9,
+        missed=sum(counted(misses(recording))) / cycles,
+        messages={box: len(np.unique(serials)) for box, serials in boxes.items()},
+    )
+
+
+TASKS = {
+    name: Experiment(
+        f"task-{name}",
+        f"the whole task of {name} in real time",
+        lasts_s + LAUNCH_S,
+        TaskRun,
+        inputs(name),
+        partial(_task, name),
+    )
+    for name, lasts_s in TASKS_S.items()
+}

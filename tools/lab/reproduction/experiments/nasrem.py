@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.trace_times import distribution
+from rack.levels.timing.trace_times import distribution, gaps_ns
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.pictures import paths_of
 from rack.tools.lab.reproduction.experiments.experiment import (
@@ -22,7 +22,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     need_real_time,
 )
 from rack.tools.recording.cycles import Cycles
-from rack.tools.recording.history import counted, misses, steal
+from rack.tools.recording.history import steal
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import task_document
@@ -100,10 +100,10 @@ class BusAccesses:
 
 @dataclass(frozen=True)
 class WayResponse:
-    """The response of a hierarchy one way, ms."""
+    """The response of a hierarchy one way, ms; None: nothing went all the way."""
 
     bound_ms: float
-    measured_ms: Percentiles
+    measured_ms: Percentiles | None
     beyond: tuple[Document, ...]
 
 
@@ -120,17 +120,15 @@ class SystemResponse:
 
 @dataclass(frozen=True)
 class NasremRun:
-    """What a run in real time left: `steal` is the hypervisor's part of a core, percent, `loads`
-    the tasks', of 1; `breaches` are the cycles that broke an equation by their own numbers."""
+    """What a run in real time left: `steal` is the hypervisor's part of a core, percent;
+    `breaches` are the cycles that broke an equation by their own numbers."""
 
+    ended: str
     ticks: int
-    missed: int
-    skipped: int
     steal: dict[str, float]
     verdicts: tuple[MeasuredVerdict, ...]
     breaches: dict[str, int]
     executors: dict[str, ExecutorCycles]
-    loads: dict[int, float]
     response: SystemResponse
     mailboxes: tuple[MailboxTraffic, ...]
     bus: dict[str, BusAccesses]
@@ -147,7 +145,6 @@ def _run(workshop: Workshop) -> NasremRun:
     analysis = replace(analysis, config=analysis.config.model_copy(update={"name": NAME}))
     stem = workshop.picture("residuals")
     plot(analysis, stem)
-    missed, skipped = counted(misses(recording))
     breaches = Counter(
         equation
         for breach in analysis.judged_breaches
@@ -155,9 +152,8 @@ def _run(workshop: Workshop) -> NasremRun:
     )
     ticks = result.outcome.ticks
     return NasremRun(
+        ended=result.outcome.cause,
         ticks=ticks,
-        missed=missed,
-        skipped=skipped,
         steal=steal(recording)["percent"],
         verdicts=tuple(_verdicts(analysis)),
         breaches=dict(breaches),
@@ -166,7 +162,6 @@ def _run(workshop: Workshop) -> NasremRun:
             for name, cycles in analysis.cycles.items()
             if cycles.task.role == "executor"
         },
-        loads=dict(analysis.loads),
         response=TypeAdapter(SystemResponse).validate_python(analysis.response),
         mailboxes=tuple(_mailbox(recording, name, ticks) for name in recording.mailboxes),
         bus=TypeAdapter(dict[str, BusAccesses]).validate_python(result.tasks),
@@ -202,7 +197,9 @@ def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
     phases = {
         name: distribution(times_ns[cycles.is_judged] * US) for name, times_ns in stamped_ns.items()
     }
-    document = {**task_document(cycles, rack), "phases": phases}
+    # Of all cycles: one that a stall prolonged leaves a gap too.
+    gap_ms = float(gaps_ns(cycles.rows).max()) * MS
+    document = {**task_document(cycles, rack), "phases": phases, "largest_gap_ms": gap_ms}
     return TypeAdapter(ExecutorCycles).validate_python(document)
 
 

@@ -2,45 +2,49 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Mapping
+from functools import cache, partial
 
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Distribution
 from rack.tools.lab.benches.systems.bench import systems
 from rack.tools.lab.benches.systems.figures import SystemFigures, SystemPrediction, prediction
+from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
 from rack.tools.lab.reproduction.experiments.measured import (
     SYSTEMS,
+    TASKS,
+    TaskRun,
     compared,
-    system_experiment,
 )
-from rack.tools.lab.reproduction.sections.gantt import DISTURBED
 from rack.tools.lab.reproduction.sections.page import (
-    Assessment,
+    DONE,
+    STRAY,
     Chapter,
+    ClaimVerdict,
     Columns,
     Findings,
     Listing,
     Plate,
+    Requirement,
     Row,
-    Ruling,
     Side,
     Statement,
     code,
+    ruled,
     text,
 )
 
 RCCL = "rccl"
-RCCL_RUN = system_experiment(RCCL)
 
 
 @cache
-def _promise(name: str) -> SystemPrediction:
-    return prediction(load(name))
+def _promises() -> dict[str, SystemPrediction]:
+    return {name: prediction(load(name)) for name in systems()}
 
 
 def _promised(workshop: Workshop) -> Side:
-    rows = [_promise_row(name, _promise(name)) for name in systems()]
+    rows = [_promise_row(name, said) for name, said in _promises().items()]
     head = (
         "rack",
         "levels",
@@ -77,8 +81,7 @@ def _promise_row(name: str, said: SystemPrediction) -> Row:
     )
 
 
-def _compared(findings: Findings) -> Assessment:
-    """Judge whether all systems run, with their responses within the bounds."""
+def _compared_measured(findings: Findings) -> Side:
     found = compared([findings.of(one) for one in SYSTEMS])
     head = (
         "rack",
@@ -94,8 +97,16 @@ def _compared(findings: Findings) -> Assessment:
         " takes one."
     )
     drawn = findings.workshop.shown(found.plot(findings.workshop.folder / PICTURES))
-    side: Side = [
+    failures = [f"{code(one.rack)}: {text(one.failure)}." for one in found.systems if one.failure]
+    ended = [
+        (code(name), text(run.ended), f"{run.lasted_s:.1f}", f"{100 * run.missed:.2f}")
+        for name, run in ((name, findings.of(one)) for name, one in TASKS.items())
+    ]
+    tasks = ("rack", "end of its whole task", "after, s", "missed, %")
+    return [
         Columns(head, rows, caption),
+        Columns(tasks, ended, "In real time."),
+        *failures,
         Plate(
             drawn,
             "Responses with their bounds, ages of messages, and more, system by system.",
@@ -105,34 +116,25 @@ def _compared(findings: Findings) -> Assessment:
             f"All figures, as {code('rack bench systems')} prints them.",
         ),
     ]
-    failed = [one for one in found.systems if not one.worked]
-    if failed and all(one.realtime.missed > DISTURBED for one in failed):
-        missed = ", ".join(
-            f"{one.rack} ({100 * one.realtime.missed:.1f} % of its fastest cycles)"
-            for one in failed
-        )
-        why = (
-            f"Missed too many cycles to do its task: {missed}. Should other programs have had the"
-            " processors: "
-        )
-        return Assessment(
-            side, Ruling.UNTESTABLE, f"{why}{code('rack reproduce --only 4.1 --again')}."
-        )
-    if failed:
-        names = "; ".join(f"{one.rack}: {one.failure}" for one in failed)
-        return Assessment(side, Ruling.FAILS, f"These did not run as they should: {text(names)}.")
-    late = [one.rack for one in found.systems if _is_beyond(one)]
-    count = len(found.systems)
-    if late:
-        why = (
-            f"All {count} systems run on one set of mechanisms. Beyond its bound after missed"
-            f" cycles: {', '.join(late)}."
-        )
-        return Assessment(side, Ruling.BOUNDED, why)
-    return Assessment(
-        side,
-        Ruling.HOLDS,
-        f"All {count} systems run on one set of mechanisms, within their bounds.",
+
+
+def judge_systems(*each: Systems | TaskRun) -> ClaimVerdict:
+    """Compare the responses of all systems with their bounds; a missed cycle may prolong them.
+
+    Their whole tasks are done in real time.
+    """
+    found = [one for run in each if isinstance(run, Systems) for one in run.systems]
+    undone = sum(isinstance(run, TaskRun) and run.ended != DONE for run in each)
+    failed = sum(not one.worked for one in found)
+    late = [one.realtime.missed for one in found if _is_beyond(one)]
+    worked = (
+        Requirement("whole tasks not done", undone, "=", 0),
+        Requirement("systems that failed in a run", failed, "=", 0),
+    )
+    return ruled(
+        (*worked, Requirement("systems with a response beyond its bound", len(late), "=", 0)),
+        f"All {len(found)} systems do their tasks on one set of mechanisms, within their bounds.",
+        here=(*worked, Requirement("of these without a missed cycle", late.count(0.0), "=", 0)),
     )
 
 
@@ -169,80 +171,70 @@ def _is_beyond(one: SystemFigures) -> bool:
     return ran.hold is not None and ran.hold.beyond
 
 
-def _layered(workshop: Workshop) -> Side:
-    rows = []
-    for name in systems():
-        said = _promise(name)
-        ratio = max(said.rates_hz) / min(said.rates_hz) if said.rates_hz else 1.0
-        rows.append((code(name), len(said.levels), said.hosts, f"{ratio:.4g}"))
-    return [
-        Columns(("rack", "levels", "boards without real time", "fastest rate to slowest"), rows)
-    ]
-
-
-def _layered_tested(findings: Findings) -> Assessment:
-    """Judge from the configs alone: levels, and whether the slow ones are above the fast ones."""
-    promised = {name: _promise(name) for name in systems()}
-    flat = [name for name, said in promised.items() if len(said.levels) < 2]
-    even = [name for name, said in promised.items() if sorted(said.rates_hz) != list(said.rates_hz)]
-    if flat or even:
-        why = (
-            f"From the configs alone. Without a second level: {', '.join(flat) or 'none'}; with a"
-            f" faster level above a slower one: {', '.join(even) or 'none'}."
-        )
-        return Assessment([], Ruling.BOUNDED, why)
-    why = (
-        f"From the configs alone: all {len(promised)} have at least two levels, and no level is"
-        " faster than the one below."
-    )
-    return Assessment([], Ruling.HOLDS, why)
-
-
-def _rccl(workshop: Workshop) -> Side:
-    layout = wire(load(RCCL))
-    rows = [
+def judge_layers(promised: Mapping[str, SystemPrediction]) -> ClaimVerdict:
+    """Count levels, and compare their rates with those of the levels below."""
+    least = min(len(said.levels) for said in promised.values())
+    inverted = sum(sorted(said.rates_hz) != list(said.rates_hz) for said in promised.values())
+    return ruled(
         (
-            task.name,
-            f"{1e9 / (task.every * layout.clock_ns):g}",
-            task.core,
-            task.priority or None,
-        )
-        for task in layout.tasks
-    ]
-    queues = [
-        f"{code(box.name)}, {box.capacity} messages, read by {', '.join(box.readers)}"
-        for box in layout.mailboxes
-        if box.capacity
-    ]
-    return [
-        Columns(("task", "rate, Hz", "processor", "priority"), rows),
-        f"Queues: {'; '.join(queues)}.",
-    ]
-
-
-def _rccl_tested(findings: Findings) -> Assessment:
-    found = findings.of(RCCL_RUN).systems[0]
-    rows = [(code(name), f"{share:.3f}") for name, share in found.realtime.board_loads.items()]
-    tasks = wire(load(RCCL)).tasks
-    periods = [task.every for task in tasks]
-    cores = {task.core for task in tasks}
-    side: Side = [Columns(("board", "processor time, share of one"), rows)]
-    if not found.worked:
-        return Assessment(side, Ruling.FAILS, text(found.failure))
-    fastest = periods.count(min(periods))
-    why = (
-        f"Joint control has a board a joint, but {fastest} boards of that rate share {len(cores)}"
-        " processors: each joint its own processor cannot be had here. At 1 kHz"
-        f" {100 * found.realtime.missed:.2f} % of their cycles were missed."
+            Requirement("levels, in the system with the fewest", least, ">=", 2),
+            Requirement("systems with a faster level above a slower one", inverted, "=", 0),
+        ),
+        f"From the configs alone, for all {len(promised)} systems.",
     )
-    return Assessment(side, Ruling.BOUNDED, why)
 
 
+SERVICES = "host-services"
+LINKS: dict[str, dict[str, int]] = {
+    RCCL: {
+        "planning.plan": 1,
+        "trajectory.command": 50,
+        **{f"joint{number}.command": 1000 for number in range(1, 7)},
+    },
+    "chimera": {"command.requests": 1, "bridge.requests": 1},
+    "condor": {"workstation.plan": 1, "adapter.plan": 1},
+    "penn": {"coordinator.requests": 1, "bridge.requests": 1},
+    "brown": {"planning.plan": 1, "trajectory.command": 100, "supervisor.command": 500},
+    "ibm": {"bridge.requests": 1, "bridge.sensors": 50, "bridge.motion": 200},
+    SERVICES: {"workstation.plan": 1, "adapter.hand": 50, "adapter.world": 50},
+    "hic": {"tendon.command": 500, "joint.command": 500, "fingertip.command": 125},
+}
+"""What joins the two sides of a system, or its layers: messages by mailbox, at least so many; for
+more than one, a second."""
+
+
+def judge_own(name: str, found: TaskRun) -> ClaimVerdict:
+    """Compare what passed between the sides of a system with what its rates demand; of RCCL also
+    the processors with its joints."""
+    links = []
+    for box, rate_hz in LINKS[name].items():
+        messages = found.messages.get(box, 0)
+        if rate_hz > 1:
+            per_s = messages / found.lasted_s
+            links.append(Requirement(f"{box}, a second", per_s, ">=", (1.0 - STRAY) * rate_hz))
+        else:
+            links.append(Requirement(f"{box}, messages", messages, ">=", 1))
+    worked = (
+        Requirement("whole tasks done", int(found.ended == DONE), "=", 1),
+        *links,
+        Requirement("part of all cycles missed", found.missed, "<=", STRAY),
+    )
+    why = "Both sides worked together until the task was done."
+    if name != RCCL:
+        return ruled(worked, why)
+    joints = [task.core for task in wire(load(RCCL)).tasks if task.board.startswith("joint")]
+    cores = Requirement("processors, of one a joint", len(set(joints)), ">=", len(joints))
+    return ruled((*worked, cores), why, here=worked)
+
+
+HOSTS = Statement(SERVICES, (TASKS["condor"],), partial(judge_own, SERVICES))
 CHAPTER = Chapter(
     "4.1",
     (
-        Statement("systems", SYSTEMS, _promised, _compared),
-        Statement("two-levels", (), _layered, _layered_tested),
-        Statement("rccl", (RCCL_RUN,), _rccl, _rccl_tested),
+        Statement(
+            "systems", (*SYSTEMS, *TASKS.values()), judge_systems, _promised, _compared_measured
+        ),
+        Statement("two-levels", (), lambda: judge_layers(_promises()), _promised),
+        *(Statement(name, (TASKS[name],), partial(judge_own, name)) for name in TASKS),
     ),
 )

@@ -14,22 +14,29 @@ from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.tables import ms
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, MeasuredVerdict, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    MS,
+    NAME,
+    NASREM,
+    MeasuredVerdict,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.sections.page import (
-    Assessment,
+    SIGNS,
+    ClaimVerdict,
     Columns,
     Findings,
     Listing,
+    Requirement,
     Row,
-    Ruling,
     Side,
     Statement,
     code,
+    ruled,
     text,
     wording,
 )
 
-SIGNS = {"<": "&lt;", "<=": "≤", "=": "="}
 HEAD = ("of", "left side", "", "right side", "margin", "")
 
 
@@ -57,11 +64,19 @@ class PaperEquation:
         return f"equation-{self.number}"
 
     def statement(
-        self, tested: Callable[[PaperEquation, Findings], Assessment] | None = None
+        self,
+        judged: Callable[[PaperEquation, NasremRun], ClaimVerdict] | None = None,
+        further: Callable[[NasremRun], Side] = lambda found: [],
     ) -> Statement:
-        """Return the equation as a statement, judged by `tested` or by all of its subjects in the
-        run."""
-        return Statement(self.name, (NASREM,), self.predicted, partial(tested or judged, self))
+        """Return the equation as a statement, judged by `judged` or by all of its subjects in the
+        run, of which the page shows `further` figures."""
+        return Statement(
+            self.name,
+            (NASREM,),
+            partial(judged or judge_equation, self),
+            self.predicted,
+            partial(_measured, self, further),
+        )
 
     def predicted(self, workshop: Workshop) -> Side:
         """Return both sides for the NASREM rack by its budgets, and the rack in which the equation
@@ -116,29 +131,42 @@ def table_of(verdicts: list[MeasuredVerdict]) -> Columns:
     return Columns((*HEAD[:-1], "worst cycle", "in 99 of 100"), rows)
 
 
-def judged(equation: PaperEquation, findings: Findings) -> Assessment:
-    """Judge an equation by the worst cycle of every subject, and by 99 of 100 cycles."""
+def _measured(
+    equation: PaperEquation, further: Callable[[NasremRun], Side], findings: Findings
+) -> Side:
     found = findings.of(NASREM)
-    verdicts = measured_of(equation.number, found)
     lasted = found.ticks * load(NAME).clock_ns * 1e-9
     words = (
         f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without"
-        " those of the start-up."
+        f" those of the start-up. {found.breaches.get(equation.number, 0)} cycles broke it by their"
+        f" own numbers. {stolen(found)}"
     )
-    side: Side = [words, table_of(verdicts)]
-    broken = text(", ".join(v.measured.subject for v in verdicts if not v.measured.holds))
-    if not broken:
-        return Assessment(
-            side,
-            Ruling.HOLDS,
-            "It holds as predicted for every level, in the worst cycle of the run too.",
+    return [words, table_of(measured_of(equation.number, found)), *further(found)]
+
+
+def demands_of(equation: str, found: NasremRun) -> list[Requirement]:
+    """Return what an equation demands of the worst cycle of every subject, ms where it is time."""
+    return [
+        Requirement(text(f"{one.subject}: {one.meaning}"), one.left, one.sign, one.right)
+        if one.unit != "ns"
+        else Requirement(
+            text(f"{one.subject}: {one.meaning}"), one.left * MS, one.sign, one.right * MS, "ms"
         )
-    if all(verdict.mostly for verdict in verdicts):
-        why = f"It holds as predicted in 99 of 100 cycles; in the worst it fails for {broken}. "
-        if counts := found.breaches.get(equation.number):
-            why += f"{counts} cycles broke it by their own numbers. "
-        return Assessment(side, Ruling.BOUNDED, why + stolen(found))
-    return Assessment(side, Ruling.FAILS, f"It fails for {broken}, in more than one of 100 cycles.")
+        for one in (verdict.measured for verdict in measured_of(equation, found))
+    ]
+
+
+def judge_equation(equation: PaperEquation, found: NasremRun) -> ClaimVerdict:
+    """Compare both sides in the worst cycle of every subject; within bounds, in 99 of 100
+    cycles."""
+    verdicts = measured_of(equation.number, found)
+    often = sum(not verdict.mostly for verdict in verdicts)
+    return ruled(
+        demands_of(equation.number, found),
+        "It holds as predicted for every level, in the worst cycle of the run too.",
+        needs=(Requirement("subjects measured", len(verdicts), ">=", 1),),
+        here=(Requirement("subjects that fail in more than one of 100 cycles", often, "=", 0),),
+    )
 
 
 def stolen(found: NasremRun) -> str:

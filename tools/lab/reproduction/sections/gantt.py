@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
@@ -18,16 +18,20 @@ from rack.tools.lab.reproduction.experiments.figures import (
     sweep,
 )
 from rack.tools.lab.reproduction.sections.page import (
-    Assessment,
+    STRAY,
     Chapter,
+    ClaimVerdict,
     Columns,
     Findings,
     Listing,
     Plate,
+    Requirement,
     Ruling,
     Side,
     Statement,
     code,
+    ruled,
+    ruled_strays,
 )
 from rack.tools.timing.charts.letters import column_for, lines
 
@@ -40,9 +44,6 @@ LEAST_P = 3.0
 """"The planner runs at least 3 ms each cycle"."""
 WORST_CYCLES = 3
 """"At worst an updated plan should be available every third cycle"."""
-AGAIN = code("rack reproduce --only 3.4 --again")
-DISTURBED = 0.02
-"""Part of an executor's cycles late from which on a run shows the machine, not the figure."""
 MOSTLY = 0.5
 """Part of the cycles, or plans, late from which on a run is said to fail: the figures fail in all,
 or in none."""
@@ -52,6 +53,7 @@ FIG2 = FigureRack("fig2", 2)
 FIG3 = FigureRack("fig3", 3)
 FIG4 = FigureRack("fig4", 2)
 OVERLOAD = FigureRack("fig4-overload", 3)
+BUFFERED = FigureRack("fig4", 2, protocol="double-buffer")
 SHORT_2 = FigureRack("fig2", 2, LEAST_X)
 LONG_2 = FigureRack("fig2", 3, MOST_X)
 SHORT_3 = FigureRack("fig3", 3, LEAST_X)
@@ -100,31 +102,51 @@ def ran(figure: FigureRack, found: FigureRun) -> Side:
     ]
 
 
-def fails(found: FigureRun) -> bool:
-    """Return whether a run fails: whether cycles or plans are mostly late."""
-    return max(found.late(LEVEL), found.late(PLANNER)) > MOSTLY
+def late_part(found: FigureRun) -> float:
+    """Return the larger part of cycles, or of plans, late."""
+    return max(found.late(LEVEL), found.late(PLANNER))
 
 
-def _judged(figure: FigureRack, works: bool, findings: Findings) -> Assessment:
-    """Judge a figure of which the paper says that it works, or that it fails."""
-    found = findings.of(figure.experiment)
-    cycles = found.tasks[LEVEL]
-    plans = found.tasks[PLANNER]
-    said = f"{cycles.late} of {cycles.jobs} cycles and {plans.late} of {plans.jobs} plans late"
-    verb = "works" if works else "fails"
-    measured = ran(figure, found)
-    if fails(found) == works and DISTURBED < found.late(LEVEL) < MOSTLY:
-        why = f"Other programs had the processors too often: {said}. On a quiet machine: {AGAIN}."
-        return Assessment(measured, Ruling.UNTESTABLE, why)
-    if fails(found) == works:
-        return Assessment(
-            measured, Ruling.FAILS, f"The paper says that it {verb}; the run had {said}."
-        )
-    why = f"It {verb}, as the paper says: {said}."
-    if any(0 < count.late <= MOSTLY * count.jobs for count in (cycles, plans)):
-        why += " The stray ones are this machine's: see the time taken away."
-        return Assessment(measured, Ruling.BOUNDED, why)
-    return Assessment(measured, Ruling.HOLDS, why)
+def _undisturbed(found: FigureRun) -> list[Requirement]:
+    """Return what a run needs to show the figure: an executor is late in almost all cycles, or in
+    none."""
+    late = found.late(LEVEL)
+    return [Requirement("part of the executor's cycles late", late, "<=", STRAY)] * (late <= MOSTLY)
+
+
+def judge_figure(works: bool, found: FigureRun) -> ClaimVerdict:
+    """Rule on a figure of which the paper says that it works, or that it fails."""
+    late = Requirement("part of cycles, or plans, late", late_part(found), ">", MOSTLY)
+    count = sum(count.late for count in found.tasks.values())
+    needs = _undisturbed(found)
+    if not works:
+        return ruled((late,), "It fails, as the paper says.", needs=needs)
+    return ruled(
+        (Requirement("cycles and plans late", count, "=", 0),),
+        "It works, as the paper says.",
+        here=(late._replace(sign="<="),),
+        needs=needs,
+    )
+
+
+def judge_both(tight: FigureRun, loose: FigureRun) -> ClaimVerdict:
+    """Compare the executors' late cycles with all, in runs in which planners made plans."""
+    runs = (tight, loose)
+    late = sum(run.tasks[LEVEL].late for run in runs)
+    due = sum(run.tasks[LEVEL].jobs for run in runs)
+    plans = min(run.tasks[PLANNER].jobs for run in runs)
+    why = "No cycle of an executor was late, while a planner computed all the time."
+    planned = Requirement("plans made, in the run with fewer", plans, ">=", 1)
+    return ruled_strays("cycles of executors late", late, due, why, (planned,))
+
+
+def ran_all(*figures: FigureRack) -> Callable[[Findings], Side]:
+    """Return what shows the runs of figures, one after the other."""
+
+    def measured(findings: Findings) -> Side:
+        return [item for one in figures for item in ran(one, findings.of(one.experiment))]
+
+    return measured
 
 
 def _predicted(figure: FigureRack, workshop: Workshop) -> Side:
@@ -232,31 +254,22 @@ def _values(rows: list[Planning]) -> str:
     return ", ".join(f"{one.process_ms:g}" for one in rows)
 
 
-def _sweep_tested(findings: Findings) -> Assessment:
-    rows = sweep(FIG2.config, PAPER_X)
-    odd = contradicting(rows)
-    short, long = (findings.of(figure.experiment) for figure in (SHORT_2, LONG_2))
-    measured = [*ran(SHORT_2, short), *ran(LONG_2, long)]
-    said = ", ".join(
-        f"X = {x:g}: {100 * found.late(PLANNER):.0f} % of the plans late"
-        for x, found in ((LEAST_X, short), (MOST_X, long))
-    )
-    if not odd:
-        return Assessment(
-            measured,
-            Ruling.HOLDS,
-            f"Every X from {LEAST_X:g} to {MOST_X:g} ms works. Runs: {said}.",
-        )
-    agrees = fails(long) == _is_slow(rows[-1]) and fails(short) == _is_slow(rows[0])
-    if not agrees:
-        return Assessment(
-            measured, Ruling.FAILS, f"The computation is not confirmed by the runs: {said}."
-        )
+def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
+    """Compare two sentences of the paper with each other, by computation and by two runs."""
+    odd = contradicting(sweep(FIG2.config, PAPER_X))
     why = (
         '"X will range from 1 to 3 ms" and "the planner runs at least 3 ms each cycle" exclude'
-        f" each other for X = {_values(odd)}. Runs agree with the computation: {said}."
+        f" each other for X = {_values(odd)}. Runs agree with the computation."
     )
-    return Assessment(measured, Ruling.CONTRADICTS, why)
+    return ruled(
+        (
+            Requirement("values of X for which both cannot be", len(odd), ">=", 1),
+            Requirement(f"X = {LEAST_X:g}: part late", late_part(short), "<=", MOSTLY),
+            Requirement(f"X = {MOST_X:g}: part late", late_part(long), ">", MOSTLY),
+        ),
+        why,
+        holding=Ruling.CONTRADICTS,
+    )
 
 
 def _fig3_side(workshop: Workshop) -> Side:
@@ -269,19 +282,15 @@ def _fig3_side(workshop: Workshop) -> Side:
     return [*_predicted(FIG3, workshop), _planning_table(rows), text]
 
 
-def _fig3_tested(findings: Findings) -> Assessment:
-    own = _judged(FIG3, False, findings)
-    short = findings.of(SHORT_3.experiment)
-    works = [one for one in sweep(FIG3.config, PAPER_X) if not _is_slow(one)]
-    measured = [*own.measured, *ran(SHORT_3, short)]
-    if own.ruling is Ruling.FAILS or not works:
-        return replace(own, measured=measured)
-    in_time = 100 * (1 - short.late(PLANNER))
-    why = (
-        f"{own.why} With X = {LEAST_X:g}, which the paper permits too, {in_time:.0f} % of the plans"
-        " were in time: the figure fails only from a certain X on."
+def judge_fig3(found: FigureRun, short: FigureRun) -> ClaimVerdict:
+    """Compare plans with the usual X, and with the shortest that the paper permits."""
+    usual = Requirement("part of cycles, or plans, late", late_part(found), ">", MOSTLY)
+    return ruled(
+        (usual, Requirement(f"the same with X = {LEAST_X:g}", late_part(short), ">", MOSTLY)),
+        "It fails, as the paper says, with the shortest X too.",
+        here=(usual,),
+        needs=_undisturbed(found),
     )
-    return Assessment(measured, Ruling.BOUNDED, why)
 
 
 def _fig4_side(workshop: Workshop) -> Side:
@@ -299,22 +308,40 @@ def _fig4_side(workshop: Workshop) -> Side:
     return [*_predicted(FIG4, workshop), text, _planning_table(rows)]
 
 
+def _figure(
+    name: str,
+    figure: FigureRack,
+    works: bool,
+    predicted: Callable[[Workshop], Side] | None = None,
+) -> Statement:
+    return Statement(
+        name,
+        (figure.experiment,),
+        partial(judge_figure, works),
+        predicted or partial(_predicted, figure),
+        ran_all(figure),
+    )
+
+
 CHAPTER = Chapter(
     "3.4",
     (
+        _figure("figure-2", FIG2, works=True),
         Statement(
-            "figure-2", (FIG2.experiment,), partial(_predicted, FIG2), partial(_judged, FIG2, True)
+            "figure-2-x",
+            (SHORT_2.experiment, LONG_2.experiment),
+            judge_sweep,
+            _sweep_side,
+            ran_all(SHORT_2, LONG_2),
         ),
         Statement(
-            "figure-2-x", (SHORT_2.experiment, LONG_2.experiment), _sweep_side, _sweep_tested
+            "figure-3",
+            (FIG3.experiment, SHORT_3.experiment),
+            judge_fig3,
+            _fig3_side,
+            ran_all(FIG3, SHORT_3),
         ),
-        Statement("figure-3", (FIG3.experiment, SHORT_3.experiment), _fig3_side, _fig3_tested),
-        Statement("figure-4", (FIG4.experiment,), _fig4_side, partial(_judged, FIG4, True)),
-        Statement(
-            "figure-4-overload",
-            (OVERLOAD.experiment,),
-            partial(_predicted, OVERLOAD),
-            partial(_judged, OVERLOAD, False),
-        ),
+        _figure("figure-4", FIG4, works=True, predicted=_fig4_side),
+        _figure("figure-4-overload", OVERLOAD, works=False),
     ),
 )

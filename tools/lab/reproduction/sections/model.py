@@ -4,6 +4,7 @@ waits, pipeline."""
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
 from itertools import pairwise
 from textwrap import dedent
 
@@ -12,27 +13,38 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.tools.faults.judge import Judgement
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, budget_of
+from rack.tools.lab.reproduction.experiments.figures import (
+    LEVEL,
+    PLANNER,
+    budget_of,
+)
 from rack.tools.lab.reproduction.experiments.losses import KILLS, SENSORS, LossesRun
-from rack.tools.lab.reproduction.experiments.measured import LEVELS, PIPELINE, RATE_HZ
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    NAME,
+    NASREM,
+    MailboxTraffic,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.sections.equations import stolen
 from rack.tools.lab.reproduction.sections.flow import between, flow_svg
-from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, MOSTLY
+from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, judge_both
 from rack.tools.lab.reproduction.sections.page import (
-    Assessment,
     Chapter,
+    ClaimVerdict,
     Columns,
     Findings,
     Listing,
     Plate,
+    Requirement,
     Row,
-    Ruling,
     Side,
     Statement,
     code,
+    ruled,
+    ruled_strays,
     text,
 )
+from rack.tools.lab.reproduction.sections.sharing import LOCK, PIPELINE
 
 PAPERS_LOOP = """\
 procedure level()
@@ -67,41 +79,42 @@ def _flow(workshop: Workshop) -> Side:
     return [Plate(path.relative_to(workshop.folder), caption)]
 
 
-def _flow_tested(findings: Findings) -> Assessment:
-    """Compare what passed through the mailboxes between levels with what the ticks of their writers
-    demand."""
-    found = findings.of(NASREM)
+def _passed(found: NasremRun) -> Iterator[tuple[str, str, str, MailboxTraffic]]:
+    """Yield the mailboxes between two levels: the way, writer and reader, and what passed."""
     config = load(NAME)
     layout = wire(config)
     boxes = {box.mailbox: box for box in found.mailboxes}
-    rows = []
-    lacking = 0
     for upper, lower in pairwise(rack_timing(config, layout).hierarchy.chains[0]):
         for way, writer, reader in (("down", upper, lower), ("up", lower, upper)):
-            names = [box.name for box in between(layout, writer, reader)]
-            for box in (boxes[name] for name in names if name in boxes):
-                every = f"{box.every_ms:g}"
-                rows.append((way, code(box.mailbox), writer, reader, every, box.due, box.messages))
-                # A run may end before the last one is written.
-                if box.messages < box.due - 1:
-                    lacking += box.due - box.messages
+            for box in between(layout, writer, reader):
+                if box.name in boxes:
+                    yield way, writer, reader, boxes[box.name]
+
+
+def _flow_measured(findings: Findings) -> Side:
+    found = findings.of(NASREM)
+    rows = [
+        (way, code(box.mailbox), writer, reader, f"{box.every_ms:g}", box.due, box.messages)
+        for way, writer, reader, box in _passed(found)
+    ]
     head = ("way", "mailbox", "from", "to", "every, ms", "messages due", "messages")
-    side: Side = [
-        "In a run of the whole task in real time; a message that its writer skipped is missing.",
+    return [
+        "In a run of the whole task in real time; a message that its writer skipped is missing."
+        f" {stolen(found)}",
         Columns(head, rows),
     ]
-    if {way for way, *_ in rows} != {"down", "up"}:
-        return Assessment(side, Ruling.FAILS, "A way between two levels had no message.")
-    if not lacking:
-        return Assessment(
-            side, Ruling.HOLDS, "Commands went down and statuses up in every cycle of every level."
-        )
-    why = (
-        f"Commands went down and statuses up; {lacking} of"
-        f" {sum(box.due for box in boxes.values())} messages were not written, because their"
-        f" cycles were skipped. {stolen(found)}"
-    )
-    return Assessment(side, Ruling.BOUNDED, why)
+
+
+def judge_flow(found: NasremRun) -> ClaimVerdict:
+    """Compare the messages between levels with what the ticks of their writers demand."""
+    passed = list(_passed(found))
+    due = sum(box.due for *_, box in passed)
+    # A run may end before the last one is written.
+    lacking = sum(max(0, box.due - 1 - box.messages) for *_, box in passed)
+    used = {way for way, *_, box in passed if box.messages}
+    ways = Requirement("ways with messages, down and up", len(used), "=", 2)
+    why = "Commands went down and statuses up in every cycle of every level."
+    return ruled_strays("messages not written", lacking, due, why, (ways,))
 
 
 def _loop(workshop: Workshop) -> Side:
@@ -122,7 +135,7 @@ def _loop(workshop: Workshop) -> Side:
     ]
 
 
-def _loop_tested(findings: Findings) -> Assessment:
+def _loop_measured(findings: Findings) -> Side:
     found = findings.of(NASREM)
     head = (
         "level",
@@ -148,23 +161,16 @@ def _loop_tested(findings: Findings) -> Assessment:
                 task.skipped,
             )
         )
-    side: Side = [
-        "Phases of the loop in every executor, us of processor time, and its cycles.",
-        Columns(head, rows),
-    ]
+    words = "Phases of the loop in every executor, us of processor time, and its cycles."
+    return [f"{words} {stolen(found)}", Columns(head, rows)]
+
+
+def judge_loop(found: NasremRun) -> ClaimVerdict:
+    """Compare the cycles that missed their bound with all."""
     bad = sum(task.missed + task.skipped for task in found.executors.values())
     due = sum(task.cycles for task in found.executors.values())
-    if not bad:
-        return Assessment(
-            side, Ruling.HOLDS, f"All {due} cycles of all levels ended within their bound."
-        )
-    if bad < MOSTLY / 10 * due:
-        why = (
-            f"{bad} of {due} cycles were missed or skipped; all others ended within their bound."
-            f" {stolen(found)}"
-        )
-        return Assessment(side, Ruling.BOUNDED, why)
-    return Assessment(side, Ruling.FAILS, f"{bad} of {due} cycles were missed or skipped.")
+    why = f"All {due} cycles of all levels ended within their bound."
+    return ruled_strays("cycles missed or skipped", bad, due, why)
 
 
 def _both(workshop: Workshop) -> Side:
@@ -181,32 +187,16 @@ def _both(workshop: Workshop) -> Side:
     ]
 
 
-def _both_tested(findings: Findings) -> Assessment:
+def _both_measured(findings: Findings) -> Side:
     rows = []
-    late = 0
-    due = 0
     for figure, coupling in ((FIG2, "tightly"), (FIG4, "loosely")):
         tasks = findings.of(figure.experiment).tasks
         executor = tasks[LEVEL]
         rows.append(
             (code(figure.label), coupling, tasks[PLANNER].jobs, executor.jobs, executor.late)
         )
-        late += executor.late
-        due += executor.jobs
     head = ("rack", "coupled", "plans", "executor's cycles", "of these late")
-    side: Side = [Columns(head, rows)]
-    if not late:
-        return Assessment(
-            side,
-            Ruling.HOLDS,
-            "No cycle of an executor was late, while a planner computed all the time.",
-        )
-    ruling = Ruling.BOUNDED if late < MOSTLY * due else Ruling.FAILS
-    return Assessment(
-        side,
-        ruling,
-        f"{late} of {due} cycles of executors were late while a planner computed all the time.",
-    )
+    return [Columns(head, rows)]
 
 
 def _bounds(workshop: Workshop) -> Side:
@@ -223,27 +213,29 @@ def _bounds(workshop: Workshop) -> Side:
     ]
 
 
-def _bounds_tested(findings: Findings) -> Assessment:
-    runs = {one.name: findings.of(one) for one in (KILLS, SENSORS)}
-    side: Side = [_losses(run, script) for script, run in runs.items()]
-    faults = [fault for run in runs.values() for fault in run.faults]
-    count = len(faults)
-    late = sum(not (fault.is_within and fault.is_recovered) for fault in faults)
-    unexplained = sum(run.unexplained for run in runs.values())
-    undone = [script for script, run in runs.items() if not run.worked]
-    if late or undone:
-        why = (
-            f"{late} of {count} faults were not detected, or not recovered from, within their"
-            " bounds."
-        )
-        return Assessment(
-            side, Ruling.FAILS, f"{why} Tasks not done: {', '.join(undone) or 'none'}."
-        )
+def _bounds_measured(findings: Findings) -> Side:
+    return [_losses(findings.of(one), one.name) for one in (KILLS, SENSORS)]
+
+
+def judge_bounds(*runs: LossesRun) -> ClaimVerdict:
+    """Compare when each loss was detected and over with its bounds."""
+    faults = [fault for run in runs for fault in run.faults]
+    struck = sum(fault.struck >= 0 for fault in faults)
+    late = sum(not fault.is_within for fault in faults)
+    lasting = sum(not fault.is_recovered for fault in faults)
     why = (
-        f"All {count} losses were detected within their bounds, no level stopped cycling, and both"
-        f" tasks were done. Unexplained detections: {unexplained}."
+        f"All {len(faults)} losses were detected and over within their bounds, no level stopped"
+        " cycling, and the tasks were done."
     )
-    return Assessment(side, Ruling.HOLDS, why)
+    return ruled(
+        (
+            Requirement("losses struck", struck, "=", len(faults)),
+            Requirement("not detected within the bound", late, "=", 0),
+            Requirement("not recovered within the bound", lasting, "=", 0),
+            Requirement("tasks not done", sum(not run.worked for run in runs), "=", 0),
+        ),
+        why,
+    )
 
 
 def _losses(found: LossesRun, script: str) -> Columns:
@@ -262,7 +254,8 @@ def _losses(found: LossesRun, script: str) -> Columns:
     return Columns(
         head,
         [_loss_row(fault, found.clock_ms) for fault in found.faults],
-        f"{code(f'rack run {NAME} --lockstep --faults {script}')}: {text(ended)}.",
+        f"{code(f'rack run {NAME} --faults {script}')}: {text(ended)}. Detections that no fault"
+        f" explains: {found.unexplained}.",
     )
 
 
@@ -281,46 +274,20 @@ def _loss_row(fault: Judgement, clock_ms: float) -> Row:
     )
 
 
-def _pipeline(workshop: Workshop) -> Side:
-    return [
-        f"{LEVELS} boards at {RATE_HZ} Hz, one below the other, each passing on in every cycle what"
-        " it has read. A message becomes visible at the end of the cycle in which it was written,"
-        f" so that {LEVELS} levels take exactly {LEVELS} cycles, however fast the boards are."
-    ]
-
-
-def _pipeline_tested(findings: Findings) -> Assessment:
-    found = findings.of(PIPELINE)
-    rows = [
-        (mode, took, found.predicted, count)
-        for mode, cycles in (("lockstep", found.lockstep), ("realtime", found.realtime))
-        for took, count in cycles.items()
-    ]
-    side: Side = [Columns(("run", "cycles taken", "predicted", "messages"), rows)]
-    is_exact = set(found.lockstep) <= {found.predicted}
-    late = sum(count for took, count in found.realtime.items() if took != found.predicted)
-    if is_exact and not late:
-        return Assessment(side, Ruling.HOLDS, f"Every message took {found.predicted} cycles.")
-    if is_exact and min(found.realtime) >= found.predicted:
-        why = (
-            f"In lockstep every message took {found.predicted} cycles; in real time"
-            f" {late} took longer, after missed cycles."
-        )
-        return Assessment(side, Ruling.BOUNDED, why)
-    return Assessment(
-        side,
-        Ruling.FAILS,
-        "Messages took another number of cycles, in lockstep too, or less than predicted.",
-    )
-
-
 CHAPTER = Chapter(
     "2",
     (
-        Statement("figure-1", (NASREM,), _flow, _flow_tested),
-        Statement("virtual-control-loop", (NASREM,), _loop, _loop_tested),
-        Statement("planner-and-executor", (FIG2.experiment, FIG4.experiment), _both, _both_tested),
-        Statement("bounded-waits", (KILLS, SENSORS), _bounds, _bounds_tested),
-        Statement("pipeline", (PIPELINE,), _pipeline, _pipeline_tested),
+        Statement("figure-1", (NASREM,), judge_flow, _flow, _flow_measured),
+        Statement("virtual-control-loop", (NASREM,), judge_loop, _loop, _loop_measured),
+        LOCK,
+        Statement(
+            "planner-and-executor",
+            (FIG2.experiment, FIG4.experiment),
+            judge_both,
+            _both,
+            _both_measured,
+        ),
+        Statement("bounded-waits", (KILLS, SENSORS), judge_bounds, _bounds, _bounds_measured),
+        PIPELINE,
     ),
 )

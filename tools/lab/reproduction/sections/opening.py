@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from rack.boards.config import load, rack_timing, wire
+from rack.tools.lab.benches.partition import Partition, Partitions
 from rack.tools.lab.reproduction.experiments.determinism import (
     ATTEMPTS,
     DETERMINISM,
     NAME,
     SECONDS,
     ComparedRun,
+    ComparedRuns,
 )
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.nasrem import NASREM
+from rack.tools.lab.reproduction.experiments.measured import PARTITION
+from rack.tools.lab.reproduction.experiments.nasrem import NASREM, ExecutorCycles, NasremRun
 from rack.tools.lab.reproduction.sections.page import (
-    Assessment,
     Chapter,
+    ClaimVerdict,
     Columns,
     Findings,
+    Requirement,
     Row,
-    Ruling,
     Side,
     Statement,
     code,
+    ruled,
     text,
 )
+from rack.tools.lab.reproduction.sections.sharing import GROWTH, REPLICATION, SPEEDUP
 
 REAL = "realtime"
 LOCKSTEP = "lockstep"
@@ -43,8 +48,7 @@ def _determined(workshop: Workshop) -> Side:
     ]
 
 
-def _determined_tested(findings: Findings) -> Assessment:
-    runs = findings.of(DETERMINISM).runs
+def _determined_measured(findings: Findings) -> Side:
     head = (
         "run",
         "mode",
@@ -56,29 +60,29 @@ def _determined_tested(findings: Findings) -> Assessment:
         "first in",
         "digest",
     )
-    side: Side = [Columns(head, [_run_row(run) for run in runs])]
-    lockstep = [run for run in runs if run.mode == LOCKSTEP]
-    real = [run for run in runs if run.mode == REAL]
+    return [Columns(head, [_run_row(run) for run in findings.of(DETERMINISM).runs])]
+
+
+def judge_determinism(found: ComparedRuns) -> ClaimVerdict:
+    """Compare digests, and where runs diverge with where they first missed a deadline."""
+    lockstep = [run for run in found.runs if run.mode == LOCKSTEP]
+    real = [run for run in found.runs if run.mode == REAL]
     reference = lockstep[0].digest
-    if any(run.digest != reference for run in lockstep):
-        return Assessment(side, Ruling.FAILS, "Two runs in lockstep differ.")
-    if not all(_is_explained(run) for run in real):
-        return Assessment(
-            side, Ruling.FAILS, "A run in real time diverged before it had missed a deadline."
-        )
-    if any(run.first_miss is None and run.digest == reference for run in real):
-        why = (
-            "Lockstep twice and a run in real time without a miss wrote the same messages, bit"
-            " for bit."
-        )
-        if len(real) > 1:
-            why += " Runs that missed deadlines diverged no earlier than at the first miss."
-        return Assessment(side, Ruling.HOLDS, why)
-    why = (
-        "Lockstep twice wrote the same messages. This machine kept no run in real time free of"
-        " misses; none diverged before its first miss, and every miss is on record."
+    differing = sum(run.digest != reference for run in lockstep)
+    early = sum(not _is_explained(run) for run in real)
+    equal = sum(run.first_miss is None and run.digest == reference for run in real)
+    always = (
+        Requirement("runs in lockstep that differ from the first", differing, "=", 0),
+        Requirement("runs in real time that diverge before their first miss", early, "=", 0),
     )
-    return Assessment(side, Ruling.BOUNDED, why)
+    without_miss = Requirement(
+        "runs in real time without a miss, with equal digests", equal, ">=", 1
+    )
+    why = (
+        "Lockstep twice and a run in real time without a miss wrote the same messages, bit for bit."
+        " No run diverged before its first miss."
+    )
+    return ruled((*always, without_miss), why, here=always)
 
 
 def _is_explained(run: ComparedRun) -> bool:
@@ -125,25 +129,23 @@ def _costs(workshop: Workshop) -> Side:
     return [Columns(head, rows, caption)]
 
 
-def _costs_tested(findings: Findings) -> Assessment:
-    """Compare the processor time of communication with what the less loaded processor takes off the
-    other one."""
-    found = findings.of(NASREM)
+def _communication_us(task: ExecutorCycles) -> float:
+    return task.phases.exchange.p50 + task.phases.read.p50 + task.phases.write.p50
+
+
+def _costs_measured(findings: Findings) -> Side:
+    found, partitions = findings.of(NASREM), findings.of(PARTITION)
     rows = []
-    communicates = 0.0
     for level, task in found.executors.items():
-        parts = task.phases
-        exec_us = parts.process.p50
-        comm_us = parts.exchange.p50 + parts.read.p50 + parts.write.p50
-        rate_hz = 1e3 / task.slice_ms
-        communicates += comm_us * rate_hz * 1e-6
+        exec_us = task.phases.process.p50
+        comm_us = _communication_us(task)
         rows.append(
             (
                 level,
                 f"{exec_us:.0f}",
                 f"{comm_us:.0f}",
                 f"{100 * comm_us / (comm_us + exec_us):.0f}",
-                f"{comm_us * rate_hz * 1e-3:.1f}",
+                f"{comm_us / task.slice_ms:.1f}",
             )
         )
     head = (
@@ -153,27 +155,50 @@ def _costs_tested(findings: Findings) -> Assessment:
         "communication, % of both",
         "communication, ms a second",
     )
-    loads = ", ".join(f"core {core}: {1e3 * load_:.0f}" for core, load_ in found.loads.items())
-    caption = f"Medians of a run. Processor time of all tasks, ms a second: {loads}."
-    side: Side = [Columns(head, rows, caption)]
-    if len(found.loads) < 2:
-        return Assessment(
-            side, Ruling.UNTESTABLE, "All boards ran on one processor: there is nothing to save."
-        )
-    saved = min(found.loads.values())
-    words = (
-        f"Communication takes {1e3 * communicates:.0f} ms of processor time a second; the second"
-        f" processor takes {1e3 * saved:.0f} ms a second off the first."
+    loads = [
+        (one.partition, *(f"{1e3 * one.loads.get(core, 0.0):.0f}" for core in (0, 1)))
+        for one in partitions.partitions
+    ]
+    caption = "Processor time of all tasks, ms a second, on one processor and on two."
+    return [
+        Columns(head, rows, "Medians of a run."),
+        Columns(("planners", "core 0", "core 1"), loads, caption),
+    ]
+
+
+def judge_communication(found: NasremRun, partitions: Partitions) -> ClaimVerdict:
+    """Compare the processor time of communication with what a second processor takes off one."""
+    tasks = found.executors.values()
+    communicates = sum(_communication_us(task) / task.slice_ms for task in tasks)
+    loads = {one.partition: one.loads for one in partitions.partitions}
+    alone = sum(loads[Partition("tight", 1).name].values())
+    saved = 1e3 * (alone - max(loads[Partition("tight", 2).name].values()))
+    demand = Requirement(
+        "communication, against the time saved", communicates, "<", saved, "ms a second"
     )
-    ruling = Ruling.HOLDS if communicates < saved else Ruling.BOUNDED
-    return Assessment(side, ruling, words)
+    why = (
+        "All of communication takes less processor time than the second processor takes off the"
+        " busier one, next to a run on one processor."
+    )
+    return ruled((demand,), why)
 
 
 ABSTRACT = Chapter(
     "abstract",
-    (Statement("determinism", (DETERMINISM,), _determined, _determined_tested),),
+    (
+        Statement(
+            "determinism", (DETERMINISM,), judge_determinism, _determined, _determined_measured
+        ),
+    ),
 )
 INTRODUCTION = Chapter(
     "1",
-    (Statement("communication", (NASREM,), _costs, _costs_tested),),
+    (
+        SPEEDUP,
+        GROWTH,
+        REPLICATION,
+        Statement(
+            "communication", (NASREM, PARTITION), judge_communication, _costs, _costs_measured
+        ),
+    ),
 )

@@ -7,6 +7,7 @@ too.
 
 from __future__ import annotations
 
+import operator
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -86,6 +87,96 @@ Item = str | Columns | Plate | Listing
 """What stands below each other on the page; a text is a paragraph."""
 Side = list[Item]
 """What is said of a claim from one side: predicted, or measured."""
+
+
+DONE = "task done"
+"""The end of a run that has done its task."""
+STRAY = 0.02
+"""Part of cycles, plans or messages missed up to which this machine, not the claim, is seen."""
+SIGNS = {"<": "&lt;", "<=": "≤", ">": "&gt;", ">=": "≥", "=": "="}
+COMPARED = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "=": operator.eq,
+}
+
+
+class Requirement(NamedTuple):
+    """What a claim demands of a measured value, and whether it is met."""
+
+    of: str
+    measured: float
+    sign: str
+    limit: float
+    unit: str = ""
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the measured value satisfies the demand."""
+        return bool(COMPARED[self.sign](self.measured, self.limit))
+
+    @property
+    def row(self) -> Row:
+        """The demand as a row of the page."""
+        measured = f"{self.measured:.6g} {self.unit}".rstrip()
+        limit = f"{SIGNS[self.sign]} {self.limit:.6g} {self.unit}".rstrip()
+        return self.of, measured, limit, self.is_met
+
+    def __str__(self) -> str:
+        of, measured, limit, _ = self.row
+        return f"{of}: {measured}, demanded {limit}"
+
+
+class ClaimVerdict(NamedTuple):
+    """A ruling, its reason in one or two sentences, and the comparisons that it results from."""
+
+    ruling: Ruling
+    why: str
+    demands: Sequence[Requirement]
+
+
+def ruled(
+    claim: Sequence[Requirement],
+    why: str,
+    *,
+    here: Sequence[Requirement] = (),
+    needs: Sequence[Requirement] = (),
+    holding: Ruling = Ruling.HOLDS,
+) -> ClaimVerdict:
+    """Rule on a claim by comparisons alone; `why` is its reason if it holds.
+
+    It is not judged by a run that lacks what it `needs`. It holds, or gets the ruling `holding`, if
+    every demand of the `claim` is met, and holds within bounds if at least those of `here` are: the
+    same claim, with what this machine disturbs taken into account.
+    """
+    assert claim or unmet(needs), "a ruling without a comparison cannot fail"
+    demands = list(dict.fromkeys((*needs, *claim, *here)))
+    if lacking := unmet(needs):
+        return ClaimVerdict(Ruling.UNTESTABLE, f"Not judged. {lacking}.", demands)
+    if not (broken := unmet(claim)):
+        return ClaimVerdict(holding, why, demands)
+    if here and not unmet(here):
+        return ClaimVerdict(Ruling.BOUNDED, f"Within wider bounds only. {broken}.", demands)
+    return ClaimVerdict(Ruling.FAILS, f"{unmet(here) or broken}.", demands)
+
+
+def ruled_strays(
+    what: str, bad: int, due: int, why: str, needs: Sequence[Requirement] = ()
+) -> ClaimVerdict:
+    """Rule on something that must not happen; within bounds, in no more than a stray part."""
+    return ruled(
+        (Requirement(what, bad, "=", 0),),
+        why,
+        here=(Requirement(f"{what}, part of all", bad / max(due, 1), "<=", STRAY),),
+        needs=(*needs, Requirement("of how many", due, ">=", 1)),
+    )
+
+
+def unmet(demands: Sequence[Requirement]) -> str:
+    """Return the demands that are not met, in words."""
+    return "; ".join(str(demand) for demand in demands if not demand.is_met)
 
 
 @dataclass(frozen=True)
@@ -240,14 +331,15 @@ class Findings:
 class Statement:
     """A claim of the paper by its name, with the experiments that it rests on.
 
-    `predicted` computes our side from configs alone, and may draw; `tested` judges what the
-    experiments have found.
+    `predicted` computes our side from configs alone, and may draw; `measured` shows what the
+    experiments have found. `judged` rules on that: it is given their records, in their order.
     """
 
     name: str
     experiments: tuple[Experiment[Any], ...]
-    predicted: Callable[[Workshop], Side]
-    tested: Callable[[Findings], Assessment]
+    judged: Callable[..., ClaimVerdict]
+    predicted: Callable[[Workshop], Side] = lambda workshop: []
+    measured: Callable[[Findings], Side] = lambda findings: []
 
     def claim(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageClaim:
         """Return the claim with its ruling; a text among the `results` says why there is none."""
@@ -276,6 +368,13 @@ class Statement:
                 return Assessment([], Ruling.UNTESTABLE, f"{text(result.lacking)}.")
             found[name] = result.found
         return self.tested(Findings(found, workshop))
+
+    def tested(self, findings: Findings) -> Assessment:
+        """Return what was measured with the comparisons made of it, and the ruling."""
+        verdict = self.judged(*map(findings.of, self.experiments))
+        head = ("compared", "measured", "demanded", "met")
+        compared = Columns(head, [demand.row for demand in verdict.demands])
+        return Assessment([*self.measured(findings), compared], verdict.ruling, verdict.why)
 
 
 @dataclass(frozen=True)

@@ -2,36 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from math import inf
 
-from rack.tools.lab.reproduction.experiments.deadline import DEADLINE, TOO_EARLY, GotoRun
+from rack.tools.lab.reproduction.experiments.deadline import (
+    DEADLINE,
+    TOO_EARLY,
+    GotoRun,
+    GotoRuns,
+)
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
-from rack.tools.lab.reproduction.experiments.nasrem import NASREM
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    NasremRun,
+    Percentiles,
+    SystemResponse,
+)
 from rack.tools.lab.reproduction.sections.equations import (
     PaperEquation,
-    judged,
-    measured_of,
-    stolen,
-    table_of,
 )
 from rack.tools.lab.reproduction.sections.page import (
-    Assessment,
     Chapter,
+    ClaimVerdict,
     Columns,
     Findings,
     Plate,
+    Requirement,
     Row,
-    Ruling,
     Side,
     Statement,
     code,
+    ruled,
     text,
 )
+from rack.tools.lab.reproduction.sections.sharing import EXCHANGE, UPDATE, WAITING
 
 HURRIED = ("timing.response_ms=1000",)
 """A response within 1 s is demanded of the same four levels."""
-
 FITS = PaperEquation("3.1", "fig4-overload")
 BOUND = PaperEquation("3.2", "nasrem", HURRIED)
 SUM = PaperEquation("3.3", "nasrem", HURRIED)
@@ -56,23 +62,26 @@ def _goto(workshop: Workshop) -> Side:
     ]
 
 
-def _goto_tested(findings: Findings) -> Assessment:
+def _goto_measured(findings: Findings) -> Side:
     found = findings.of(DEADLINE)
+    rows = [_row(run) for run in (found.soft, found.early, found.met)]
+    head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
+    return [Columns(head, rows, f"At A: {list(found.place)} m. Runs in real time.")]
+
+
+def judge_goto(found: GotoRuns) -> ClaimVerdict:
+    """Compare when A was done with the time by which it was promised."""
     early = found.early
     met = found.met
-    rows = [_row(run) for run in (found.soft, early, met)]
-    head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
-    side: Side = [Columns(head, rows, f"At A: {list(found.place)} m. Runs in lockstep.")]
-    is_refused = early.done_s is None and not early.moved
-    is_met = met.done_s is not None and met.by_s is not None and met.done_s <= met.by_s
-    if is_refused and is_met:
-        why = (
-            f"By {early.by_s:g} s is refused before anything moves; by {met.by_s:g} s is"
-            f" promised, and done at {met.done_s:g} s. Without a time nothing is promised."
-        )
-        return Assessment(side, Ruling.HOLDS, why)
-    return Assessment(
-        side, Ruling.FAILS, f"Refused when it must be: {is_refused}; met when promised: {is_met}."
+    done_s = inf if met.done_s is None else met.done_s
+    begun = early.moved + (early.done_s is not None)
+    return ruled(
+        (
+            Requirement(f"by {early.by_s:g} s, too early: motions begun", begun, "=", 0),
+            Requirement("by the time promised: A done", done_s, "<=", met.by_s or 0.0, "s"),
+        ),
+        "A time that is too early is refused before anything moves; one that is promised is met."
+        " Without a time nothing is promised.",
     )
 
 
@@ -83,22 +92,29 @@ def _row(run: GotoRun) -> Row:
     return f"GOTO A{by}, GOTO B", done, moved, text(run.cause), text(run.reason) or "-"
 
 
-def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
-    """Judge eq. 3.3: the sum, and what waiting for the next read adds to it."""
-    found = findings.of(NASREM)
+def _ways(response: SystemResponse) -> list[tuple[str, float, Percentiles]]:
+    """Return the ways that something went: the name, the bound of the grid and the times, ms."""
+    both = {"command, down": response.command, "status, up": response.status}
+    return [
+        (name, way.bound_ms, way.measured_ms)
+        for name, way in both.items()
+        if way.measured_ms is not None
+    ]
+
+
+def _sum_measured(found: NasremRun) -> Side:
+    """Return the sum, and what waiting for the next read adds to it."""
     response = found.response
-    verdicts = measured_of(equation.number, found)
-    sum_ms = response.sum_eq_3_3_ms
     rows = [
         (
             name,
-            f"{sum_ms:g}",
-            f"{way.bound_ms:g}",
-            f"{way.measured_ms.p50:g}",
-            f"{way.measured_ms.max:g}",
+            f"{response.sum_eq_3_3_ms:g}",
+            f"{bound_ms:g}",
+            f"{times.p50:g}",
+            f"{times.max:g}",
             f"{response.bound_eq_3_2_ms:g}",
         )
-        for name, way in (("command, down", response.command), ("status, up", response.status))
+        for name, bound_ms, times in _ways(response)
     ]
     head = (
         "",
@@ -108,39 +124,33 @@ def _sum_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         "longest",
         "n R<sub>max</sub>",
     )
-    side: Side = [
-        f"Along {' → '.join(response.levels)}, ms:",
-        Columns(head, rows),
-        table_of(verdicts),
-    ]
-    if not all(verdict.measured.holds for verdict in verdicts):
-        late = len(response.command.beyond) + len(response.status.beyond)
-        if late and found.missed + found.skipped:
-            why = (
-                f"{late} responses exceeded the sum with its waits, after missed cycles."
-                f" {stolen(found)}"
-            )
-            return Assessment(side, Ruling.BOUNDED, why)
-        return Assessment(
-            side,
-            Ruling.FAILS,
-            f"{late} responses exceeded the sum with its waits, without a missed cycle.",
-        )
-    longest = max(response.command.measured_ms.max, response.status.measured_ms.max)
-    if longest <= sum_ms:
-        return Assessment(side, Ruling.HOLDS, "No response was longer than the sum.")
-    why = (
-        f"The sum alone is no bound: the longest response is {longest:g} ms, the sum {sum_ms:g}. A"
-        " message also waits for its next read on the clock's grid: going down where a cycle does"
-        " not divide the one above it, going up almost a cycle of every level. With these waits no"
-        " response was longer than predicted, and the longest was as long."
+    words = (
+        "A message also waits for its next read on the clock's grid: going down where a cycle does"
+        " not divide the one above it, going up almost a cycle of every level."
     )
-    return Assessment(side, Ruling.BOUNDED, why)
+    return [f"{words} Along {' → '.join(response.levels)}, ms:", Columns(head, rows)]
 
 
-def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
-    own = judged(equation, findings)
-    found = findings.of(NASREM)
+def judge_sum(equation: PaperEquation, found: NasremRun) -> ClaimVerdict:
+    """Compare the longest responses with the sum alone; within bounds, with the sum and its
+    waits, which a missed cycle may prolong."""
+    response = found.response
+    beyond = [*response.command.beyond, *response.status.beyond]
+    unexplained = sum(not any("missed" in delay for delay in one["delayed_by"]) for one in beyond)
+    total_ms = response.sum_eq_3_3_ms
+    ways = _ways(response)
+    return ruled(
+        [
+            Requirement(f"{name}: the sum", times.max, "<=", total_ms, "ms")
+            for name, _, times in ways
+        ],
+        "No response was longer than the sum.",
+        here=(Requirement("beyond the sum with its waits, without a miss", unexplained, "=", 0),),
+        needs=(Requirement("ways that something went, down and up", len(ways), "=", 2),),
+    )
+
+
+def _residuals(found: NasremRun) -> Side:
     rows = [
         (
             name,
@@ -162,22 +172,30 @@ def _residual_tested(equation: PaperEquation, findings: Findings) -> Assessment:
         found.pictures["residuals"],
         "What the cycles of each level used of R<sub>i</sub>, and &alpha;.",
     )
-    return replace(own, measured=[*own.measured, Columns(head, rows), plate])
+    return [Columns(head, rows), plate]
 
 
 SOFT = Chapter(
     "3",
-    (Statement("soft-and-real-time", (DEADLINE,), _goto, _goto_tested),),
+    (Statement("soft-and-real-time", (DEADLINE,), judge_goto, _goto, _goto_measured),),
 )
 RESPONSE = Chapter(
     "3.1",
-    (FITS.statement(), BOUND.statement(), SUM.statement(_sum_tested)),
+    (FITS.statement(), BOUND.statement(), SUM.statement(judge_sum, _sum_measured)),
 )
 LOW = Chapter(
     "3.2",
-    (EXECUTES.statement(), PARTS.statement(), RESIDUAL.statement(_residual_tested)),
+    (EXECUTES.statement(), PARTS.statement(), RESIDUAL.statement(further=_residuals)),
 )
 HIGH = Chapter(
     "3.3",
-    (GRID.statement(), TIGHT.statement(), WITH_PLANNER.statement(), SMALL.statement()),
+    (
+        GRID.statement(),
+        WAITING,
+        TIGHT.statement(),
+        WITH_PLANNER.statement(),
+        UPDATE,
+        SMALL.statement(),
+        EXCHANGE,
+    ),
 )

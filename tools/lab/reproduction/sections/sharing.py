@@ -1,0 +1,149 @@
+"""Claims of sections 1 to 3.3 on how levels share processors and the backplane."""
+
+from __future__ import annotations
+
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
+from rack.tools.lab.reproduction.experiments.sharing import (
+    CHAINS,
+    LEVELS,
+    RATE_HZ,
+    WAITS,
+    Chains,
+    Waits,
+)
+from rack.tools.lab.reproduction.sections.gantt import BUFFERED, FIG3, FIG4, judge_both, ran_all
+from rack.tools.lab.reproduction.sections.page import (
+    STRAY,
+    ClaimVerdict,
+    Columns,
+    Findings,
+    Requirement,
+    Side,
+    Statement,
+    ruled,
+    ruled_strays,
+)
+
+
+def judge_speedup(one: FigureRun, two: FigureRun) -> ClaimVerdict:
+    """Compare the plans of the same level on one processor and on two."""
+    plans = [run.tasks[PLANNER].jobs for run in (one, two)]
+    return ruled(
+        (Requirement("plans on two processors, and on one", plans[1], ">", plans[0]),),
+        f"On two processors the level makes {plans[1] / max(plans[0], 1):.2f} times the plans.",
+        needs=(Requirement("plans on one processor", plans[0], ">=", 1),),
+    )
+
+
+def judge_pipeline(found: Chains) -> ClaimVerdict:
+    """Compare the cycles that messages took with the number of levels."""
+    exact = found.lockstep.took
+    real = found.realtime.took
+    off = sum(exact.values()) - exact.get(LEVELS, 0)
+    early = sum(count for took, count in real.items() if took < LEVELS)
+    arrived = sum(real.values())
+    late = arrived - early - real.get(LEVELS, 0)
+    always = (
+        Requirement(f"messages in lockstep that took other than {LEVELS} cycles", off, "=", 0),
+        Requirement("messages in real time that took fewer", early, "=", 0),
+    )
+    # Every level may miss its part.
+    strays = Requirement("part that took more", late / max(arrived, 1), "<=", LEVELS * STRAY)
+    return ruled(
+        (*always, Requirement("messages in real time that took more", late, "=", 0)),
+        f"Every message took {LEVELS} cycles.",
+        here=(*always, strays),
+        needs=(Requirement("messages", min(arrived, sum(exact.values())), ">=", 1),),
+    )
+
+
+def judge_growth(found: Chains) -> ClaimVerdict:
+    """Count missed cycles after boards were added: none has more to do for it."""
+    grown = found.grown
+    on_time = Requirement(
+        "messages that took a cycle a board", grown.took.get(grown.boards, 0), ">=", 1
+    )
+    why = f"From {LEVELS} boards to {grown.boards}, all cycles were in time."
+    return ruled_strays("cycles missed or skipped", grown.missed, grown.due, why, (on_time,))
+
+
+def judge_locks(found: Chains) -> ClaimVerdict:
+    """Count missed cycles of boards that lock, read and unlock as the paper's do."""
+    locked = found.locked
+    why = "Boards that lock every mailbox for each access kept all their cycles."
+    return ruled_strays("cycles missed or skipped", locked.missed, locked.due, why)
+
+
+def judge_update(found: FigureRun) -> ClaimVerdict:
+    """Count updates of a plan in which the executor began, of those that its release met."""
+    why = "An executor released during the update of its plan waited for the end of it."
+    return ruled_strays("updates preempted", found.preempted, found.met, why)
+
+
+def judge_waits(found: Waits) -> ClaimVerdict:
+    """Compare how late cycles start after polling, and after blocking."""
+    blocks, polls = (found.late_us[wake] for wake in ("signal", "poll"))
+    return ruled(
+        (
+            Requirement(
+                "median lateness, polling and blocking", polls["p50"], "<", blocks["p50"], "us"
+            ),
+        ),
+        "A board that polls starts its cycles sooner: it needs no switch.",
+    )
+
+
+def judge_replication() -> ClaimVerdict:
+    """Refuse to rule: nothing here takes over the work of a board."""
+    built = Requirement("boards that a replica can replace", 0, ">=", 1)
+    return ruled((), "", needs=(built,))
+
+
+def _chains(findings: Findings) -> Side:
+    rows = [
+        (name, run.boards, run.due, run.missed, took, count)
+        for name, run in vars(findings.of(CHAINS)).items()
+        for took, count in run.took.items()
+    ]
+    head = ("chain", "boards", "cycles", "missed or skipped", "a message took, cycles", "messages")
+    return [Columns(head, rows)]
+
+
+def _pipeline(workshop: Workshop) -> Side:
+    return [
+        f"{LEVELS} boards at {RATE_HZ} Hz, one below the other, each passing on in every cycle what"
+        " it has read. A message becomes visible at the end of the cycle in which it was written,"
+        f" so that {LEVELS} levels take exactly {LEVELS} cycles, however fast the boards are."
+    ]
+
+
+def _updates(findings: Findings) -> Side:
+    found = findings.of(FIG3.experiment)
+    executor = found.tasks[LEVEL]
+    return [f"{found.met} updates were met by one of {executor.jobs} releases of the executor."]
+
+
+def _waits(findings: Findings) -> Side:
+    rows = [
+        (wake, *(f"{times[part]:.1f}" for part in ("p50", "p99", "max")))
+        for wake, times in findings.of(WAITS).late_us.items()
+    ]
+    return [Columns(("waits by", "late, median, us", "99th percentile", "longest"), rows)]
+
+
+SPEEDUP = Statement(
+    "speedup", (FIG3.experiment, FIG4.experiment), judge_speedup, measured=ran_all(FIG3, FIG4)
+)
+GROWTH = Statement("growth", (CHAINS,), judge_growth, measured=_chains)
+REPLICATION = Statement("replication", (), judge_replication)
+LOCK = Statement("locks", (CHAINS,), judge_locks, measured=_chains)
+PIPELINE = Statement("pipeline", (CHAINS,), judge_pipeline, _pipeline, _chains)
+UPDATE = Statement("update", (FIG3.experiment,), judge_update, measured=_updates)
+WAITING = Statement("waiting", (WAITS,), judge_waits, measured=_waits)
+EXCHANGE = Statement(
+    "slices-and-buffers",
+    (FIG4.experiment, BUFFERED.experiment),
+    judge_both,
+    measured=ran_all(BUFFERED),
+)
