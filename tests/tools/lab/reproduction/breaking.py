@@ -1,0 +1,68 @@
+"""Racks that break claims of the paper, run by the experiments of `rack reproduce`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rack.boards.config.schema import RackConfig
+from rack.tools.lab.benches.observed import Recorded
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+
+CHAIN = "chain"
+"""The rack of empty boards, which has no name of its own."""
+
+
+class BreakingWorkshop(Workshop):
+    """Runs racks with `changes`, TOML by the name of the rack, each at most `most_s` long.
+
+    `scripts` are the faults that a script of that name holds instead, as TOML.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        changes: Mapping[str, str],
+        most_s: float,
+        scripts: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(folder, share=True)
+        self._changes = changes
+        self._most_s = most_s
+        self._scripts = scripts or {}
+        self.about = f"{changes}, {most_s} s, {self._scripts}"
+        self.prepare()
+
+    def source(self, name: str) -> str:
+        """Return the path of a changed config; a chain comes as text, and stays one.
+
+        A change that the chain cannot take is left out: of its own protocol, or an overrun in
+        lockstep.
+        """
+        if "\n" in name:
+            changes = self._changes.get(CHAIN, "")
+            clashes = (("[protocol]", "[protocol]"), ('"lockstep"', "overrun"))
+            fits = not any(own in name and other in changes for own, other in clashes)
+            return name + changes * fits
+        changes = self._changes.get(name)
+        if changes is None:
+            return name
+        base = "" if changes.startswith("name") else f'extends = ["{name}"]\n'
+        return self._written(name, f"format = 2\n{base}{changes}")
+
+    def config(
+        self, name: str, settings: Sequence[str] = (), faults: str | None = None
+    ) -> RackConfig:
+        """Return a changed config, with the changed script of that name."""
+        if faults in self._scripts:
+            faults = self._written(f"script-{faults}", self._scripts[faults])
+        return super().config(name, settings, faults)
+
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
+        """Run a rack, no longer than permitted."""
+        return super().run(label, config, min(seconds or self._most_s, self._most_s))
+
+    def _written(self, name: str, text: str) -> str:
+        path = self.folder / f"broken-{name}.toml"
+        path.write_text(text, encoding="utf-8")
+        return str(path)

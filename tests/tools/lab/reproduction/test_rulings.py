@@ -1,0 +1,387 @@
+"""Every ruling of the page can fail: for each claim a rack that breaks it, run by the claim's own
+experiments, and the demand that it does not meet.
+
+A row changes a rack by a few lines of TOML. What is run is short: the verdict counts, and which
+comparison gave it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter
+
+from rack.boards.config import load
+from rack.tools.lab.benches import switch
+from rack.tools.lab.benches.systems.figures import prediction
+from rack.tools.lab.reproduction.experiments import figures, measured, nasrem, sharing
+from rack.tools.lab.reproduction.experiments.figures import settings_of
+from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
+from rack.tools.lab.reproduction.experiments.sharing import WAITS
+from rack.tools.lab.reproduction.reproduction import CHAPTERS
+from rack.tools.lab.reproduction.sections.comparison import judge_layers
+from rack.tools.lab.reproduction.sections.page import ClaimVerdict, Ruling, Statement, unmet
+from rack.tools.timing.analysis.analysis import Analysis
+from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
+from tests.tools.lab.reproduction.test_equations import RUN
+
+pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.timeout(300)]
+
+STATEMENTS = {one.name: one for chapter in CHAPTERS for one in chapter.statements}
+UNJUDGED = {"replication"}
+"""Claims on something that is not built: the page refuses to rule."""
+HERE = Path(__file__).parent
+LATE = """
+[[fault]]
+kind = "overrun"
+board = "{board}"
+by = 1.2
+at = {at}
+for = "60s"
+"""
+"""Every other cycle is skipped."""
+WALL_CLOCK = f"""name = "clocked"
+python_path = ["{HERE}"]
+[clock]
+period_ms = 2.5
+[board.task]
+slot = 2
+rate_hz = 50
+executor = "wall_clock:WallClock"
+"""
+LOCKSTEP = """
+[clock]
+mode = "lockstep"
+"""
+LATE_BOARD = LATE.format(board="board2", at=0.1)
+DELAYED = """
+[[fault]]
+kind = "delay"
+board = "{board}"
+by = {by}
+at = 0.5
+for = "60s"
+"""
+SLOW_BUS = "[board.servo.transfer]\nread_ms = 0.5\nwrite_ms = 0.5\n"
+HELD = """
+[[command]]
+level = "primitive"
+what = "hold"
+tick = 2600
+[[command]]
+level = "primitive"
+what = "resume"
+tick = 5000
+"""
+LOST = """
+[supervision]
+restarts = 0
+[[fault]]
+kind = "kill"
+board = "{board}"
+tick = 1
+"""
+"""A board is lost at once, and stays so."""
+NO_RESTART = "[supervision]\nrestarts = 0\n"
+LEVEL = """
+[board.{name}]
+slot = {slot}
+rate_hz = {rate_hz}
+executor = "rack.levels.systems.figures:FigureExecutor"
+planner = "rack.levels.systems.figures:FigurePlanner"
+coupling = "tight"
+within_cycles = 4
+priority = 50
+params = {{ process_ms = {process_ms}, plan_ms = 5.0 }}
+"""
+LATE_TASK = (
+    'name = "late-task"\n[clock]\nperiod_ms = 10.0\n'
+    + LEVEL.format(name="task", slot=2, rate_hz=2, process_ms=[700.0, 10.0])
+    + LEVEL.format(name="servo", slot=3, rate_hz=50, process_ms=1.0)
+)
+"""Every second cycle of the slow level is missed; every level plans."""
+ONE_LOSS = {
+    "kill-each-board": """
+[[fault]]
+kind = "kill"
+board = "servo"
+at = 0.5
+""",
+    "bad-sensors": """
+[[fault]]
+kind = "sensor-nan"
+board = "servo"
+joint = 2
+at = 0.5
+for = "50ms"
+""",
+}
+"""Short scripts in place of those of whole tasks."""
+
+
+Judge = Callable[[BreakingWorkshop, Statement], ClaimVerdict]
+FOUND: dict[tuple[str, str], Any] = {}
+"""What experiments have found, by their names and the racks: claims share some."""
+
+
+def by_experiments(workshop: BreakingWorkshop, statement: Statement) -> ClaimVerdict:
+    """Return the ruling on what all experiments of a claim find."""
+    found = []
+    for one in statement.experiments:
+        key = one.name, workshop.about
+        if key not in FOUND:
+            FOUND[key] = one.make(workshop)
+        found.append(FOUND[key])
+    return statement.judged(*found)
+
+
+def by_equation(rack: str, settings: tuple[str, ...] = ()) -> Judge:
+    """Return a judge of an equation by a run of another rack than NASREM's, or in lockstep."""
+
+    def judge(workshop: BreakingWorkshop, statement: Statement) -> ClaimVerdict:
+        run = workshop.run(rack, workshop.config(rack, settings)).recording
+        analysis = Analysis.of(run)
+        found = replace(RUN, verdicts=tuple(nasrem._verdicts(analysis)))
+        if analysis.response is not None:
+            response = TypeAdapter(SystemResponse).validate_python(analysis.response)
+            found = replace(found, response=response)
+        return statement.judged(found)
+
+    return judge
+
+
+def with_ways_exchanged(workshop: BreakingWorkshop, statement: Statement) -> ClaimVerdict:
+    """Return the ruling on a run whose figures changed places: no rack makes polling the slower
+    way, so that this case comes from data."""
+    found = WAITS.make(workshop)
+    late_us = dict(zip(found.late_us, reversed(found.late_us.values()), strict=True))
+    return statement.judged(replace(found, late_us=late_us))
+
+
+def by_one_system(name: str) -> Judge:
+    """Return a judge by the experiment of one system."""
+    return lambda workshop, statement: by_experiments(
+        workshop, replace(statement, experiments=(measured.system_experiment(name),))
+    )
+
+
+@dataclass(frozen=True)
+class Breaking:
+    """A claim, a rack that breaks it, and the demand that is then not met, in part of its words.
+
+    Of a healthy rack no demand is unmet.
+    """
+
+    claim: str
+    unmet: str
+    changes: Mapping[str, str] = field(default_factory=dict)
+    seconds: float = 3.5
+    scripts: Mapping[str, str] = field(default_factory=dict)
+    judge: Judge = by_experiments
+
+
+LATE_SERVO = {"nasrem": LATE.format(board="servo", at=0.3)}
+ROWS = (
+    Breaking("determinism", "runs in lockstep that differ", {"nasrem": WALL_CLOCK}, 0.5),
+    Breaking("figure-1", "messages not written, part of all", LATE_SERVO),
+    Breaking("virtual-control-loop", "cycles missed or skipped, part of all", LATE_SERVO),
+    Breaking("locks", "cycles missed or skipped, part of all", {CHAIN: LATE_BOARD}),
+    Breaking(
+        "planner-and-executor",
+        "cycles of executors late, part of all",
+        {"fig2": "[board.level.params]\nprocess_ms = [9.0, 1.0, 1.0]\n"},
+    ),
+    Breaking(
+        "bounded-waits",
+        "tasks not done",
+        {"nasrem": "[board.servo]\nrestarts = 0\n" + LOCKSTEP},
+        2.0,
+        ONE_LOSS,
+    ),
+    Breaking(
+        "pipeline",
+        "messages in lockstep that took other",
+        {CHAIN: '\n[protocol]\ndefault = "double-buffer"\n'},
+    ),
+    Breaking("nasrem", "servo: part off 400 Hz", LATE_SERVO),
+    Breaking("equation-3.1", "level: t_proc + t_c", judge=by_equation("fig4-overload")),
+    Breaking("equation-3.4", "level: t_exec", judge=by_equation("fig4", settings_of("fig4", 7.0))),
+    Breaking("equation-3.5", "level", judge=by_equation("fig4-overload")),
+    Breaking("equation-3.6", "level", judge=by_equation("fig4", settings_of("fig4", 4.0))),
+    Breaking("equation-3.7", "level", judge=by_equation("fig4", settings_of("fig4", 7.0))),
+    Breaking("equation-3.8", "level", judge=by_equation("fig3")),
+    Breaking("equation-3.9", "level", judge=by_equation("fig3", settings_of("fig3", 4.0))),
+    Breaking(
+        "equation-3.10",
+        "level",
+        judge=by_equation("fig2", ("timing.small_share=0.05",)),
+    ),
+    Breaking(
+        "figure-2",
+        "part of cycles, or plans, late",
+        {"fig2": "[board.level.params]\nprocess_ms = 9.0\n"},
+    ),
+    Breaking("figure-2-x", "X = 3: part late", {"fig2": "[board.level.params]\nplan_ms = 1.0\n"}),
+    Breaking(
+        "figure-3",
+        "part of cycles, or plans, late",
+        {"fig3": "[board.level.params]\nplan_ms = 1.0\n"},
+    ),
+    Breaking(
+        "figure-4",
+        "part of cycles, or plans, late",
+        {"fig4": "[board.level.params]\nprocess_ms = 7.0\n"},
+    ),
+    Breaking(
+        "figure-4-overload",
+        "part of cycles, or plans, late",
+        {"fig4-overload": "[board.level.params]\nprocess_ms = 0.5\n"},
+    ),
+    Breaking(
+        "equation-3.2",
+        "R_s of a status",
+        {"nasrem": "[timing]\nresponse_ms = 1000\n" + LOCKSTEP},
+        7.0,
+        judge=by_equation("nasrem"),
+    ),
+    Breaking(
+        "equation-3.3",
+        "beyond the sum with its waits, without a miss",
+        {"nasrem": DELAYED.format(board="elemental_move", by=4) + LOCKSTEP},
+        7.0,
+        judge=by_equation("nasrem"),
+    ),
+    Breaking(
+        "speedup",
+        "plans on two processors",
+        {"fig4": "[board.level.params]\nplan_ms = 60.0\n"},
+    ),
+    Breaking("growth", "cycles missed or skipped, part of all", {CHAIN: LATE_BOARD}),
+    Breaking("waiting", "median lateness, polling and blocking", judge=with_ways_exchanged),
+    Breaking(
+        "update",
+        "updates preempted, part of all",
+        {"fig3": '[protocol.mailbox]\n"level.plan" = "time-slice"\n'},
+    ),
+    Breaking(
+        "slices-and-buffers",
+        "cycles of executors late, part of all",
+        {"fig4": "[board.level.params]\nprocess_ms = [9.0, 1.0, 1.0]\n"},
+    ),
+    Breaking("communication", "communication, against the time saved", {"nasrem": SLOW_BUS}),
+    Breaking(
+        "soft-and-real-time",
+        "by the time promised: A done",
+        {"nasrem": HELD + LOCKSTEP},
+        20.0,
+    ),
+    Breaking(
+        "state-tables",
+        "transitions only with the disturbance",
+        {"nist-state-table": "[scene]\nmotion = []\n" + LOCKSTEP},
+    ),
+    Breaking(
+        "figure-5",
+        "slow levels: part missed",
+        {"nasrem": LATE_TASK},
+    ),
+    Breaking(
+        "systems",
+        "systems that failed in a run",
+        {"condor": NO_RESTART},
+        judge=by_one_system("condor"),
+    ),
+    *(
+        Breaking(name, f"{box}, a second", {name: LOST.format(board=lost)})
+        for name, box, lost in (
+            ("rccl", "joint1.command", "joint1"),
+            ("brown", "supervisor.command", "supervisor"),
+            ("hic", "fingertip.command", "fingertip"),
+        )
+    ),
+    *(
+        Breaking(claim, f"{host}.{box}, messages", {name: f"[host.{host}]\nexternal = true\n"})
+        for claim, name, host, box in (
+            ("chimera", "chimera", "command", "requests"),
+            ("condor", "condor", "workstation", "plan"),
+            ("host-services", "condor", "workstation", "plan"),
+            ("penn", "penn", "coordinator", "requests"),
+        )
+    ),
+    Breaking(
+        "ibm",
+        "bridge.sensors, a second",
+        {"ibm": '[board.bridge.params.pass]\nsensors = { from = "arm.status", every = 8 }\n'},
+    ),
+    Breaking(
+        "predictable-response",
+        "lockstep: not at the predicted tick",
+        {"nasrem": DELAYED.format(board="primitive", by=3)},
+    ),
+    Breaking(
+        "two-levels",
+        "levels, in the system with the fewest",
+        judge=lambda workshop, statement: judge_layers({"fig2": prediction(load("fig2"))}),
+    ),
+    Breaking(
+        "context-switch",
+        "99th percentile, the config's",
+        {"nasrem": "[timing]\ncontext_switch_ms = 0.0001\n"},
+    ),
+)
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make runs short that no workshop makes."""
+    monkeypatch.setattr(figures, "SECONDS", 1.0)
+    monkeypatch.setattr(figures, "ATTEMPTS", 1)
+    monkeypatch.setattr(sharing, "SECONDS", 0.7)
+    monkeypatch.setattr(measured, "PARTITION_S", 2.5)
+    monkeypatch.setattr(measured, "COMMANDS", 4)
+    monkeypatch.setattr(measured, "TWINS", 0)
+    monkeypatch.setattr(switch, "WAKES", 200)
+
+
+ALONE = {"figure-2-x", "figure-3", "figure-4-overload"}
+"""Claims of failure, which only a run that keeps its cycles contradicts."""
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        pytest.param(row, id=row.claim, marks=[pytest.mark.alone] * (row.claim in ALONE))
+        for row in ROWS
+    ],
+)
+def test_a_claim_does_not_hold_in_a_rack_that_breaks_it(row: Breaking, tmp_path: Path) -> None:
+    workshop = BreakingWorkshop(tmp_path, row.changes, row.seconds, row.scripts)
+    verdict = row.judge(workshop, STATEMENTS[row.claim])
+    assert row.unmet in unmet(verdict.demands), verdict
+    assert verdict.ruling is Ruling.FAILS
+
+
+HEALTHY = (
+    Breaking("two-levels", "", judge=lambda workshop, statement: statement.judged()),
+    Breaking("equation-3.2", "", {"nasrem": LOCKSTEP}, 7.0, judge=by_equation("nasrem")),
+    Breaking("bounded-waits", "", {"nasrem": LOCKSTEP}, 3.5, ONE_LOSS),
+)
+"""Racks that keep a claim, where a run is short and needs no real time; test_chapters.py and
+test_figures.py have the others, by data."""
+
+
+@pytest.mark.parametrize("row", HEALTHY, ids=lambda row: row.claim)
+def test_a_claim_holds_in_a_rack_that_keeps_it(row: Breaking, tmp_path: Path) -> None:
+    workshop = BreakingWorkshop(tmp_path, row.changes, row.seconds, row.scripts)
+    verdict = row.judge(workshop, STATEMENTS[row.claim])
+    assert unmet(verdict.demands) == ""
+    assert verdict.ruling is Ruling.HOLDS
+
+
+def test_every_ruling_of_the_page_has_a_rack_that_breaks_it() -> None:
+    assert sorted(row.claim for row in ROWS) == sorted(set(STATEMENTS) - UNJUDGED)
+    assert all(STATEMENTS[name].judged().ruling is Ruling.UNTESTABLE for name in UNJUDGED)
