@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import platform
 import re
 import select
 import signal
@@ -12,7 +13,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from resource import RLIMIT_NOFILE, RLIMIT_NPROC, getrlimit
+from struct import Struct
 from time import process_time_ns
+from typing import NamedTuple
 
 from rack.backplane.layout import TaskSpec
 
@@ -93,21 +96,61 @@ _PR_SET_CHILD_SUBREAPER = 36
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def take_processor(spec: TaskSpec) -> int:
-    """Pin the calling process, take its priority if allowed, lock its memory, stop the garbage
-    collector.
+DEADLINE = 100
+"""Stands for SCHED_DEADLINE among SCHED_FIFO's priorities, which end at 99: it precedes all."""
+_SCHED_DEADLINE = 6
+_RESET_ON_FORK = 1
+_RECLAIM = 2
+"""Lets a process that exceeds its reservation use what others leave: a first cycle takes longer."""
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+"""Number of the system call, by machine: the C library has no function for it."""
 
-    Return the SCHED_FIFO priority obtained; 0: ordinary scheduling.
+
+class Reservation(NamedTuple):
+    """Processor time under SCHED_DEADLINE: so much in each period, before its end."""
+
+    runtime_ns: int
+    period_ns: int
+
+
+def take_core(core: int, priority: int, reservation: Reservation | None = None) -> int:
+    """Pin the calling process to a core and, if allowed, a reservation or else a priority.
+
+    Return the SCHED_FIFO priority obtained; 0: ordinary scheduling; `DEADLINE`: the reservation.
     """
-    pin(spec.core)
-    priority = spec.priority if set_priority(spec.priority) else 0
+    everywhere = os.sched_getaffinity(0)
+    pin(core)
+    if reservation is not None:
+        # A pinned process is admitted only where the kernel does not add up what is reserved.
+        for cores in ({core}, everywhere):
+            os.sched_setaffinity(0, cores)
+            if _reserve(reservation):
+                return DEADLINE
+        pin(core)
+    return priority if set_priority(priority) else 0
+
+
+def _reserve(reservation: Reservation) -> bool:
+    """Take SCHED_DEADLINE; False when the system refuses it."""
+    runtime_ns, period_ns = reservation
+    times = runtime_ns, period_ns, period_ns
+    record = Struct("=IIQiIQQQ")
+    wanted = record.pack(record.size, _SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
+    number = _SCHED_SETATTR.get(platform.machine())
+    return number is not None and _libc.syscall(number, 0, wanted, 0) == 0
+
+
+def take_processor(spec: TaskSpec, reservation: Reservation | None = None) -> int:
+    """Take core and scheduling as `take_core`, lock the process's memory, stop the garbage
+    collector."""
+    obtained = take_core(spec.core, spec.priority, reservation)
     # Ordinary processes wake up to 50 us late without this, to save power.
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     # Here, not above: it needs numpy, for which `rack list` and the like should not wait.
     from rack.backplane.memory import lock_memory
 
     lock_memory()
-    return priority
+    return obtained
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rack.backplane.layout import ExchangeSpec
+from rack.backplane.process import Reservation
 from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
@@ -41,7 +42,7 @@ class TaskWiring:
     `guards_clock`: the task is one of the fastest and watches the clock. `sent`: the ports whose
     messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for a bus
     adapter in a replay. `exchange`: the ports that are not simply read in every cycle; it makes the
-    task write its mailbox `<board>.exchange`.
+    task write its mailbox `<board>.exchange`. `reservation`: asked for in place of a priority.
     """
 
     task: str
@@ -56,6 +57,7 @@ class TaskWiring:
     entries: Entries | None = None
     transfer: BusTimes = field(default_factory=BusTimes)
     exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)
+    reservation: Reservation | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class ClockWiring:
     mailbox `ends_run` reports done or error, or if its writer, not lost, has written nothing for
     `silent`. In lockstep the clock is at most `history` ahead of a recorder, and a lost board
     rejoins `restart_ticks` after its loss. `on_loss`: the demand on the arm while a task is lost.
-    `keeps_awake`: no core sleeps while it is idle.
+    `keeps_awake`: no core sleeps while it is idle. `reservation`: as of a task.
     """
 
     lockstep: bool
@@ -99,3 +101,4 @@ class ClockWiring:
     keeps_awake: bool
     restart_ticks: int
     on_loss: Mapping[str, Demand]
+    reservation: Reservation | None = None

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from rack.backplane.process import DEADLINE, Reservation, take_core
 from rack.tools.lab.benches.network import Lab
 
 WAIT_S = 600.0
@@ -35,7 +36,17 @@ def obtains_fifo() -> bool:
     return True
 
 
+def obtains_deadlines() -> bool:
+    """Say whether this machine lets a process reserve processor time."""
+    pid = os.fork()
+    if not pid:
+        is_given = take_core(min(os.sched_getaffinity(0)), 0, Reservation(100_000, 10_000_000))
+        os._exit(is_given != DEADLINE)
+    return not os.waitpid(pid, 0)[1]
+
+
 needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
+needs_deadlines = pytest.mark.skipif(not obtains_deadlines(), reason="needs SCHED_DEADLINE")
 needs_two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 needs_lab = pytest.mark.skipif(bool(Lab.is_possible()), reason=Lab.is_possible())
 

@@ -212,12 +212,8 @@ class LayoutMaker:
         if writer.role == "planner":
             return longest_ns
         budget = self._config.board[writer.board].budget
-        parts = (
-            ()
-            if budget is None
-            else (budget.exchange_ms, budget.read_ms, budget.process_ms, budget.write_ms)
-        )
-        return min(round(sum(parts) * NS_PER_MS) or self._config.clock_ns, longest_ns)
+        busy_ms = 0.0 if budget is None else budget.cycle_ms
+        return min(round(busy_ms * NS_PER_MS) or self._config.clock_ns, longest_ns)
 
     def _task(self, place: TaskPlace) -> TaskSpec:
         board = self._config.board[place.board]

@@ -7,6 +7,7 @@ config.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from pydantic import ValidationError
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
-from rack.backplane.process import cores_kept_awake, mapped_and_locked
+from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
@@ -34,7 +35,7 @@ from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
-from rack.boards.config.timing import is_critical
+from rack.boards.config.timing import is_critical, reservation
 from rack.boards.config.toml import Tables, parse
 from rack.boards.config.wiring import TaskPorts, Wiring, reference
 from rack.boards.errors import ConfigError, LaunchError, Mistake
@@ -146,6 +147,7 @@ class Resolved:
             core=self._clock_core,
             priority=clock.priority,
             keeps_awake=clock.mode == "realtime" and clock.idle_cores == "awake",
+            reservation=reservation(self.config, self.config.timing.clock_ms, 1),
             restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
             on_loss={
                 task.name: demands[self.config.board[task.board].on_loss]
@@ -192,6 +194,7 @@ class Resolved:
         if (network := network_rules(self.config)) is not None:
             found += network.network_notes(self.config)
         found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
+        found += self._reserved(segment)
         found += self._unlocked(segment)
         if self.clock(None).keeps_awake:
             with cores_kept_awake() as refusal:
@@ -230,6 +233,23 @@ class Resolved:
             f"memory not locked for {', '.join(unlocked)}: {limit}; page faults may delay cycles."
             f" {PERMIT_LOCK}"
         ]
+
+    def _reserved(self, segment: Segment) -> Iterator[str]:
+        """Yield who has a reservation, on which cores, and who was refused one."""
+        asking = {
+            task.task: segment.block(task.task)
+            for task in self.tasks
+            if task.reservation is not None
+        }
+        given = [name for name, block in asking.items() if block[Block.PRIORITY] == DEADLINE]
+        pinned = [name for name in given if len(os.sched_getaffinity(asking[name][Block.PID])) == 1]
+        for what, names in (
+            ("earliest deadline first by SCHED_DEADLINE, on their cores", pinned),
+            ("earliest deadline first by SCHED_DEADLINE, on any core", set(given) - set(pinned)),
+            ("SCHED_DEADLINE refused, fixed priorities", asking.keys() - set(given)),
+        ):
+            if names:
+                yield f"{what}: {', '.join(sorted(names))}"
 
     def _refused(self, segment: Segment) -> str:
         if self.config.clock.mode == "lockstep":
@@ -328,6 +348,10 @@ class _Examined:
         critical_priority = 0
         if not is_executor and is_critical(self._config, layout, spec.board):
             critical_priority = board.priority
+        # Planners are below all reservations.
+        busy_ms = 0.0
+        if is_executor and board.budget is not None:
+            busy_ms = board.budget.cycle_ms
         return TaskWiring(
             task=ports.task,
             target=reference(self._config, ports.place),
@@ -343,6 +367,7 @@ class _Examined:
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
             exchange=exchanges(self._wiring, ports),
+            reservation=reservation(self._config, busy_ms, spec.every),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),

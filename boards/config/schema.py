@@ -18,6 +18,7 @@ from rack.backplane.layout import Role, Wake
 from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
+from rack.boards.config.scheduling import Scheduling
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
@@ -33,8 +34,6 @@ ANY_CORE = -1
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
-IdleCores = Literal["sleep", "awake"]
-OnNoRealtime = Literal["refuse", "warn"]
 OnLoss = Literal["hold", "stop", "brake"]
 Motion = Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do", "set"]
 Power = Literal["enable", "disable", "reset", "release"]
@@ -69,7 +68,7 @@ LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
 
-class ClockConfig(Table):
+class ClockConfig(Scheduling):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
     period_ms: float = Field(
@@ -99,7 +98,7 @@ class ClockConfig(Table):
             " signal: until the clock wakes them; poll: busy-wait"
         ),
     )
-    idle_cores: IdleCores = Field(
+    idle_cores: Literal["sleep", "awake"] = Field(
         "sleep",
         description=(
             "in real time, idle cores sleep or are held awake, which root alone may do; awake:"
@@ -110,10 +109,6 @@ class ClockConfig(Table):
     core: Core = Field(0, description="core of the system controller")
     priority: Priority = Field(
         0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling"
-    )
-    on_no_realtime: OnNoRealtime = Field(
-        "warn",
-        description="if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch",
     )
 
 
@@ -174,6 +169,11 @@ class BudgetConfig(Table):
         le=1e7,
         description="longest acceptable time for a new plan, ms; an upper limit on within_cycles",
     )
+
+    @property
+    def cycle_ms(self) -> float:
+        """Of a cycle of the executor."""
+        return self.exchange_ms + self.read_ms + self.process_ms + self.write_ms
 
 
 class TransferConfig(Table):

@@ -9,6 +9,8 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
+from rack.backplane.process import Reservation
+from rack.boards.config.scheduling import RESERVED
 from rack.boards.config.schema import (
     BoardConfig,
     BudgetConfig,
@@ -131,6 +133,15 @@ def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
 def tick_ns(config: RackConfig) -> int:
     """Return one tick of the wall clock, ns."""
     return round(config.clock_ns / config.clock.speed)
+
+
+def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
+    """Return what a board that computes so long in `every` ticks reserves of its processor, ms;
+    None: it asks for a priority."""
+    if config.clock.scheduler == "fixed-priority" or config.clock.mode == "lockstep" or not busy_ms:
+        return None
+    period_ns = every * tick_ns(config)
+    return Reservation(min(round(RESERVED * busy_ms * NS_PER_MS), period_ns), period_ns)
 
 
 def first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:

@@ -15,8 +15,8 @@ from rack.backplane.process import (
     cores_kept_awake,
     die_with_parent,
     name_process,
-    pin,
     set_priority,
+    take_core,
     take_processor,
 )
 from rack.backplane.segment import Segment
@@ -95,7 +95,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
             # Still at ordinary priority: a board that is restarted must not delay another board's
             # cycle.
             touch_memory()
-        block[Block.PRIORITY] = take_processor(spec)
+        block[Block.PRIORITY] = take_processor(spec, wiring.reservation)
         block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open()
@@ -112,8 +112,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
     """Take the processor and run the system clock."""
-    pin(wiring.core)
-    set_priority(wiring.priority)
+    take_core(wiring.core, wiring.priority, wiring.reservation)
     # Not touched: every board waits for the clock's start, and its lead over the grid has room for
     # a page fault.
     lock_memory()

@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.process import (
+    DEADLINE,
     GONE,
     STOPPED,
     WAITING,
+    Reservation,
     children_of,
     compute_until,
     cores_kept_awake,
@@ -31,10 +33,11 @@ from rack.backplane.process import (
     set_priority,
     start_time,
     state_of,
+    take_core,
     take_processor,
 )
 from tests.backplane.bus import task
-from tests.machine import needs_fifo
+from tests.machine import needs_deadlines, needs_fifo
 from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -209,6 +212,37 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
 
     assert exit_status(fork(take)) == 0
     assert exit_status(fork(be_ordinary)) == 0
+
+
+SCHED_DEADLINE = 6
+
+
+@needs_deadlines
+def test_a_reservation_is_that_of_the_process_itself_on_its_core_or_on_any() -> None:
+    cores = os.sched_getaffinity(0)
+
+    def take() -> bool:
+        assert take_core(min(cores), 5, Reservation(100_000, 10_000_000)) == DEADLINE
+        assert os.sched_getaffinity(0) in ({min(cores)}, cores)
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == SCHED_DEADLINE
+        # The kernel refuses a fork that would double what is reserved.
+        child = fork(lambda: os.sched_getscheduler(0) == os.SCHED_OTHER)
+        return exit_status(child) == 0 and set_priority(0)
+
+    assert exit_status(fork(take)) == 0
+
+
+@needs_fifo
+def test_without_the_reservation_a_process_is_pinned_and_has_its_priority() -> None:
+    core = max(os.sched_getaffinity(0))
+
+    def take() -> bool:
+        # More than there is: refused on every machine.
+        assert take_core(core, 5, Reservation(2_000_000, 1_000_000)) == 5
+        assert os.sched_getaffinity(0) == {core}
+        return os.sched_getscheduler(0) == os.SCHED_FIFO
+
+    assert exit_status(fork(take)) == 0
 
 
 def test_a_child_dies_with_its_parent() -> None:

@@ -18,6 +18,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from rack.backplane.process import DEADLINE
 from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
 from rack.tools.console.tables import console, decimal, grid
@@ -29,11 +30,18 @@ from rack.tools.live.snapshot import DEAD, GONE, LOST, Snapshot, TaskProgress, T
 if TYPE_CHECKING:
     from rich.live import Live
 
+
+def _scheduling(priority: int) -> str:
+    if priority == DEADLINE:
+        return "deadline"
+    return f"FIFO {priority}" if priority else "other"
+
+
 COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "slot": lambda row: str(row.slot),
     "task": lambda row: row.task,
     "core": lambda row: str(row.core),
-    "sched": lambda row: f"FIFO {row.priority}" if row.priority else "other",
+    "sched": lambda row: _scheduling(row.priority),
     "Hz": lambda row: f"{row.rate_hz:g}",
     "tick": lambda row: str(row.tick),
     "cycles": lambda row: str(row.cycles),

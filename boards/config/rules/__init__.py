@@ -51,6 +51,7 @@ RULES: tuple[Rule, ...] = (
     boards.clock,
     boards.rates,
     boards.polling,
+    boards.reservations,
     boards.schedule,
     mailboxes.strict,
     mailboxes.ports,
@@ -76,6 +77,7 @@ NEEDS: Mapping[Rule, set[str]] = {
     boards.clock: {"clock"},
     boards.rates: {"clock"},
     boards.polling: {"clock"},
+    boards.reservations: {"clock"},
     boards.schedule: {"clock"},
     levels.programs: {"robot", "scene", "task"},
 }

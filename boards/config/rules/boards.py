@@ -9,6 +9,7 @@ from graphlib import CycleError, TopologicalSorter
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import ClockError
+from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeated
 from rack.boards.config.schema import (
     LONGEST_EVERY,
@@ -218,6 +219,27 @@ def polling(wiring: Wiring) -> Iterator[Mistake]:
         if (board.wake or config.clock.wake) == "poll" and others:
             why = f"needs a core of its own, but shares core {board.core} with: {', '.join(others)}"
             yield Mistake(f"board.{name}.wake", "poll", why)
+
+
+def reservations(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that each board can reserve processor time, if the clock's scheduler needs that."""
+    config = wiring.config
+    if config.clock.scheduler == "fixed-priority":
+        return
+    if not config.timing.clock_ms:
+        yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice as much")
+    for name, board in config.board.items():
+        place = f"board.{name}"
+        if board.budget is None or not board.budget.cycle_ms:
+            yield Mistake(f"{place}.budget", None, "missing; the board reserves twice as much")
+        if (board.wake or config.clock.wake) == "poll":
+            yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up what it reserves")
+        if board.coupling == "tight":
+            why = "its planner's update takes the executor's priority, which reservations precede"
+            yield Mistake(f"{place}.coupling", "tight", why)
+        if board.executor == LAN_ADAPTER:
+            why = "not with a network, whose threads need the adapter's priority"
+            yield Mistake("clock.scheduler", config.clock.scheduler, why)
 
 
 def schedule(wiring: Wiring) -> Iterator[Mistake]:
