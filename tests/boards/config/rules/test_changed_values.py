@@ -26,7 +26,7 @@ RACKS = (
     "nasrem.toml",
     "cyclic.toml",
     "condor/condor.toml",
-    "brown/brown.toml",
+    "brown/one-machine.toml",
     "cell/puma.toml",
     "rccl/rccl.toml",
     "fig4.toml",
