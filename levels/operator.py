@@ -251,8 +251,12 @@ class Orders:
         if self.answer is Answer.TAKEN:
             self._answer(Answer.DONE)
 
+    def takes_time(self) -> None:
+        """Report that the setting just accepted is not done yet; `drives_done` reports that."""
+        self._tell(_Told(self.serial, Answer.TAKEN))
+
     def drives_done(self, serial: int) -> None:
-        """Report that a command to the arm's drives is done."""
+        """Report that a command to the arm's drives, or a setting that took time, is done."""
         self._tell(_Told(serial, Answer.DONE))
 
     def keeps(self, board: str) -> str:

@@ -27,7 +27,7 @@ OFTEN = (
     "nasrem --faults kill-each-board --seconds 9",
     "k1607",
     "nist-state-table --seconds 5",
-    "brown --seconds 4",
+    "brown/one-machine --seconds 4",
     "hic --seconds 6",
     "fig2 --seconds 1",
 )
@@ -59,7 +59,7 @@ RUNS = (
     "penn --faults client-dies --seconds 11",
     *(
         f"{system} --faults kill-each-board --seconds 5"
-        for system in ("brown", "rccl", "nist-state-table", "hic", "penn")
+        for system in ("brown/one-machine", "rccl", "nist-state-table", "hic", "penn")
     ),
     *(f"{system} --faults kill-each-board --seconds 5" for system in ("ibm", "chimera", "condor")),
     "configs/examples/own-level/metered.toml --seconds 2",

@@ -1,5 +1,5 @@
-"""The rack brown, with real processes in lockstep: a law is replaced in motion, the network fails,
-all repeats."""
+"""The rack brown on one machine, with real processes in lockstep: a law is replaced in motion, the
+general machine is silent, all repeats."""
 
 from __future__ import annotations
 
@@ -40,7 +40,11 @@ class Ran(NamedTuple):
 
 def ran(script: Path) -> Ran:
     with Rack(
-        load("brown", [f"name=test-brown-{os.getpid()}", "clock.mode=lockstep"], str(script))
+        load(
+            "brown/one-machine",
+            [f"name=test-brown-{os.getpid()}", "clock.mode=lockstep"],
+            str(script),
+        )
     ) as rack:
         digest = rack.run(SECONDS).digest
         names = "arm.status", "shoulder.status", "supervisor.status", "supervisor.command"

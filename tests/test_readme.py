@@ -33,7 +33,7 @@ ELSEWHERE = re.compile(
     r"<|\.toml|RUN|rack"
     r" (status|top|watch|mailbox|stop|pause|resume|set|record|replay|inject|estop|command|prompt)"
     r"|kill-each-board|--view|--step"
-    r"|bench (response|systems|lan|hand)|rack run cell|--lan|rack lan"
+    r"|bench (response|systems|lan|hand)|rack run (cell|brown)|--lan|rack lan"
 )
 """Commands that need a run, or a running rack, of another line: they have tests of their own in
 tests/tools."""

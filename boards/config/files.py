@@ -121,7 +121,7 @@ def anchor(tables: Tables, folder: Path) -> Tables:
         anchored["python_path"] = [str((folder / item).resolve()) for item in own]
     if adapters := _table(tables, "adapter"):
         anchored["adapter"] = {
-            name: _with_certificates(adapter, folder) for name, adapter in adapters.items()
+            name: _with_files(adapter, folder) for name, adapter in adapters.items()
         }
     if boards := _table(tables, "board"):
         anchored["board"] = {
@@ -137,10 +137,17 @@ def _table(tables: Tables, key: str) -> Tables:
     return found if isinstance(found, dict) else {}
 
 
-def _with_certificates(adapter: Any, folder: Path) -> Any:
-    """Return an adapter's table with the absolute path of its certificates, if it names any."""
-    own = adapter.get("certificates") if isinstance(adapter, dict) else None
-    return {**adapter, "certificates": str(folder / own)} if isinstance(own, str) else adapter
+def _with_files(adapter: Any, folder: Path) -> Any:
+    """Return an adapter's table with the absolute paths of its certificates, and of the configs of
+    other racks, if it names any."""
+    if not isinstance(adapter, dict):
+        return adapter
+    found = dict(adapter)
+    if isinstance(own := adapter.get("certificates"), str):
+        found["certificates"] = str(folder / own)
+    if isinstance(racks := adapter.get("launch"), list):
+        found["launch"] = [str(_find(str(rack), folder) or rack) for rack in racks]
+    return found
 
 
 def with_table_files(board: Any, path: Callable[[str], str]) -> Any:

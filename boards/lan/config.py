@@ -117,6 +117,13 @@ class LanTable(Table):
             " and lockstep waits for them"
         ),
     )
+    launch: tuple[str, ...] = Field(
+        (),
+        description=(
+            "configs of racks that `rack run` launches with this one, on this machine; each in a"
+            " process of its own"
+        ),
+    )
     permit: dict[PeerName, Rights] = Field(
         {},
         description=(

@@ -119,10 +119,13 @@ class ModifiedLaw:
     def obey(self, command: Message) -> str:
         """Put a modification in, or take it out, with the next sample; return why that is refused,
         empty: it is not."""
-        one = self._all.get(command.name)
-        is_on = command.goal == Goal.ON
+        return self.switch(command.name, command.goal == Goal.ON)
+
+    def switch(self, name: str, is_on: bool) -> str:
+        """Do the same for a name."""
+        one = self._all.get(name)
         if one is None:
-            return f"no modification '{command.name}'; permitted: {', '.join(self._all) or 'none'}"
+            return f"no modification '{name}'; permitted: {', '.join(self._all) or 'none'}"
         if is_on != one.is_on or one.name in self._failed:
             self._failed.pop(one.name, None)
             if is_on and one.modification.hook == Hook.INSTEAD:

@@ -119,7 +119,7 @@ def command(
       rack command nasrem task goto home --tick 4000 --wait --timeout 60
       rack command nasrem task goto home --lease
       rack command hardware servo enable --wait
-      rack command brown joints modify friction on --at 2.5
+      rack command brown modifications modify wrist.deadzone on --at 2.5
       rack command nist-state-table task table careful
       rack command nist-state-table elemental_move do pick block1 --wait
       rack command 192.168.1.5/cell task hold --certificates ~/cell

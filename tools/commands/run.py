@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -87,9 +88,10 @@ def run(
 ) -> None:
     """Run a rack until its task ends, and report on the run.
 
-    On a terminal a live table shows every task and what holds the rack; elsewhere one line a second
-    is printed. --json prints the report as one document. With --no-record it has the same keys;
-    those that need a recording are null.
+    A rack that names others in adapter.lan.launch launches them, too, each in a process of its own;
+    one that fails ends all. On a terminal a live table shows every task and what holds the rack;
+    elsewhere one line a second is printed. --json prints the report as one document. With
+    --no-record it has the same keys; those that need a recording are null.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
@@ -173,7 +175,15 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
         report = write_report(folder) if folder is not None else None
     except (Failure, OSError) as error:
         print(f"no report: {error}", file=sys.stderr)
-    print_report(*(report or (unrecorded(config, result.document()), result.text())), as_json)
-    if folder is not None and not as_json:
+    data, text = report or (unrecorded(config, result.document()), result.text())
+    if result.others:
+        data["others"] = [asdict(other) for other in result.others]
+    print_report(data, text, as_json)
+    if as_json:
+        return
+    if folder is not None:
         lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
         print(f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}")
+    for other in result.others:
+        ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
+        print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")

@@ -23,6 +23,7 @@ from rack.tools.faults.ending import Strike, strikes
 from rack.tools.live.display import Display
 from rack.tools.live.folder import EventLog
 from rack.tools.live.holds import Standstill
+from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import Queues
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.recording.recorder_process import RecorderProcess
@@ -48,7 +49,8 @@ class RunResult:
 
     `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
     `refused`: messages that full queues refused, by queue. `recording` is "complete", "none" (not
-    wanted), or what is missing; `rows_lost` are the rows missing, by task and by mailbox.
+    wanted), or what is missing; `rows_lost` are the rows missing, by task and by mailbox. `others`
+    are the racks launched with this one; `failed` says which of them failed.
     """
 
     rack: str
@@ -61,15 +63,20 @@ class RunResult:
     faults: tuple[Strike, ...]
     clock_offset_ns: int
     refused: dict[str, int]
+    others: tuple[OtherEnd, ...]
+    failed: str
 
     @property
     def worked(self) -> bool:
-        """Whether the run succeeded, and was recorded as wanted."""
-        return self.outcome.worked and self.recording in ("complete", "none")
+        """Whether the run succeeded, and was recorded as wanted; those of the others, too."""
+        is_recorded = self.recording in ("complete", "none")
+        return self.outcome.worked and is_recorded and not self.failed
 
     def failure(self) -> str:
         """Return in one line why the run did not succeed."""
         end = self.outcome
+        if self.failed:
+            return f"{self.rack}: {end.cause}; {self.failed}"
         if end.worked:
             return f"{self.rack}: {end.cause}, but not all is recorded: {self.recording}"
         return (
@@ -110,7 +117,8 @@ def run_rack(
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
     `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate` and
-    `entries` are as in `Rack`.
+    `entries` are as in `Rack`. Launch the racks that the config names: one that fails ends the run,
+    and a run that does not succeed ends them.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
     dies does not end the run, but files that cannot be written do: raises `Failure`.
@@ -120,10 +128,11 @@ def run_rack(
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to keep.
         with INTERRUPT.at_once():
+            others = stack.enter_context(OtherRacks(config, seconds, folder is not None))
             recorder = None if folder is None else RecorderProcess()
             if recorder is not None:
                 stack.callback(recorder.finish)
-            rack = stack.enter_context(Rack(config, log.add, share, crate, entries))
+            rack = stack.enter_context(Rack(config, log.add, share or bool(others), crate, entries))
             rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
                 try:
@@ -139,7 +148,7 @@ def run_rack(
         unfinished = NO_TIME.format(folder) if folder else ""
         with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             started = time.monotonic()
-            outcome = _watch(rack, seconds, display, log, news)
+            outcome = _watch(rack, seconds, display, log, news, others)
             wall_s = time.monotonic() - started
             segment = rack.segment
         _log_news(news, segment, log)
@@ -154,6 +163,7 @@ def run_rack(
                 folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0), outcome.ticks
             )
         _log_news(news, segment, log)
+        failed = others.finish()
         blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
         result = RunResult(
             rack=config.name,
@@ -169,6 +179,8 @@ def run_rack(
             faults=strikes(segment, config.joints),
             clock_offset_ns=time.time_ns() - time.monotonic_ns(),
             refused={queue.mailbox: queue.refused for queue in Queues(segment).look()},
+            others=others.ends(),
+            failed=failed,
         )
         log.end(result.document())
     return result
@@ -187,7 +199,12 @@ def _viewer(port: int) -> News:
 
 
 def _watch(
-    rack: Rack, seconds: float | None, display: Display, log: EventLog, news: list[News]
+    rack: Rack,
+    seconds: float | None,
+    display: Display,
+    log: EventLog,
+    news: list[News],
+    others: OtherRacks,
 ) -> Outcome:
     """Run the rack to its end; show it, and log what only the host side can see."""
     rack.start(seconds)
@@ -201,8 +218,12 @@ def _watch(
         _log_news(news, rack.segment, log)
         for event in standstill.look():
             log.add(event)
+        if why := others.failure():
+            rack.stop(why)
     if rack.outcome is None:
         raise Failure("the run ended without an outcome")
+    if not rack.outcome.worked:
+        others.stop()
     return rack.outcome
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from typing import ClassVar
 
 from pydantic import Field
 
@@ -44,17 +45,18 @@ class JointGateway(Executor):
         "statuses": Input(JOINT_STATUS, "below.status", many=True),
     }
     outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_STATUS, rests_on="statuses")}
-    params = GatewayParams
+    params: ClassVar[type[GatewayParams]] = GatewayParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(GatewayParams, context.params)
+        params = read_params(self.params, context.params)
         every = context.every
         # Ticks, in whole cycles.
         self._delay = -(-round(params.delay / context.tick_s) // every) * every
         self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
         self._missing = params.missing
-        self._period = max(pace.every for pace in context.above.values())
+        # Ticks from reference to reference; none if the level above is not of this rack.
+        self._period = max((pace.every for pace in context.above.values()), default=0)
         self._above = ", ".join(context.above)
         self._down: Link = deque()
         self._up: Link = deque()

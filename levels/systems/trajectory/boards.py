@@ -24,8 +24,10 @@ class JointBoards:
     there.
     """
 
-    def __init__(self, joints: Sequence[str]) -> None:
+    def __init__(self, joints: Sequence[str], handover: int = HANDOVER_CYCLES) -> None:
+        """Await the joints' answer to the first set point for `handover` cycles."""
         self._joints = joints
+        self._handover = handover
         self.in_step = False
         self.position = np.zeros(len(joints))  # (joints,), rad: where the boards hold the joints
         self._cycles = 0  # since they got into step
@@ -62,7 +64,7 @@ class JointBoards:
                 return f"{board}: no status for {silent} cycles"
             if status.stopped:
                 return f"{board}: {status.reason or 'it does not follow set points'}"
-            if self.in_step and status.holding and self._cycles > HANDOVER_CYCLES:
+            if self.in_step and status.holding and self._cycles > self._handover:
                 return f"{board}: it holds"
         return ""
 

@@ -10,6 +10,7 @@ from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.limits import Limits
+from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES
 from rack.levels.systems.trajectory.goal import ToolGoal, Unfit, WorldSight
 from rack.levels.systems.trajectory.legs import JointLeg, Leg, Times, ToolLeg
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
@@ -29,6 +30,12 @@ class TrajectoryParams(Table):
         0.25, description="time constant with which a live goal follows its body, s"
     )
     blind: Positive = Field(0.3, description="time for which a body's motion is extrapolated, s")
+    handover: int = Field(
+        HANDOVER_CYCLES,
+        ge=1,
+        le=1000,
+        description="cycles until statuses must show that the first set point is followed",
+    )
 
 
 class MotionTools(NamedTuple):

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rack.boards.config import load, rack_timing, wire
+from rack.boards.config import names as bundled
 from rack.boards.config.files import CONFIGS, read
 from rack.boards.config.layout import obtained_core
 from rack.tools.console.answer import Failure
@@ -21,7 +22,7 @@ from rack.tools.lab.benches.observed import Runs, missed_share, record
 from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, prediction
 from rack.tools.lab.benches.systems.hold import held, hold_for
 from rack.tools.lab.benches.systems.kills import kill_each, kills_s
-from rack.tools.lab.benches.systems.motion import LONGEST_S, PosesBench, poses_config
+from rack.tools.lab.benches.systems.motion import ALONE, LONGEST_S, PosesBench, poses_config
 from rack.tools.lab.benches.systems.realtime import (
     ages_ms,
     board_loads,
@@ -46,10 +47,12 @@ def systems() -> list[str]:
     """Return the bundled racks to compare: the default rack, and those that have a folder of their
     own.
 
-    Racks of a network are not among them: they need others to work with.
+    Racks of a network are not among them: they need others to work with. Of a system that is one
+    rack, too, that is compared.
     """
     found = sorted(path for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)
-    return ["nasrem", *(path.stem for path in found if "adapter" not in read(path))]
+    names = [path.stem if "adapter" not in read(path) else f"{path.stem}/{ALONE}" for path in found]
+    return ["nasrem", *(name for name in names if name in bundled())]
 
 
 def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:

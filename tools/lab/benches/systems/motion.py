@@ -30,6 +30,8 @@ from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import Deed, observe, record
 from rack.tools.lab.benches.systems.hold import hold_paths
 
+ALONE = "one-machine"
+"""The config of a system in one rack, where its main one needs other racks."""
 LONGEST_S = 12.0
 """Simulated time of the run in which the motion must end."""
 REST_RAD_S = 1e-3
@@ -121,7 +123,7 @@ def poses_config(name: str) -> Path | None:
     if own is None:
         return None
     motion = "three-poses.toml"
-    if own.stem != own.parent.name:
+    if own.stem not in (own.parent.name, ALONE):
         motion = f"{own.stem}-{motion}"
     return file_at(own.parent / motion)
 

@@ -118,7 +118,7 @@ PARTITION = Experiment(
 def system_experiment(name: str) -> Experiment[Systems]:
     """Return the figures of one rack, in lockstep and in real time."""
     return Experiment(
-        f"system-{name}",
+        f"system-{name.replace('/', '-')}",
         f"{name} next to the other systems",
         SYSTEM_LASTS_S + POSES_LAST_S * (poses_config(name) is not None),
         Systems,

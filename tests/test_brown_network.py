@@ -1,0 +1,298 @@
+"""The rack brown as two racks on a network: one command launches both; modifications travel from
+the general machine to the servo rack; what this one does while the cable is out."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import SHM_FOLDER, Segment
+from rack.boards.config import CONFIGS, load, resolve
+from rack.boards.errors import ConfigError
+from rack.levels.operator import Answer
+from rack.tools.lab.benches.network import Lab
+from tests import golden
+from tests.boards.lan.racks import RackProcess, ended, running, watch
+from tests.machine import needs_fifo, needs_lab
+from tests.processes import RACK, wait_until
+from tests.snapshots import Snapshots
+from tests.test_cell_page import ONE_MACHINE, OWN_MEMORY
+
+SNAPSHOTS = Snapshots(__file__)
+LINK_OUT = """
+[[fault]]
+kind = "mute"
+board = "lan"
+mailbox = "lan.reference"
+at = 1.5
+for = 0.5
+"""
+"""Twenty-five references of the general machine do not come."""
+HELD = "no reference from 'lan': held after 5 extrapolated"
+MOVING_RAD_S = 0.05
+MOST_S = 120.0
+"""Longest time for the launch of both racks, or for a whole run, on a busy machine."""
+
+
+def configs(name: str, folder: Path, more: str = "") -> list[Path]:
+    """Write the configs of servo rack, with `more`, and general machine, under names of their
+    own."""
+    found = []
+    for file in (CONFIGS / "brown" / "servo.toml", CONFIGS / "brown" / "brown.toml"):
+        text = file.read_text().replace('"../', '"')
+        text = text.replace("peer_brown", f"peer_{name.replace('-', '_')}")
+        found.append(folder / file.name)
+        found[-1].write_text(re.sub(r"\bbrown\b(?!\.toml)", name, text))
+    found[0].write_text(found[0].read_text() + more)
+    return found
+
+
+class Ran(NamedTuple):
+    """A run of both racks: digests of servo rack and general machine, and mailboxes."""
+
+    digests: list[str]
+    boxes: dict[str, np.ndarray]
+    answers: list[tuple[int, int, int]]
+    """Of the general machine to its operator: tick, command, answer."""
+
+    def values(self, mailbox: str, field: str, first: int, last: int) -> np.ndarray:
+        """Return a field of the servo rack's messages from one tick to another."""
+        rows = self.boxes[mailbox]
+        return np.asarray(rows["message"][field][(rows["tick"] >= first) & (rows["tick"] <= last)])
+
+    def speed(self, first: int, last: int) -> float:
+        """Return the greatest speed of a joint wanted from one tick to another, rad/s."""
+        return float(np.abs(self.values("arm.status", "target_velocity", first, last)).max())
+
+
+def ran(name: str, folder: Path) -> Ran:
+    racks = [load(path, ["clock.mode=lockstep"]) for path in configs(name, folder, LINK_OUT)]
+    with running(racks) as (servo, general):
+        for rack in (servo, general):
+            rack.start(3.0)
+        watch([servo, general])
+        found = [ended(servo), ended(general)]
+        names = "arm.status", "shoulder.status", "supervisor.status", "supervisor.command"
+        boxes = {box: MailboxRing(servo.segment, box).drain().rows for box in names}
+        rows = MailboxRing(general.segment, "modifications.status").drain().rows
+    assert [one.outcome.cause for one in found] == ["time over"] * 2, [one.texts for one in found]
+    shown = zip(rows["tick"], rows["message"]["order"], rows["message"]["answer"], strict=True)
+    answers = [(int(tick), int(order), int(answer)) for tick, order, answer in shown]
+    return Ran([one.outcome.digest for one in found], boxes, answers)
+
+
+@pytest.fixture(scope="module")
+def name() -> str:
+    """The name of both runs: digests contain it."""
+    return "test-brown-network"
+
+
+@pytest.fixture(scope="module")
+def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    return ran(name, tmp_path_factory.mktemp("brown"))
+
+
+@pytest.mark.slow
+def test_a_modification_of_the_general_machine_is_put_in_over_the_network_without_a_step(
+    run: Ran,
+) -> None:
+    # Commanded at 1.2 s; on each of its ways it waits for a cycle of 20 ms and two of 10 ms.
+    reasons = run.values("shoulder.status", "reason", 1200, 1300)
+    first = int(np.argmax(reasons == b"modified by pd"))
+    assert 0 < first <= 60
+    assert run.speed(1200, 1300) > MOVING_RAD_S
+    torque = run.values("shoulder.status", "torque", 1200 + first - 1, 1200 + first)
+    np.testing.assert_allclose(torque[1], torque[0], atol=1e-12)
+    # The general machine's ticks are of 5 ms.
+    begun, done = (
+        next(5 * tick for tick, order, answer in run.answers if (order, answer) == (1, wanted))
+        for wanted in (Answer.TAKEN, Answer.DONE)
+    )
+    assert begun < 1200 + first < done <= 1300, "done is what the boards have answered"
+
+
+@pytest.mark.slow
+def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_on(run: Ran) -> None:
+    status = run.boxes["supervisor.status"]
+    held = status["tick"][status["message"]["reason"] == HELD.encode()]
+    # The last reference before the fault, five made up, and the time of the link.
+    assert 1600 < held[0] < 1700
+    after = held[-1]
+    assert run.speed(1500, 1500) > MOVING_RAD_S
+    assert run.speed(after, after) < 1e-3, "it rests"
+    assert run.speed(after, 2999) > MOVING_RAD_S, "it moves again"
+    assert not run.values("arm.status", "braked", 1200, 2999).any()
+    assert run.values("shoulder.status", "reason", 2000, 2000).tolist() == [b"modified by pd"]
+
+
+@pytest.mark.slow
+def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> None:
+    assert ran(name, tmp_path).digests == run.digests
+
+
+@pytest.mark.parametrize(
+    ("known", "why"),
+    [
+        (["x." + "y" * 38], "should have at most 39 characters"),
+        (["x.y"] * 9, "should have at most 8 items"),
+        (["notch"], "should match pattern"),
+    ],
+)
+def test_names_of_modifications_that_no_message_holds_are_refused(
+    known: list[str], why: str
+) -> None:
+    with pytest.raises(ConfigError, match=why):
+        resolve(load("brown", [f"board.modifications.params.known={known}", "command=[]"]))
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+@needs_lab
+def test_one_command_runs_both_to_the_end_of_the_program(tmp_path: Path) -> None:
+    command = [*RACK, "run", "brown", "--lockstep", "--no-record", "--json"]
+    done = subprocess.run(
+        [*ONE_MACHINE, *OWN_MEMORY, "sh", "-c", 'ip link set lo up; exec "$@"', "sh", *command],
+        cwd=tmp_path,
+        timeout=MOST_S,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    general = json.loads(done.stdout)
+    (servo,) = general["others"]
+    assert (general["outcome"]["cause"], servo["cause"]) == ("task done", "task done")
+    if golden.machine()["libm"] == golden.read()["machine"]["libm"]:
+        digests = {report["rack"]: report["digest"] for report in (general, servo)}
+        SNAPSHOTS.check("lockstep", digests)
+
+
+class Launched:
+    """`rack run` of both racks in lockstep, until the general machine runs."""
+
+    def __init__(self, folder: Path, name: str, *words: str) -> None:
+        _, general = configs(name, folder)
+        command = [*RACK, "run", str(general), "--lockstep", "--no-record", *words]
+        self.name = name
+        self.process = subprocess.Popen(
+            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def await_tick(self) -> None:
+        """Wait until the servo rack is moving on."""
+        names = [f"nasrem-rack.{self.name}{rack}" for rack in ("", "-servo")]
+        wait_until(lambda: all((SHM_FOLDER / one).exists() for one in names), MOST_S)
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if "tick" in line and "command" in line:
+                return
+        raise AssertionError(self.process.communicate())
+
+    def await_end(self) -> tuple[int, str]:
+        """Return its exit status and last words, once nothing of both racks is left."""
+        _, said = self.process.communicate(timeout=MOST_S)
+        left = [path.name for path in SHM_FOLDER.glob(f"*{self.name}*")]
+        assert not left
+        return self.process.returncode, said
+
+
+@contextmanager
+def launched(folder: Path, name: str, *words: str) -> Iterator[Launched]:
+    """Launch both; should they still run at the end, both are killed."""
+    both = Launched(folder, name, *words)
+    try:
+        yield both
+    finally:
+        both.process.kill()
+        both.process.communicate()
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+def test_an_interrupt_ends_both_and_leaves_nothing(rack_name: str, tmp_path: Path) -> None:
+    with launched(tmp_path, rack_name) as both:
+        both.await_tick()
+        both.process.send_signal(signal.SIGINT)
+        assert both.await_end()[0] == 128 + signal.SIGINT
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+def test_a_rack_that_cannot_be_launched_ends_the_other_with_status_1(
+    rack_name: str, tmp_path: Path
+) -> None:
+    absent = 'adapter.lan.launch=["none/none.toml"]'
+    with launched(tmp_path, rack_name, "--set", absent) as both:
+        status, said = both.await_end()
+    assert status == 1
+    assert 'config = "none/none.toml": no such file' in said
+    assert said.splitlines()[-1].endswith("stopped; none/none.toml: exit status 2")
+
+
+class OnMachine:
+    """One of the two racks, in real time on a machine of the lab."""
+
+    def __init__(self, config: Path, popen: Callable[..., Any], *settings: str) -> None:
+        self.process = RackProcess(
+            config, None, "adapter.lan.insecure=true", *settings, popen=popen
+        )
+        self.process.await_event("start")
+        self.segment = Segment.attach(load(config).name)
+
+    def peek(self, mailbox: str) -> Any:
+        """Return the newest message of a mailbox."""
+        return open_observer(self.segment, mailbox).peek().value
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the arm is to move."""
+        return bool(np.abs(self.peek("arm.status").target_velocity).max() > MOVING_RAD_S)
+
+    def end(self) -> None:
+        """Stop it, and let go of its memory."""
+        self.process.send(signal.SIGTERM)
+        self.process.outcome()
+        self.segment.close()
+
+
+@pytest.mark.alone
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+@needs_lab
+@needs_fifo
+def test_with_the_cable_pulled_the_arm_holds_and_goes_on_when_it_is_back(
+    rack_name: str, tmp_path: Path
+) -> None:
+    servo_config, general_config = configs(rack_name, tmp_path)
+    with Lab(2) as lab:
+        endpoint = f"tcp/{lab.address(0)}:7447"
+        nobody = "adapter.lan.permit.operator=[]"
+        listen, connect = (f'adapter.lan.{key}=["{endpoint}"]' for key in ("listen", "connect"))
+        servo = OnMachine(servo_config, partial(lab.popen, 0), nobody, listen)
+        general = OnMachine(general_config, partial(lab.popen, 1), nobody, connect)
+        wait_until(lambda: servo.is_moving)
+        lab.unplug(1)
+        wait_until(lambda: servo.peek("supervisor.status").reason == HELD)
+        for one in (servo, general):
+            one.process.await_event("detection", "is lost")
+        wait_until(lambda: not servo.is_moving)
+        assert not servo.peek("arm.status").braked
+        lab.plug(1)
+        wait_until(lambda: servo.is_moving)
+        servo.process.await_event("recovery", "is back")
+        done = general.peek("trajectory.status").done
+        wait_until(lambda: general.peek("trajectory.status").done > done)
+        general.end()
+        servo.end()

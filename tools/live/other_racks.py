@@ -1,0 +1,123 @@
+"""The racks that `adapter.lan.launch` names: a run launches them with its own, each by `rack run`
+in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from rack.backplane.process import die_with_parent, how_ended
+from rack.boards.config.schema import RackConfig
+
+END_S = 60.0
+"""Longest wait for their end after this rack's own: they report on their runs, too."""
+STOP_S = 3.0
+"""Longest wait for one that is stopped."""
+
+
+@dataclass(frozen=True)
+class OtherEnd:
+    """How another rack has ended; `folder` is that of its run, None: it was not recorded."""
+
+    rack: str
+    cause: str
+    ticks: int
+    digest: str
+    folder: str | None
+
+
+class Launched(NamedTuple):
+    """Another rack. Its report is in a file in memory: nobody would empty a pipe."""
+
+    config: str
+    process: subprocess.Popen[bytes]
+    report: int
+
+
+class OtherRacks:
+    """Other racks while this one runs. Whoever leaves the context leaves none of them."""
+
+    def __init__(self, config: RackConfig, seconds: float | None, is_recorded: bool) -> None:
+        """Launch those that a config names, with its clock, and for as long."""
+        lan = config.adapter.lan
+        options = ["--json", "--share", f"--speed={config.clock.speed}"]
+        options += ["--lockstep"] if config.clock.mode == "lockstep" else []
+        options += [] if seconds is None else [f"--seconds={seconds}"]
+        options += [] if is_recorded else ["--no-record"]
+        self._is_stopped = False
+        self._failed = ""
+        self._racks: list[Launched] = []
+        for other in () if lan is None else lan.launch:
+            report = os.memfd_create("report")
+            # A group of its own: Ctrl-C would reach it twice, from the terminal and from here.
+            process = subprocess.Popen(
+                [sys.executable, "-m", "rack.tools.cli", "run", other, *options],
+                stdin=subprocess.DEVNULL,
+                stdout=report,
+                process_group=0,
+                preexec_fn=partial(die_with_parent, os.getpid()),
+            )
+            self._racks.append(Launched(other, process, report))
+
+    def __len__(self) -> int:
+        return len(self._racks)
+
+    def failure(self) -> str:
+        """Return which of them have failed so far, and how; empty: none."""
+        # Those that have been stopped end by a signal: that is no failure.
+        if not self._is_stopped:
+            failed = [rack for rack in self._racks if rack.process.poll()]
+            self._failed = "; ".join(
+                f"{rack.config}: {how_ended(rack.process.returncode)}" for rack in failed
+            )
+        return self._failed
+
+    def stop(self) -> None:
+        """Let all of them end."""
+        self._is_stopped = True
+        for rack in self._racks:
+            rack.process.terminate()
+
+    def finish(self) -> str:
+        """Wait for their end; return what `failure` does."""
+        deadline = time.monotonic() + (STOP_S if self._is_stopped else END_S)
+        late = []
+        for rack in self._racks:
+            try:
+                rack.process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                late.append(f"{rack.config}: still running")
+        return "; ".join(late) or self.failure()
+
+    def ends(self) -> tuple[OtherEnd, ...]:
+        """Return how those have ended that ran."""
+        found = []
+        for rack in self._racks:
+            text = os.pread(rack.report, os.fstat(rack.report).st_size, 0)
+            report = json.loads(text) if text else {}
+            if outcome := report.get("outcome"):
+                end = outcome["cause"], outcome["ticks"], outcome["digest"]
+                found.append(OtherEnd(report["rack"], *end, report["folder"]))
+        return tuple(found)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+        self.finish()
+        for rack in self._racks:
+            rack.process.kill()
+            os.close(rack.report)
