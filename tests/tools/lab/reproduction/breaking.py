@@ -63,6 +63,6 @@ class BreakingWorkshop(Workshop):
         return super().run(label, config, min(seconds or self._most_s, self._most_s))
 
     def _written(self, name: str, text: str) -> str:
-        path = self.folder / f"broken-{name}.toml"
+        path = self.folder / f"broken-{name.replace('/', '-')}.toml"
         path.write_text(text, encoding="utf-8")
         return str(path)

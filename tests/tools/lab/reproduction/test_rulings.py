@@ -296,11 +296,11 @@ ROWS = (
         judge=by_one_system("condor"),
     ),
     *(
-        Breaking(name, f"{box}, a second", {name: LOST.format(board=lost)})
-        for name, box, lost in (
-            ("rccl", "joint1.command", "joint1"),
-            ("brown", "supervisor.command", "supervisor"),
-            ("hic", "fingertip.command", "fingertip"),
+        Breaking(claim, f"{box}, a second", {name: LOST.format(board=lost)})
+        for claim, name, box, lost in (
+            ("rccl", "rccl", "joint1.command", "joint1"),
+            ("brown", "brown/one-machine", "supervisor.command", "supervisor"),
+            ("hic", "hic", "fingertip.command", "fingertip"),
         )
     ),
     *(
