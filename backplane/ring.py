@@ -23,7 +23,8 @@ class Ring:
     written.
 
     `oldest` returns the number of the oldest record in `memory`, where that is a mirror without the
-    others.
+    others. The first `before` records were written in a run that this one continues: they are not
+    read.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class Ring:
         dtype: np.dtype,
         head: memoryview,
         oldest: Callable[[], int] = lambda: 0,
+        before: int = 0,
     ) -> None:
         # As plain bytes: copying by field would skip the padding, and checksums would not match.
         self._rows = np.frombuffer(memory, dtype=f"V{dtype.itemsize}")
@@ -39,7 +41,7 @@ class Ring:
         self._head = head
         self._oldest = oldest
         self._depth = len(self._rows)
-        self._taken = 0
+        self.before = self._taken = before
 
     @property
     def waiting(self) -> int:

@@ -33,7 +33,7 @@ from rack.backplane.process import is_alive, start_time
 from rack.backplane.words import Block, Box, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 14
+VERSION = 15
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""

@@ -84,13 +84,14 @@ class TraceWriter:
 def trace_ring(segment: Segment, task: str) -> Ring:
     """Return the reading end of a task's trace ring; its rows are of dtype `RECORD`."""
     spec = segment.layout.task(task)
-    head = segment.block(task)[Block.TRACE_HEAD : Block.TRACE_HEAD + 1]
+    block = segment.block(task)
     memory = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
     return Ring(
         memory,
         RECORD,
-        head,
+        block[Block.TRACE_HEAD : Block.TRACE_HEAD + 1],
         partial(segment.oldest, segment.map.blocks[task] + 8 * Block.TRACE_HEAD),
+        block[Block.TRACE_FIRST],
     )
 
 

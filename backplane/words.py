@@ -133,6 +133,9 @@ class Block(IntEnum):
     CLOCK_SKIPPED = 25  # ticks skipped by the clock that this task has reported
     # of a host board in lockstep: tick until which its program waits; 0: a message has come
     WAITS_UNTIL = 26
+    # 1 + tick before which the task is to save its state; 0: it is not, or has. Set by the clock
+    SAVE = 27
+    TRACE_FIRST = 28  # trace records before this run, which continues another; written by the Rack
 
 
 class TaskState(IntEnum):
@@ -169,6 +172,7 @@ class Box(IntEnum):
     KEPT = 10  # the same, for racks that go on: its information does not grow too old. See `switch`
     # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
     POSITION = 11
+    FIRST = 12  # serial of the newest message before this run: see `Block.TRACE_FIRST`
 
 
 class Slot(IntEnum):

@@ -36,7 +36,8 @@ class MailboxRing(Ring):
         self._box = segment.box(name)
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
         oldest = partial(segment.oldest, address + 8 * Box.HEAD)
-        super().__init__(memory, row_dtype(spec), self._box[Box.HEAD : Box.HEAD + 1], oldest)
+        head = self._box[Box.HEAD : Box.HEAD + 1]
+        super().__init__(memory, row_dtype(spec), head, oldest, self._box[Box.FIRST])
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def drain(self) -> Drained:

@@ -20,7 +20,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, View
 from rack.tools.live.folder import folder_of
 from rack.tools.live.watched import WatchedRack, watched
-from rack.tools.recording.occasions import Keeping
+from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes
@@ -141,7 +141,7 @@ def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None =
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).write_text(segment.config)
     view = None
-    if port is not None or Keeping.of(segment) is None:
+    if port is not None or Retention.of(segment) is None:
         view = SafeSink(lambda: ViewSink(segment, folder, port), notes.append)
     return Recorder(segment, folder, view, rack.refresh if segment.is_mirror else None)
 

@@ -233,12 +233,12 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     Return "complete" or what is missing, and the rows missing by task and by mailbox.
     """
     # Here, not above: its libraries would delay the launch.
-    from rack.tools.recording.occasions import Keeping
+    from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recording import Recording
     from rack.tools.recording.run_files import tally
 
     try:
-        keeping = Keeping.of(segment)
+        keeping = Retention.of(segment)
         # A run that was interrupted has no time to make tables of what a flight recorder kept.
         left = None if keeping is None else tally(folder)
         if keeping is None or left is None:

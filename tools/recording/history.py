@@ -213,13 +213,17 @@ def first_difference(one: Recording, other: Recording) -> Difference | None:
 
 
 def _difference(one: Recording, other: Recording, mailbox: str) -> Difference | None:
+    both = (one, other)
+    serials = [recording.signal(mailbox, "serial") for recording in both]
+    # One that continues another run begins later.
+    begins = [int(np.searchsorted(each, max(s[0] for s in serials))) for each in serials]
     # The chain covers serial, tick and content of a message and of all before it.
-    chains = [recording.signal(mailbox, "chain") for recording in (one, other)]
+    chains = [run.signal(mailbox, "chain")[at:] for run, at in zip(both, begins, strict=True)]
     length = min(len(chain) for chain in chains)
     differs = np.flatnonzero(chains[0][:length] != chains[1][:length])
     if not len(differs):
         return None
-    first = differs[0]
-    return Difference(
-        int(min(recording.signal(mailbox, "tick")[first] for recording in (one, other))), mailbox
-    )
+    ticks = [
+        run.signal(mailbox, "tick")[at + differs[0]] for run, at in zip(both, begins, strict=True)
+    ]
+    return Difference(int(min(ticks)), mailbox)

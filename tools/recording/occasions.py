@@ -27,7 +27,7 @@ class TickRange(NamedTuple):
     last: int
 
 
-class Keeping(NamedTuple):
+class Retention(NamedTuple):
     """What `[record]` wants to be kept, in ticks."""
 
     keep: int

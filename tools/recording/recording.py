@@ -253,14 +253,14 @@ class Recording:
             lost = self.lost[name]
             if name in self.cycles:
                 rows = len(self.cycles[name])
-                at = lost + rows
+                at = ring.before + lost + rows
             else:
                 serials = self.signal(name, "serial")
                 rows = len(serials)
-                at = int(serials[-1]) if rows else 0
+                at = int(serials[-1]) if rows else ring.before
             # Messages that every reader rejects are absent and not lost; those lost last are
             # overwritten.
-            found[name] = Missing.of(ring, at, min(lost, at - rows))
+            found[name] = Missing.of(ring, at, min(lost, at - ring.before - rows))
         return {name: missing for name, missing in found.items() if missing.rows}
 
     @cached_property

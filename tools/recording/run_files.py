@@ -4,6 +4,7 @@ later from its spool."""
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from shutil import copyfile, rmtree
@@ -48,7 +49,7 @@ class Missing(NamedTuple):
         """Return it for the ring of a rack that has ended, from which `taken` records were taken,
         and `lost` of them were not."""
         ring.resume(taken)
-        written = taken + ring.waiting
+        written = taken - ring.before + ring.waiting
         left, overwritten = ring.drain()
         return cls(lost + overwritten + len(left), written)
 
@@ -57,13 +58,14 @@ class Tally:
     """What a recorder has taken of a rack's rings, or left of it on disk.
 
     By ring, `lost` counts the rows lost, `rows` those taken, and `taken` is the number of its last
-    record so far. `kept` holds the ticks of the stretches kept, [first, end), of a flight recorder.
+    record so far, from `before` on. `kept` holds the ticks of the stretches kept, [first, end), of a
+    flight recorder.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:
         self.tasks = [task.name for task in layout.tasks]
         self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
-        self.taken = dict(self.lost)
+        self.taken = {**self.lost, **(before or {})}
         self.rows = dict(self.lost)
         self.kept: list[tuple[int, int]] = []
         self.number = 0
@@ -130,8 +132,15 @@ class RunFiles(Tally):
     `gaps` holds where rows were lost: ring, first and last tick without rows.
     """
 
-    def __init__(self, folder: Path, layout: Layout, launch: Launch, suffix: str = "") -> None:
-        super().__init__(layout)
+    def __init__(
+        self,
+        folder: Path,
+        layout: Layout,
+        launch: Launch,
+        suffix: str = "",
+        before: Mapping[str, int] | None = None,
+    ) -> None:
+        super().__init__(layout, before)
         self.gaps: list[tuple[str, int, int]] = []
         self._reached = dict.fromkeys(self.lost, (-1, 0))
         """Of each ring the newest tick, and the rows lost by then."""

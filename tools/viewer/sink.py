@@ -30,7 +30,7 @@ from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WREN
 from rack.levels.systems.hand.messages import GRASP_STATUS, HAND_STATUS, STREAMED_DOWN
 from rack.levels.systems.joint_boards.messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
 from rack.levels.systems.trajectory.messages import MOTION_STATUS
-from rack.tools.recording.occasions import Keeping
+from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, Marks, PlannedPath, Poses, Pushes, write_geometry
 from rack.tools.viewer.curves import Fields, Joints
@@ -173,7 +173,7 @@ class ViewSink:
             RackViews(layout, ran.config, ran.cell).everything(), live=port is not None
         )
         run = f"{folder.name}-{launch.created_ns}"
-        file = next_file(folder) if Keeping.of(segment) is None else None
+        file = next_file(folder) if Retention.of(segment) is None else None
         recording = new_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)

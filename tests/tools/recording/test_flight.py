@@ -21,7 +21,7 @@ from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording.history import first_difference
-from rack.tools.recording.occasions import Keeping
+from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
@@ -156,7 +156,7 @@ def fly(rack: Rack, folder: Path, seconds: float) -> Recorder:
 
 def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
     """Return the rings of which rows lack, and the ticks that had to be kept and are not there."""
-    left, keeping = tally(folder), Keeping.of(segment)
+    left, keeping = tally(folder), Retention.of(segment)
     assert left is not None
     assert keeping is not None
     absent = keeping.absent(segment, left.kept, segment.words[System.STOP_TICK])

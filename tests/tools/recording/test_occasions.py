@@ -12,7 +12,7 @@ from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.recording.occasions import Keeping, Occasions
+from rack.tools.recording.occasions import Retention, Occasions
 from rack.tools.recording.spool import rings
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
@@ -52,7 +52,7 @@ def test_misses_holds_and_all_alarms_but_commands_are_occasions(
             bell.ring(tick, alarm)
         assert list(occasions.alarms()) == [7, 9]
         assert list(occasions.alarms()) == []
-        keeping = Keeping.of(segment)
+        keeping = Retention.of(segment)
         assert keeping is not None
         assert keeping.around(100) == (0, 900)
         assert keeping.around(1000) == (600, 1800)

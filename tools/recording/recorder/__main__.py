@@ -37,7 +37,7 @@ def main() -> None:
     launcher = os.getppid()
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
-    from rack.tools.recording.occasions import Keeping
+    from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
     from rack.tools.recording.recorder_process import UNWRITABLE
 
@@ -53,7 +53,7 @@ def main() -> None:
     in_background = port is None and not segment.words[System.LOCKSTEP]
     view = None
     # A flight recorder writes no file of the viewer; `rack replay` makes it of what is kept.
-    if port is not None or Keeping.of(segment) is None:
+    if port is not None or Retention.of(segment) is None:
         view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
     try:
         with Recorder(segment, Path(folder), view) as recorder:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.tools.recording.occasions import Keeping, Occasions, TickRange
+from rack.tools.recording.occasions import Retention, Occasions, TickRange
 from rack.tools.recording.run_files import Tally
 from rack.tools.recording.spool import Spool, StretchHead
 
@@ -33,7 +33,7 @@ class FlightRecorder:
     restarts its recorder three times at the most.
     """
 
-    def __init__(self, segment: Segment, keeping: Keeping, spool: Spool, tally: Tally) -> None:
+    def __init__(self, segment: Segment, retention: Retention, spool: Spool, tally: Tally) -> None:
         self._keeping = keeping
         self._spool = spool
         self._tally = tally

@@ -17,7 +17,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
-from rack.tools.recording.occasions import Keeping
+from rack.tools.recording.occasions import Retention
 from rack.tools.recording.recorder.flight import FlightRecorder
 from rack.tools.recording.run_files import RunFiles, Tally
 from rack.tools.recording.spool import Frame, Spool, rings
@@ -144,15 +144,18 @@ class Recorder:
         # The spool first: it fails where another recorder is running, and leaves that one's files
         # alone.
         self._spool = Spool(folder, layout, segment.launch)
-        keeping = Keeping.of(segment)
-        self._files = RunFiles(folder, layout, segment.launch) if keeping is None else None
-        self._tally = self._files or Tally(layout)
+        keeping = Retention.of(segment)
+        self._rings = rings(segment)
+        before = {name: ring.before for name, ring in self._rings.items()}
+        self._files = None
+        if keeping is None:
+            self._files = RunFiles(folder, layout, segment.launch, before=before)
+        self._tally = self._files or Tally(layout, before)
         for found in self._spool.resume():
             self._tally.take(found)
         self._flight = (
             None if keeping is None else FlightRecorder(segment, keeping, self._spool, self._tally)
         )
-        self._rings = rings(segment)
         for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)
         # Lockstep has no deadlines that the machine could break; the cores of another machine are
