@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.process import Reservation
 from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
+KEEPING = "rack.boards.checkpoint.keeping"
+"""What takes checkpoints, by name: a rack that takes none does not load it."""
 Source = str | Mapping[str, str]
 """What a port reads: a mailbox, or mailboxes by board."""
 
@@ -32,6 +35,24 @@ class BusTimes:
     write_ns: int = 0
     exchange_ns: int = 0
     update_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Checkpoints of a run: into which folder, every how many ticks; 0: none.
+
+    `origin`: the file of the one that the run continues from. Classes in it are those of the rack,
+    or of modules in `packages`. It has the first `faults` and `commands` of the config in its
+    tables; `losses` are the boards that were lost before it, and when.
+    """
+
+    folder: Path = Path()
+    every: int = 0
+    origin: Path | None = None
+    packages: tuple[Path, ...] = ()
+    faults: int = 0
+    commands: int = 0
+    losses: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,6 +79,8 @@ class TaskWiring:
     transfer: BusTimes = field(default_factory=BusTimes)
     exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)
     reservation: Reservation | None = None
+    # Of one run, no part of how a rack is wired.
+    keeping: Keeping | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -102,3 +125,4 @@ class ClockWiring:
     restart_ticks: int
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None = None
+    keeping: Keeping | None = field(default=None, repr=False)

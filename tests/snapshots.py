@@ -75,7 +75,9 @@ def plain(value: Any) -> Any:  # noqa: C901  # one match of all kinds
         case BaseModel():
             return plain(dict(value))
         case _ if is_dataclass(value) and not isinstance(value, type):
-            return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+            # What is not shown belongs to one run.
+            shown = [field.name for field in fields(value) if field.repr]
+            return {name: plain(getattr(value, name)) for name in shown}
         case Mapping():
             return {str(key): plain(entry) for key, entry in value.items()}
         case np.ndarray() | np.generic():

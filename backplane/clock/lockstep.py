@@ -33,8 +33,14 @@ LOOK_S = 0.001
 disturb the clock."""
 
 
+def _keep_nothing(tick: int) -> None:
+    """Take no checkpoint."""
+
+
 class LockstepDriver(ClockDriver):
     """The driver of the clock in lockstep.
+
+    `keep` is called before every tick, to take a checkpoint when one is due.
 
     `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for
     each. Protocols whose messages are visible at once need this to be repeatable.
@@ -52,21 +58,29 @@ class LockstepDriver(ClockDriver):
         self._one_at_a_time = one_at_a_time
         self._history_ticks = history_ticks
         self._last_first = list(reversed(self.tasks))
+        self.keep: Callable[[int], None] = _keep_nothing
+        self._next = self.first_tick
+        self._last = self._next - 1
 
     def run(self) -> None:
         """Make ticks until the run is over or the launcher is gone."""
-        tick = self.first_tick
-        last = tick - 1
         self.words[System.STATE] = Run.RUNNING
-        while (
-            self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
-        ):
+        # In attributes: a checkpoint keeps them.
+        while self._begins(tick := self._next):
             if self.begin(tick):
-                if not self._step(tick, last):
+                if not self._step(tick, self._last):
                     break
-                last = tick
-            tick += 1
+                self._last = tick
+            self._next = tick + 1
         self.end()
+
+    def _begins(self, tick: int) -> bool:
+        """Say whether `tick` begins, after whatever must be waited for before it."""
+        # Nothing has looked at this tick yet: who continues from here begins with it.
+        self.keep(tick)
+        return (
+            self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
+        )
 
     def _step(self, tick: int, last: int) -> bool:
         """Do one tick; False when the launcher is gone."""

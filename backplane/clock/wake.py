@@ -30,6 +30,7 @@ from rack.backplane.words import Block, Head, Run, System
 
 # Plain integers for the hot path.
 _RELEASED = int(Block.RELEASED)
+_SAVE = int(Block.SAVE)
 _STATE = int(System.STATE)
 _STOPPED = int(Run.STOPPED)
 _EPOCH = int(System.EPOCH_NS)
@@ -79,6 +80,8 @@ class NextCycle:
         self.hold_until(self._due)
         self._slack = 0
         self.skipped = 0
+        self.save: Callable[[], None] | None = None
+        """Called when the clock wants the state of the task, between two cycles."""
 
     def wait(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over and every
@@ -106,6 +109,8 @@ class NextCycle:
                     # weeks.
                     self._semaphore.take()
                 return self._take(newest)
+            if block[_SAVE] and self.save is not None:
+                self.save()
             if is_over or not self._pause():
                 return None
             is_posted = False

@@ -103,6 +103,10 @@ class Writer:
         box[Box.CLAIMANT] = claim(epoch, os.getpid())
         self._slots.resume(box[Box.CLAIMANT])
 
+    def sign(self) -> None:
+        """Sign with this process's claim: the local record has come from another process."""
+        self._slots.sign(self._slots.box[Box.CLAIMANT])
+
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`, released at `tick`; return False when it is too late.
 

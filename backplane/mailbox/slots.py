@@ -115,10 +115,14 @@ class Slots:
         while whole > max(0, head - self.depth) and not self.holds(whole):
             whole -= 1
         self.words[_SERIAL] = head
-        self.words[_EPOCH] = signature
+        self.sign(signature)
         self.words[_CHECK] = (
             self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
         )
+
+    def sign(self, signature: int) -> None:
+        """Publish under that signature from now on."""
+        self.words[_EPOCH] = signature
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an

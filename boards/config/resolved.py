@@ -41,7 +41,15 @@ from rack.boards.config.wiring import TaskPorts, Wiring, reference
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
-from rack.boards.wiring import BusTimes, ClockWiring, Entries, HostWiring, TaskWiring, mailboxes_of
+from rack.boards.wiring import (
+    BusTimes,
+    ClockWiring,
+    Entries,
+    HostWiring,
+    Keeping,
+    TaskWiring,
+    mailboxes_of,
+)
 from rack.levels.level import LevelContext, Pace
 from rack.levels.tables import GoalConfig, RobotConfig, Table
 
@@ -122,6 +130,10 @@ class Resolved:
         recorded run."""
         tasks = tuple(replace(task, entries=entries.get(task.task)) for task in self.tasks)
         return replace(self, tasks=tasks, hosts=())
+
+    def with_keeping(self, keeping: Keeping) -> Resolved:
+        """Return the rack with checkpoints, or continuing from one."""
+        return replace(self, tasks=tuple(replace(task, keeping=keeping) for task in self.tasks))
 
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task

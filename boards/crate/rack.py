@@ -8,10 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from importlib import import_module
 from multiprocessing.connection import wait
 from pathlib import Path
 from threading import Thread
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rack.backplane import semaphores
 from rack.backplane.address_map import CLOCK
@@ -46,11 +48,23 @@ from rack.boards.crate.requests import (
     PowerOn,
     Preload,
 )
-from rack.boards.errors import CANNOT_GO_ON, ConfigError, LaunchError, Mistake
+from rack.boards.errors import (
+    CANNOT_GO_ON,
+    CANNOT_KEEP,
+    CheckpointError,
+    ConfigError,
+    LaunchError,
+    Mistake,
+)
 from rack.boards.events import Cause, Ending, Event, Journal, Outcome, brakings
 from rack.boards.faults.kind import KINDS
-from rack.boards.wiring import Entries
+from rack.boards.wiring import Entries, Keeping
 
+if TYPE_CHECKING:
+    from rack.boards.checkpoint.format import Checkpoint
+
+RESTORING = "rack.boards.checkpoint.restoring"
+"""What a rack with checkpoints loads, by name."""
 LAUNCH_S = 60.0
 """Time limit of each step of the launch: to preload one class, which may compile code, or to ready
 all boards."""
@@ -72,7 +86,8 @@ class Rack:
     its thread. Without `share`, a launch is
     refused if another rack's real-time boards occupy a core that this one requests. A `crate` that
     was started earlier saves time. With `entries`, by bus adapter and port, host boards are not
-    started: what a recorded run wrote there enters instead.
+    started: what a recorded run wrote there enters instead. `keeping`: the checkpoints that it
+    takes in lockstep, and the one that it continues from.
     """
 
     def __init__(
@@ -82,9 +97,12 @@ class Rack:
         share: bool = True,
         crate: CrateLine | None = None,
         entries: Mapping[str, Entries] | None = None,
+        keeping: Keeping | None = None,
     ) -> None:
         self.config = config
         self._entries = entries
+        self._keeping = keeping
+        self._origin: Checkpoint | None = None
         self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
@@ -93,6 +111,7 @@ class Rack:
         self._pids: dict[str, int] = {}
         self._faults: list[str] = []
         self._is_armed = False
+        self._cannot_keep = False
         self._is_beyond_help = False
         self._cause: Cause | None = None
         self._why_stopped = ""
@@ -144,10 +163,15 @@ class Rack:
         crate.ask(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
         plan = resolve(self.config)
         self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
+        if self._keeping is not None:
+            self._plan = plan = plan.with_keeping(self._keeping)
+            self._origin = import_module(RESTORING).origin(plan, self._keeping)
         plan.check_files()
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
         self._set_words()
+        if self._origin is not None:
+            import_module(RESTORING).continue_in(self.segment, self._origin)
         semaphores.create(plan.layout)
         crate.send(Open(self.config.name, plan.crate_priority))
         self._journal.add(
@@ -178,7 +202,10 @@ class Rack:
         while absent := [t.name for t in self._plan.layout.tasks if self._state(t.name) not in UP]:
             self._listen(patience.left_s)
             if self._faults:
-                raise LaunchError("\n".join(self._line.printed()) or self._faults[0])
+                printed = self._line.printed()
+                if self._cannot_keep:
+                    raise CheckpointError(printed[0])
+                raise LaunchError("\n".join(printed) or self._faults[0])
             if patience.is_over:
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {LAUNCH_S:g} s")
             patience.report(f"boards {', '.join(absent)} are starting")
@@ -187,21 +214,24 @@ class Rack:
         """Fill the tables with the config's faults and commands; start the faults that are
         processes."""
         table = FaultTable(self.segment)
-        for injection in self._plan.faults:
+        before = self._keeping or Keeping()
+        for injection in self._plan.faults[before.faults :]:
             entry = table.add(injection)
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        for wanted in self._plan.commands:
+        for wanted in self._plan.commands[before.commands :]:
             desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until
         the task ends."""
-        clock = self._plan.clock(seconds)
+        clock = replace(self._plan.clock(seconds), keeping=self._keeping)
         self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
+        for board, tick in (self._keeping or Keeping()).losses:
+            supervision.admit(board, tick)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
         self._hosts = HostBoards(
             self.segment, self._plan.hosts, supervision, self._line, self._journal
@@ -209,7 +239,13 @@ class Rack:
         self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
         self._awaited = RackAwaited(self.segment, self._journal)
-        self._reset_latch()
+        if self._origin is None:
+            self._reset_latch()
+        else:
+            # The latch is as it was, and what was raised before is in the other run's events.
+            self._is_armed = True
+            self._alarms.drain()
+            self._journal.add("launch", "", f"continues before tick {self._origin.tick}")
         self._line.ask(PowerOn(CLOCK, clock))
         self._hosts.start()
         self._journal.add("start", CLOCK, self.config.clock.mode)
@@ -366,11 +402,12 @@ class Rack:
                 )
             return
         text = f"board '{end.name}' ended: {how_ended(end.status)}"
+        self._cannot_keep |= end.status == CANNOT_KEEP
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
         if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
             self._give_up(end.name, text)
             return
-        is_final = end.status == CANNOT_GO_ON
+        is_final = end.status in (CANNOT_GO_ON, CANNOT_KEEP)
         if is_final:
             # It has printed the reason.
             self._record_printed()

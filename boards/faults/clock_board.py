@@ -22,7 +22,7 @@ from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Sta
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Block, System, TaskState
+from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import kind_of
@@ -188,9 +188,10 @@ class FaultStage:
         )
         self.injected = 0
         self.awaited: dict[int, int] = {}
-        for entry in self._table.staged((Stage.OVER,)):
+        if self._words[System.STATE] == Run.RUNNING:
             # A restarted clock does not know what its predecessor has seen.
-            self._await_messages(entry)
+            for entry in self._table.staged((Stage.OVER,)):
+                self._await_messages(entry)
         self.open: list[FaultEntry] = []
         self._phased: list[FaultEntry] = []
 

@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib import import_module
 
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
@@ -22,12 +23,12 @@ from rack.backplane.process import (
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.classes import find_class
-from rack.boards.errors import CANNOT_GO_ON
+from rack.boards.errors import CANNOT_GO_ON, CANNOT_KEEP, CheckpointError
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
 from rack.boards.run.task import Task
-from rack.boards.wiring import ClockWiring, TaskWiring
+from rack.boards.wiring import KEEPING, ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 
@@ -46,8 +47,10 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
     name_process(f"{segment.rack}:{name}")
     try:
         return board(segment)
-    except (BackplaneError, LevelError) as error:
+    except (BackplaneError, LevelError, CheckpointError) as error:
         print(f"board '{name}': {error}", file=sys.stderr, flush=True)
+        if isinstance(error, CheckpointError):
+            return CANNOT_KEEP
         return CANNOT_GO_ON if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
     except Exception:
         print(f"board '{name}' failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
@@ -100,6 +103,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         if isinstance(level, Adapter):
             level.open()
         task = _task(segment, wiring, level, attention)
+        if wiring.keeping is not None:
+            import_module(KEEPING).keep_task(segment, task, wiring.keeping)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from importlib import import_module
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
@@ -29,7 +30,7 @@ from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System, is_on
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operator import hold
-from rack.boards.wiring import ClockWiring
+from rack.boards.wiring import KEEPING, ClockWiring
 from rack.levels.operator import DRIVES, SETTINGS, Answer
 
 HEAD_START_NS = 20_000_000
@@ -295,6 +296,8 @@ def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
         alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
     driver = driver_of_run(segment, wiring, EndOfRun(segment, wiring), alarms)
     driver.controller = SystemController(segment, wiring, driver)
+    if wiring.keeping is not None:
+        import_module(KEEPING).keep_clock(segment, driver, wiring.keeping)
     driver.run()
 
 

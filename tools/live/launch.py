@@ -238,14 +238,14 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     from rack.tools.recording.run_files import tally
 
     try:
-        keeping = Retention.of(segment)
+        retention = Retention.of(segment)
         # A run that was interrupted has no time to make tables of what a flight recorder kept.
-        left = None if keeping is None else tally(folder)
-        if keeping is None or left is None:
+        left = None if retention is None else tally(folder)
+        if retention is None or left is None:
             missing = Recording(folder).missing(segment)
         else:
             missing = left.missing(segment)
-            if not missing and (absent := keeping.absent(segment, left.kept, ticks)):
+            if not missing and (absent := retention.absent(segment, left.kept, ticks)):
                 first, last = absent[0]
                 return f"ticks {first:,} to {last:,} had to be kept, and are not there", {}
         if not missing:

@@ -22,6 +22,9 @@ from rack.levels.servo.driver import numbers
 class JointTorques(CommandsAbove):
     """Adds up the `JOINT_TORQUE`s of the boards above; each is 0 for the joints of other boards."""
 
+    # Addresses in this process, of messages that are seen for the first time again.
+    found_again = ("_messages", "_memory", "_begins")
+
     def __init__(self, context: LevelContext, cell: Cell) -> None:
         super().__init__(context, cell.patience, 1, "torque", "braked")
         joints = len(cell.home)

@@ -34,7 +34,7 @@ class FlightRecorder:
     """
 
     def __init__(self, segment: Segment, retention: Retention, spool: Spool, tally: Tally) -> None:
-        self._keeping = keeping
+        self._retention = retention
         self._spool = spool
         self._tally = tally
         self._words = segment.words
@@ -67,7 +67,7 @@ class FlightRecorder:
         self._sealed.append(Sealed(self._path, TickRange(self._began, next_tick)))
         self._path = path
         self._began = tick
-        self._forget(tick - self._keeping.keep)
+        self._forget(tick - self._retention.keep)
 
     def close(self) -> None:
         """Finish the last stretch. An empty one follows, which says what was taken in all."""
@@ -83,7 +83,7 @@ class FlightRecorder:
         return self._spool.divert(stretch, end)
 
     def _mark(self, tick: int) -> None:
-        window = self._keeping.around(tick)
+        window = self._retention.around(tick)
         if self._windows and self._windows[-1].first <= window.first <= self._windows[-1].last:
             last = self._windows.pop()
             window = TickRange(last.first, max(last.last, window.last))

@@ -144,17 +144,17 @@ class Recorder:
         # The spool first: it fails where another recorder is running, and leaves that one's files
         # alone.
         self._spool = Spool(folder, layout, segment.launch)
-        keeping = Retention.of(segment)
+        retention = Retention.of(segment)
         self._rings = rings(segment)
         before = {name: ring.before for name, ring in self._rings.items()}
         self._files = None
-        if keeping is None:
+        if retention is None:
             self._files = RunFiles(folder, layout, segment.launch, before=before)
         self._tally = self._files or Tally(layout, before)
         for found in self._spool.resume():
             self._tally.take(found)
         self._flight = (
-            None if keeping is None else FlightRecorder(segment, keeping, self._spool, self._tally)
+            None if retention is None else FlightRecorder(segment, retention, self._spool, self._tally)
         )
         for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)

@@ -1,0 +1,139 @@
+"""Taking checkpoints: the clock asks every task for its state between two ticks, when all have
+finished, and puts one file together.
+
+The tasks save theirs at the same time, each on its core. A checkpoint that falls into the outage of
+a board is taken once the board is back: a process that is not there has no state.
+"""
+
+from __future__ import annotations
+
+import sys
+import zlib
+from functools import partial
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System
+from rack.boards.checkpoint.format import Checkpoint, PartState, layout_hash, read
+from rack.boards.checkpoint.kinds import Keeper
+from rack.boards.checkpoint.memory import copy, regions
+from rack.boards.checkpoint.parts import Parts
+from rack.boards.errors import CheckpointError
+from rack.boards.run.task import Task
+from rack.boards.wiring import Keeping
+
+STATE = ".state"
+"""Suffix of the file that a task leaves for the clock."""
+SHAPE = 16
+"""Bytes of a shape in front of the state that a task leaves for the clock."""
+REFUSED = -1
+"""Value of `Block.SAVE` of a task whose state cannot be kept."""
+
+
+def keep_task(segment: Segment, task: Task, keeping: Keeping) -> None:
+    """Have a task that has just been built save its state when the clock wants it; in a run that
+    continues another, let it go on from the state there."""
+    keeper = task.next_cycle.save = TaskKeeper(task, keeping)
+    keeper.parts = Parts(task, task.spec.name)
+    _go_on(segment, keeper.parts, task.spec.name, keeping)
+
+
+def keep_clock(segment: Segment, driver: LockstepDriver, keeping: Keeping) -> None:
+    """Have the clock take checkpoints; in a run that continues another, let it go on."""
+    keeper = driver.keep = ClockKeeper(segment, driver, keeping)
+    keeper.parts = Parts(driver, CLOCK)
+    _go_on(segment, keeper.parts, CLOCK, keeping)
+
+
+def _go_on(segment: Segment, parts: Parts, name: str, keeping: Keeping) -> None:
+    """Continue from the state of that name in a checkpoint, when the rack is launched; a process
+    that is restarted later begins anew."""
+    if keeping.origin is None or segment.words[System.STATE] != Run.STARTING:
+        return
+    found = read(keeping.origin).parts[name]
+    if found.shape != parts.shape:
+        why = "its class, or what it is made of, has changed shape since"
+        raise CheckpointError(f"'{name}' cannot continue from {keeping.origin}: {why}")
+    parts.load(zlib.decompress(found.changed), keeping.packages)
+    for writer in parts.of_type(Writer):
+        writer.sign()
+
+
+class TaskKeeper(Keeper):
+    """Saves the state of one task, between two of its cycles, for the clock to collect."""
+
+    def __init__(self, task: Task, keeping: Keeping) -> None:
+        self.parts: Parts
+        self._block = task.block
+        self._notify_clock = task.stopwatch.notify_clock
+        self._path = keeping.folder / f"{task.spec.name}{STATE}"
+
+    def __call__(self) -> None:
+        """Save it."""
+        result = REFUSED
+        try:
+            shape = bytes.fromhex(self.parts.shape)
+            self._path.write_bytes(shape + zlib.compress(self.parts.save(), 1))
+            result = 0
+        except (CheckpointError, OSError) as error:
+            print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
+        self._block[Block.SAVE] = result
+        self._notify_clock()
+
+
+class ClockKeeper(Keeper):
+    """Takes the checkpoints of a run."""
+
+    def __init__(self, segment: Segment, driver: LockstepDriver, keeping: Keeping) -> None:
+        self.parts: Parts
+        self._segment = segment
+        self._driver = driver
+        self._keeping = keeping
+        self._layout = layout_hash(segment.layout)
+        self._due: int | None = None
+
+    def __call__(self, tick: int) -> None:
+        """Take a checkpoint before `tick`, if one is due and every process is there."""
+        every = self._keeping.every
+        if not every:
+            return
+        if self._due is None:
+            self._due = tick + 1
+            self._due += -self._due % every
+        if tick < self._due or any(task.is_lost or task.is_stopped for task in self._driver.tasks):
+            return
+        self._due = tick - tick % every + every
+        self._driver.settle()
+        if all(task.is_settled() for task in self._driver.tasks):
+            self._take(tick)
+
+    def _take(self, tick: int) -> None:
+        driver = self._driver
+        for task in driver.tasks:
+            task.block[Block.SAVE] = tick + 1
+            task.wake()
+        for task in driver.tasks:
+            driver.await_state(task, partial(_has_saved, task.block))
+        has_all = not any(task.block[Block.SAVE] for task in driver.tasks)
+        for task in driver.tasks:
+            task.block[Block.SAVE] = 0
+        if not has_all:
+            return
+        places = regions(self._segment, tick)
+        try:
+            parts = {CLOCK: PartState(self.parts.shape, zlib.compress(self.parts.save(), 1))}
+            for task in driver.tasks:
+                path = self._keeping.folder / f"{task.spec.name}{STATE}"
+                state = path.read_bytes()
+                parts[task.spec.name] = PartState(state[:SHAPE].hex(), state[SHAPE:])
+                path.unlink()
+            memory = copy(self._segment, places)
+            Checkpoint(tick, self._layout, places, memory, parts).write(self._keeping.folder)
+        except (CheckpointError, OSError) as error:
+            print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
+
+
+def _has_saved(block: memoryview) -> bool:
+    return block[Block.SAVE] <= 0

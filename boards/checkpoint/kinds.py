@@ -1,0 +1,242 @@
+"""Kinds of objects that the processes of a rack consist of: what each leads to, what of it may
+change, and how that is put back.
+
+`KINDS` is the list of what the state of a process is. An object of another kind has no checkpoint,
+and says so by name; variables of modules and classes are in none.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from ctypes import Array as CArray
+from enum import Enum
+from functools import _lru_cache_wrapper, partial
+from mmap import mmap
+from operator import is_
+from pathlib import PurePath
+from struct import Struct
+from types import (
+    BuiltinFunctionType,
+    CellType,
+    FunctionType,
+    MappingProxyType,
+    MethodType,
+    MethodWrapperType,
+    ModuleType,
+)
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import Semaphore
+from rack.boards.errors import CheckpointError
+from rack.boards.wiring import Keeping
+from rack.levels.compiled import compiled
+from rack.levels.level import LevelContext
+
+Inner = Iterable[tuple[object, Any]]
+"""What a thing leads to, by key or place, in the same order in every process."""
+ATOMS = (int, float, complex, str, bytes, frozenset, type(None), np.number, np.bool_)
+"""What cannot change, and is written where it stands."""
+FOUND_AGAIN = "found_again"
+"""Attribute of a class: the names of those that its objects find again where they are not set."""
+_ABSENT = object()
+
+
+class Keeper:
+    """Base of what saves a process: it hangs on its parts, and is none of them."""
+
+
+def nothing(thing: Any) -> Inner:
+    """Return that a thing leads to nothing."""
+    return ()
+
+
+class PartKind(NamedTuple):
+    """One kind. `types`: its types, or names of types, of libraries that not every rack loads.
+
+    `contents` returns a copy of what may change (None: nothing), `put` puts what `changes` found
+    back.
+    """
+
+    name: str
+    types: tuple[type | str, ...]
+    inner: Callable[[Any], Inner] = nothing
+    contents: Callable[[Any], Any] | None = None
+    put: Callable[[Any, Any], None] | None = None
+
+
+def _put_dict(thing: dict[Any, Any], found: list[Any]) -> None:
+    half = len(found) // 2
+    thing.clear()
+    thing.update(zip(found[:half], found[half:], strict=True))
+
+
+def _put_list(thing: list[Any] | deque[Any], found: list[Any]) -> None:
+    thing.clear()
+    thing.extend(found)
+
+
+def _put_set(thing: set[Any], found: list[Any]) -> None:
+    thing.clear()
+    thing.update(found)
+
+
+def _put_cell(thing: CellType, found: list[Any]) -> None:
+    (thing.cell_contents,) = found
+
+
+def _put_bytes(thing: bytearray, found: bytes) -> None:
+    thing[:] = found
+
+
+def _elements(thing: np.ndarray) -> np.ndarray | None:
+    """Return the elements of an array as bytes; None for a view: they are its owner's."""
+    if thing.base is not None or not thing.flags.writeable:
+        return None
+    return _flat(thing).copy()
+
+
+def _flat(thing: np.ndarray) -> np.ndarray:
+    return thing.reshape(-1, order="A").view(f"V{thing.itemsize}")
+
+
+def _put_array(thing: np.ndarray, found: tuple[bytes, bytes]) -> None:
+    places, elements = found
+    flat = _flat(thing)
+    flat[np.frombuffer(places, np.int32)] = np.frombuffer(elements, flat.dtype)
+
+
+def _data(thing: Any) -> bytes:
+    """Return all of a MjData but the model that its state carries along."""
+    state: bytes = thing.__getstate__()
+    return b"".join(state.split(thing.model.__getstate__(), 1))
+
+
+def _put_data(thing: Any, found: bytes) -> None:
+    """Put a MjData back where it is, since others know its addresses."""
+    import mujoco
+
+    model = thing.model.__getstate__()
+    at = thing.__getstate__().find(model)
+    source = mujoco.MjData.__new__(mujoco.MjData)
+    source.__setstate__(b"".join((found[:at], model, found[at:])))
+    mujoco.mj_copyData(thing, thing.model, source)
+
+
+def _fields(slots: tuple[str, ...], again: tuple[str, ...], thing: Any) -> dict[str, Any]:
+    fields = dict(getattr(thing, "__dict__", ()))
+    for name in slots:
+        value = getattr(thing, name, _ABSENT)
+        if value is not _ABSENT:
+            fields[name] = value
+    for name in again:
+        fields.pop(name, None)
+    return fields
+
+
+def _put_fields(thing: Any, found: tuple[dict[str, Any], list[str]]) -> None:
+    changed, gone = found
+    for name, value in changed.items():
+        object.__setattr__(thing, name, value)
+    for name in gone:
+        object.__delattr__(thing, name)
+
+
+def _of_partial(thing: partial[Any]) -> Inner:
+    return enumerate((thing.func, *thing.args, *thing.keywords.values()))
+
+
+def _of_function(thing: FunctionType) -> Inner:
+    return enumerate((*(thing.__closure__ or ()), *(thing.__defaults__ or ())))
+
+
+def _items(thing: Mapping[object, Any]) -> Inner:
+    return thing.items()
+
+
+def _through(name: str) -> Callable[[Any], Inner]:
+    return lambda thing: ((name, getattr(thing, name)),)
+
+
+KINDS = (
+    PartKind("program", (type, ModuleType, compiled, Struct, "CPUDispatcher")),
+    PartKind(
+        "config",
+        (LevelContext, Keeping, BaseModel, Enum, PurePath, range, np.dtype, np.ufunc, "MjModel"),
+    ),
+    # Of one process alone, or of the whole rack.
+    PartKind("process", (Segment, Semaphore, ByteLock, Keeper, mmap, CArray, "PyCapsule")),
+    # What it holds is made again when it is asked for.
+    PartKind("cache", (_lru_cache_wrapper,)),
+    PartKind("tuple", (tuple,), enumerate),
+    PartKind("mapping", (MappingProxyType,), _items),
+    PartKind("function", (FunctionType,), _of_function),
+    PartKind("method", (MethodType, MethodWrapperType, BuiltinFunctionType), _through("__self__")),
+    PartKind("partial", (partial,), _of_partial),
+    PartKind("view", (memoryview,), _through("obj")),
+    PartKind("record", (np.void,), _through("base")),
+    PartKind("array", (np.ndarray,), _through("base"), _elements, _put_array),
+    PartKind("bytes", (bytearray,), nothing, bytes, _put_bytes),
+    PartKind("list", (list, deque), enumerate, list, _put_list),
+    PartKind("dict", (dict,), _items, lambda thing: [*thing, *thing.values()], _put_dict),
+    PartKind("set", (set,), nothing, list, _put_set),
+    PartKind(
+        "cell", (CellType,), _through("cell_contents"), lambda t: [t.cell_contents], _put_cell
+    ),
+    PartKind("simulation", ("MjData",), nothing, _data, _put_data),
+)
+_FOUND: dict[type, PartKind] = {}
+
+
+def part_kind(kind: type) -> PartKind:
+    """Return the kind of a type. Raises `CheckpointError` for one that is not known: nobody can
+    tell what of it changes."""
+    if kind not in _FOUND:
+        known = (found for found in KINDS if _is_one_of(kind, found.types))
+        _FOUND[kind] = next(known, None) or _object(kind)
+    return _FOUND[kind]
+
+
+def _is_one_of(kind: type, types: tuple[type | str, ...]) -> bool:
+    return kind.__name__ in types or issubclass(
+        kind, tuple(each for each in types if isinstance(each, type))
+    )
+
+
+def _object(kind: type) -> PartKind:
+    """Return the kind of a class in Python: its attributes may change, but for those that its
+    objects find again."""
+    declared = [base.__dict__["__slots__"] for base in kind.__mro__ if "__slots__" in vars(base)]
+    if not (kind.__dictoffset__ or declared):
+        raise CheckpointError(f"a {kind.__module__}.{kind.__qualname__} has no checkpoint")
+    slots = [name for names in declared for name in ([names] if isinstance(names, str) else names)]
+    fields = partial(_fields, tuple(slots), getattr(kind, FOUND_AGAIN, ()))
+    return PartKind("object", (kind,), lambda thing: fields(thing).items(), fields, _put_fields)
+
+
+def changes(now: Any, before: Any) -> Any:
+    """Return what has changed in contents, None if nothing has.
+
+    Of an object that is the attributes with another value, and the names of those that are gone; of
+    an array the elements, after their places; otherwise all.
+    """
+    match now:
+        case dict():
+            changed = {name: v for name, v in now.items() if before.get(name, _ABSENT) is not v}
+            gone = [name for name in before if name not in now]
+            return (changed, gone) if changed or gone else None
+        case np.ndarray():
+            # One array may hold both parameters and state.
+            places = np.flatnonzero(now != before).astype(np.int32)
+            found = places.tobytes(), now[places].tobytes()
+            return found if len(places) else None
+        case list():
+            same = len(now) == len(before) and all(map(is_, now, before))
+            return None if same else now
+        case _:
+            return None if now == before else now
