@@ -13,7 +13,7 @@ from rack.boards.config.files import assembled, named_classes
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, View
+from rack.tools.console.parameters import Faults, Json, Settings, View, config_names
 
 if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
@@ -21,6 +21,14 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
     from rack.tools.live.launch import RunResult
 
+RunConfig = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="CONFIG",
+        help="config by name, or path to a .toml file",
+        autocompletion=config_names,
+    ),
+]
 Lockstep = Annotated[
     bool,
     typer.Option(
@@ -65,6 +73,26 @@ FromRun = Annotated[
         ),
     ),
 ]
+Checkpoint = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S",
+        min=1e-6,
+        max=1e6,
+        help="with --lockstep: keep the whole rack in the run's folder every S simulated seconds",
+    ),
+]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        "--from",
+        metavar="RUN@TIME",
+        help=(
+            "continue a run, in place of CONFIG, from its last checkpoint at TIME s or before, bit"
+            " for bit; a branch of it with --set or --faults"
+        ),
+    ),
+]
 NoRecord = Annotated[
     bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")
 ]
@@ -72,7 +100,7 @@ NoRecord = Annotated[
 
 def run(
     context: typer.Context,
-    config: ConfigName,
+    config: RunConfig = None,
     lockstep: Lockstep = False,
     step: Step = False,
     seconds: Seconds = None,
@@ -80,6 +108,8 @@ def run(
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
     entries: FromRun = None,
+    checkpoint: Checkpoint = None,
+    origin: Origin = None,
     out: Out = None,
     no_record: NoRecord = False,
     view: View = False,
@@ -92,6 +122,8 @@ def run(
     one that fails ends all. On a terminal a live table shows every task and what holds the rack;
     elsewhere one line a second is printed. --json prints the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
+
+    With --from, --seconds counts from the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
@@ -106,14 +138,23 @@ def run(
       rack run nasrem --set clock.speed=2 --view
       rack run nist-state-table --lockstep --step
       rack run ibm --lockstep --entries runs/ibm-20250101-120000
+      rack run nasrem --lockstep --checkpoint 5 --out runs/whole
+      rack run --from runs/whole@10 --faults bad-sensors
     """
     if view and no_record:
         raise Failure(
             "--view and --no-record: the viewer shows what the recorder takes; leave one out", 2
         )
+    if (config is None) == (origin is None):
+        raise Failure("permitted: CONFIG, or --from RUN@TIME in its place; see --help", 2)
     overrides = list(settings)
-    overrides += ["clock.mode=lockstep"] if lockstep else []
+    overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
+    if origin is not None:
+        from rack.tools.live.continued import run_of
+
+        config = str(run_of(origin))
+    assert config is not None
     tables = assembled(config, overrides, faults)
     crate = _informed(context.obj, tables)
     from rack.boards.config.resolved import validated
@@ -121,6 +162,8 @@ def run(
     from rack.tools.live.folder import folder_of
     from rack.tools.live.launch import NO_TIME, run_rack
 
+    if checkpoint is not None or origin is not None:
+        from rack.tools.live.continued import keeping_for
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
 
@@ -128,6 +171,9 @@ def run(
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
+    keeping = None
+    if checkpoint is not None or origin is not None:
+        keeping = keeping_for(found, folder, checkpoint, origin)
     # From the start of the run to the end of its report; during the launch a signal ends the
     # command at once.
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
@@ -143,6 +189,7 @@ def run(
                 crate=crate,
                 step=step,
                 entries=again,
+                keeping=keeping,
             )
         _report(found, folder, result, as_json)
     if not result.worked:

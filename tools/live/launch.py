@@ -16,7 +16,7 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.events import Event, Outcome, braked_text
-from rack.boards.wiring import Entries
+from rack.boards.wiring import Entries, Keeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
@@ -100,7 +100,7 @@ class RunResult:
         return "\n".join([*lines, f"digest {end.digest}"])
 
 
-def run_rack(
+def run_rack(  # noqa: PLR0913  # each is an option of the command
     config: RackConfig,
     seconds: float | None,
     folder: Path | None,
@@ -111,14 +111,15 @@ def run_rack(
     crate: CrateLine | None = None,
     step: bool = False,
     entries: Mapping[str, Entries] | None = None,
+    keeping: Keeping | None = None,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`
     unless that is None.
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
-    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate` and
-    `entries` are as in `Rack`. Launch the racks that the config names: one that fails ends the run,
-    and a run that does not succeed ends them.
+    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate`, `entries`
+    and `keeping` are as in `Rack`. Launch the racks that the config names: one that fails ends the
+    run, and a run that does not succeed ends them.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
     dies does not end the run, but files that cannot be written do: raises `Failure`.
@@ -132,11 +133,14 @@ def run_rack(
             recorder = None if folder is None else RecorderProcess()
             if recorder is not None:
                 stack.callback(recorder.finish)
-            rack = stack.enter_context(Rack(config, log.add, share or bool(others), crate, entries))
+            rack = stack.enter_context(
+                Rack(config, log.add, share or bool(others), crate, entries, keeping)
+            )
             rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
                 try:
-                    folder.mkdir(parents=True, exist_ok=True)
+                    for made in (folder, *([] if keeping is None else [keeping.folder])):
+                        made.mkdir(parents=True, exist_ok=True)
                     (folder / "config.toml").write_text(config.text())
                     log.open(folder / "events.jsonl")
                 except OSError as error:
