@@ -58,8 +58,8 @@ class Tally:
     """What a recorder has taken of a rack's rings, or left of it on disk.
 
     By ring, `lost` counts the rows lost, `rows` those taken, and `taken` is the number of its last
-    record so far, from `before` on. `kept` holds the ticks of the stretches kept, [first, end), of a
-    flight recorder.
+    record so far, from `before` on. `kept` holds the ticks of the stretches that a flight recorder
+    kept, [first, end).
     """
 
     def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:

@@ -12,7 +12,7 @@ from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.recording.occasions import Retention, Occasions
+from rack.tools.recording.occasions import Occasions, Retention
 from rack.tools.recording.spool import rings
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]

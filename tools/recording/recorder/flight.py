@@ -11,7 +11,7 @@ import numpy as np
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.tools.recording.occasions import Retention, Occasions, TickRange
+from rack.tools.recording.occasions import Occasions, Retention, TickRange
 from rack.tools.recording.run_files import Tally
 from rack.tools.recording.spool import Spool, StretchHead
 

@@ -154,7 +154,9 @@ class Recorder:
         for found in self._spool.resume():
             self._tally.take(found)
         self._flight = (
-            None if retention is None else FlightRecorder(segment, retention, self._spool, self._tally)
+            None
+            if retention is None
+            else FlightRecorder(segment, retention, self._spool, self._tally)
         )
         for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)
