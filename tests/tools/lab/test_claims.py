@@ -85,7 +85,9 @@ def test_a_figure_that_was_changed_on_its_page_alone_is_found() -> None:
     assert unknown_figures("it takes 35 ms", ["5 ms"]) == ["35 ms"]
 
 
-@pytest.mark.parametrize("page", {*SETTINGS, *(page for c in LEDGER.values() for page in c.shown)})
+@pytest.mark.parametrize(
+    "page", sorted({*SETTINGS, *(page for claim in LEDGER.values() for page in claim.shown)})
+)
 def test_claims_and_settings_stand_on_their_pages(page: str) -> None:
     text = " ".join(text_of(page).split())
     assert not [entry for entry in known_on(page) if entry not in text]
