@@ -7,7 +7,7 @@ from pydantic import Field
 from rack.backplane.message import Message, State
 from rack.levels.level import Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import TASK_STATUS
-from rack.levels.peer import PEER
+from rack.levels.peer import PEER, Presence
 from rack.levels.systems.joint_boards.gateway import (
     LEAD_CYCLES,
     GatewayParams,
@@ -67,8 +67,13 @@ class NetworkGateway(JointGateway):
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Hand references down, and statuses up."""
-        self._follow(read.peer.value.ahead)
+        peer: Message = read.peer.value
+        self._follow(peer.ahead)
         super().process(read, write, tick)
+        if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
+            # Its references would not be followed, and its motion would begin without the arm.
+            write.status.stopped = True
+            write.status.reason = "the clocks of both racks are not compared yet"
         program: Message = read.program.value
         if program.state in (State.DONE, State.ERROR):
             write.status.state = program.state

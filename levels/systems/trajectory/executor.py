@@ -103,6 +103,10 @@ class TrajectoryExecutor(Executor):
         self._orders.take(read.operator)
         self._sight.look(read.world)
         cancelled = self._agenda.take(read.requests)
+        if cycles > HANDOVER_CYCLES and self._boards.in_step:
+            # The boards hold by now. Across a network their statuses say so too late.
+            self._boards.leave(f"{cycles} cycles missed: the boards hold")
+            self._work.interrupt()
         self._follow_boards(read)
         if cancelled:
             self._work.cancel()
