@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from time import monotonic_ns
 
 from rack.backplane.errors import ClockError
@@ -58,12 +59,13 @@ def ticks_of(
     """
     clock_hz = 1e9 / clock_ns
     grid, step = of
-    if not rate_hz > 0:
+    # Infinite, too, for a rate so low that the quotient has no number.
+    ticks = clock_hz / rate_hz if rate_hz > 0 else inf
+    if ticks == inf:
         raise ClockError(
             f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole"
             " number"
         )
-    ticks = clock_hz / rate_hz
     every = round(ticks)
     if every >= 1 and abs(ticks - every) <= 1e-6 * ticks:
         return every

@@ -36,7 +36,7 @@ def test_above_the_clocks_rate_there_is_one_neighbour(rate_hz: float) -> None:
         ticks_of(rate_hz, CLOCK_NS, "level")
 
 
-@pytest.mark.parametrize("rate_hz", [0.0, -50.0, float("nan")])
+@pytest.mark.parametrize("rate_hz", [0.0, -50.0, float("nan"), 5e-324])
 def test_an_impossible_rate_is_refused(rate_hz: float) -> None:
     with pytest.raises(ClockError, match="is not a rate"):
         ticks_of(rate_hz, CLOCK_NS, "level")

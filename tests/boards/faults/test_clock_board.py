@@ -18,7 +18,7 @@ from rack.backplane.process import STOPPED, WAITING, is_alive, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore
 from rack.backplane.watch.alarms import Alarm, alarm_ring
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block, Run, System
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME, mailbox, task
@@ -169,6 +169,7 @@ def test_messages_are_seen_to_flow_again_after_a_fault_of_them(site: Site) -> No
 def test_a_restarted_clock_awaits_the_messages_that_its_predecessor_did(site: Site) -> None:
     site.add("mute", tick=2, ticks=3)
     site.advance(2, 5)
+    site.segment.words[System.STATE] = Run.RUNNING
     restarted = FaultStage(site.segment, site.driver)
     assert restarted.awaited == site.stage.awaited == {0: 5}
 

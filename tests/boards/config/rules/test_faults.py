@@ -61,7 +61,7 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
         ".cycles = 4: for is also given; permitted: one of for, cycles",
     ),
     "no time": (
-        {"kind": "mute", "board": "wave", "for": "1 min"},
+        {"kind": "mute", "board": "wave", "for": "1 hour"},
         'should be a time, as in "0.5s", "20ms" or 0.5',
     ),
     "for nothing": (
