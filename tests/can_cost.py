@@ -76,7 +76,7 @@ def main() -> None:
     share = np.mean([processor_ns(d.pid or 0) - n for d, n in zip(drives, used_ns, strict=True)])
     median, high = 1e3 * np.percentile(costs, (50, 99))
     if "--json" in sys.argv:
-        print_json({"exchange_ms": {"p50": median, "p99": high}})
+        print_json({"exchange_ms": {"p50": median, "p99": high}, "in_time": ages[1] / CYCLES})
     else:
         print(f"a cycle: {median:.3f} ms (median), {high:.3f} ms (99th percentile)")
         print(f"age of samples, ticks: {dict(sorted(ages.items()))}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -15,7 +16,8 @@ from tests.processes import RACK, own_can_channel
 
 pytestmark = pytest.mark.thorough
 
-EXAMPLES = Path(__file__).parent.parent / "configs" / "examples"
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "configs" / "examples"
 FOLDERS = sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 RACK_NAME = re.compile(r"""^(\W*name ?= ?["'])([\w-]+)""", re.MULTILINE)
@@ -24,6 +26,8 @@ RECORDED = ("own-arm", "own-level")
 user's own."""
 REAL_TIME = ("can-arm",)
 """Examples that run in real time alone."""
+LEAST_IN_TIME = 0.9
+"""Part of the samples that must come in time without a rack, for one to be judged."""
 PROGRAMS = {"rack": RACK, "python": (sys.executable,)}
 
 
@@ -31,6 +35,14 @@ def commands(folder: Path) -> list[list[str]]:
     """Return the commands of an example's README as words."""
     lines = "".join(SHELL.findall((folder / "README.md").read_text())).splitlines()
     return [line.partition("#")[0].split() for line in lines]
+
+
+def part_in_time() -> float:
+    """Return the part of the exchanges with the drives of `can-arm` that come in time here, without
+    a rack: where the page's figures are from, 98 % do."""
+    command = [sys.executable, "-m", "tests.can_cost", "--json"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    return float(json.loads(done.stdout)["in_time"])
 
 
 @pytest.mark.slow
@@ -42,6 +54,8 @@ def test_example_runs_as_its_readme_says(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAN_CHANNEL", own_can_channel())
+    if name in REAL_TIME and (part := part_in_time()) < LEAST_IN_TIME:
+        pytest.skip(f"six drives at 500 Hz need a faster machine: {part:.0%} of samples in time")
     folder = Path(shutil.copytree(EXAMPLES / name, tmp_path / name))
     for path in (path for end in ("toml", "py", "ipynb") for path in folder.glob(f"*.{end}")):
         path.write_text(RACK_NAME.sub(rf"\1\2-{os.getpid()}", path.read_text(), count=1))
