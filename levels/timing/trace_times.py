@@ -32,6 +32,9 @@ UNITS = {
 """The unit functions of a record, by role, with their first and last time stamp. A planner's
 reading is part of P."""
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9}
+UNDISTURBED = 10.0
+"""Percentile of a part's times taken for its undisturbed time: on a host that takes the machine
+away in nearly every plan, their median is not."""
 Distribution = dict[str, float]
 
 
@@ -193,7 +196,7 @@ def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
 
     `above` is when tasks of higher priority had the core: that is taken off the part in which they
     ran. Where the sum still exceeds the processor time, because ordinary scheduling or the machine
-    interfered, the rest is taken off the parts that are longer than usual, then off all in
+    interfered, the rest is taken off what parts take beyond their undisturbed time, then off all in
     proportion.
     """
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
@@ -202,10 +205,24 @@ def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
     parts = ends - starts - above.within(starts, ends)
     beyond = parts.sum(axis=1) - rows["processor_ns"]
     beyond = np.where(beyond > 0, beyond + overhead_ns(rows), 0)
-    unusual = np.clip(parts - np.median(parts, axis=0), 0, None)
+    unusual = np.clip(parts - _undisturbed(parts, rows["processor_ns"]), 0, None)
     parts = parts - _shared_out(beyond, unusual)
     rest = np.clip(parts.sum(axis=1) - rows["processor_ns"], 0, None)
     return np.asarray(np.rint(parts - _shared_out(rest, parts)), np.int64)
+
+
+def _undisturbed(parts: np.ndarray, processor_ns: np.ndarray) -> np.ndarray:
+    """Return the undisturbed time of each part, shape (4,).
+
+    A short part is undisturbed in many cycles. The longest may be disturbed in all of them: of it,
+    that is what the others leave of the processor time.
+    """
+    usual = np.percentile(parts, UNDISTURBED, axis=0)
+    longest = int(np.argmax(usual))
+    left = np.percentile(processor_ns, UNDISTURBED) - (usual.sum() - usual[longest])
+    if 0 < left < usual[longest]:
+        usual[longest] = left
+    return usual
 
 
 def _shared_out(total: np.ndarray, weights: np.ndarray) -> np.ndarray:
