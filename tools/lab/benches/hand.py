@@ -81,7 +81,7 @@ def shift_mm(recording: Recording) -> tuple[float, float] | None:
     """Return how far the pulls move the object, and how far it is from its place after the last
     one, mm.
 
-    None if it is not held in all that time.
+    None if it is not held in all that time, or not seen before and during the pulls.
     """
     config = recording.rack_config
     clock_s = recording.layout.clock_ns * 1e-9
@@ -97,8 +97,11 @@ def shift_mm(recording: Recording) -> tuple[float, float] | None:
     times = recording.signal(scene, "tick") * clock_s
     row = config.scene.objects.index(pulls[0].body)
     place = recording.signal(scene, "position")[:, row]
-    before = place[times < begin][-1]
-    away = 1e3 * np.sqrt(((place[(times >= begin) & (times <= end)] - before) ** 2).sum(axis=1))
+    before = place[times < begin]
+    pulled = place[(times >= begin) & (times <= end)]
+    if not len(before) or not len(pulled):
+        return None
+    away = 1e3 * np.sqrt(((pulled - before[-1]) ** 2).sum(axis=1))
     return float(away.max()), float(away[-1])
 
 

@@ -102,3 +102,10 @@ def test_the_shift_is_that_of_the_object_under_the_pull_and_after_it() -> None:
 
 def test_an_object_that_is_let_go_before_the_end_of_the_pulls_has_no_shift() -> None:
     assert shift_mm(Run(held_until=2.5)) is None  # type: ignore[arg-type]
+
+
+def test_an_object_that_was_not_seen_before_the_pulls_has_no_shift() -> None:
+    run = Run()
+    for field in ("tick", "position"):
+        run.signals["hand.scene", field] = run.signals["hand.scene", field][20:]
+    assert shift_mm(run) is None  # type: ignore[arg-type]
