@@ -217,7 +217,7 @@ def _undisturbed(parts: np.ndarray, processor_ns: np.ndarray) -> np.ndarray:
     A short part is undisturbed in many cycles. The longest may be disturbed in all of them: of it,
     that is what the others leave of the processor time.
     """
-    usual = np.percentile(parts, UNDISTURBED, axis=0)
+    usual = np.asarray(np.percentile(parts, UNDISTURBED, axis=0))
     longest = int(np.argmax(usual))
     left = np.percentile(processor_ns, UNDISTURBED) - (usual.sum() - usual[longest])
     if 0 < left < usual[longest]:

@@ -84,8 +84,8 @@ def needs_real_time(kind: str) -> bool:
 
 @dataclass(frozen=True)
 class Target:
-    """A place for a fault. `cycle`, `reader`: periods in ticks of the task and of its mailbox's
-    fastest reader."""
+    """A place for a fault. `cycle`: the period of the task, or of a mailbox's messages, ticks;
+    `reader`: that of its fastest reader."""
 
     kind: str
     board: str
@@ -119,7 +119,8 @@ class Targets:
             return self._at(kind.name, self._tasks(kind))
         targets = []
         for box in filter(partial(self._is_seen, kind), self.layout.mailboxes):
-            cycle = cycle_ticks(self.layout, box.writer)
+            # The servo level writes a scene in one of its cycles out of many.
+            cycle = max(cycle_ticks(self.layout, box.writer), box.every)
             reader = min(between_reads(self.layout, box, reader) for reader in box.readers)
             targets.append(Target(kind.name, box.writer, cycle, box.name, reader))
         return targets
