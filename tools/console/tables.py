@@ -4,6 +4,7 @@ or coloured."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from io import StringIO
 from typing import Any
 
@@ -94,6 +95,20 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterat
         )
         if number == 0:
             yield f"|{'|'.join('-' * (width + 2) for width in widths)}|"
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table as data. `dropped` are columns that a narrow terminal leaves out, the first of them
+    first."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    dropped: Sequence[str] = ()
+
+    def markdown(self) -> Iterator[str]:
+        """Yield all of it in Markdown."""
+        return markdown_table(self.head, self.rows)
 
 
 def decimal(value: float | None, digits: int = 3) -> str:

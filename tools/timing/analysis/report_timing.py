@@ -1,0 +1,149 @@
+"""Times of cycles, misses and system responses, as a report's text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rack.tools.console.tables import TextTable, decimal, figure
+from rack.tools.recording.history import counted
+
+Report = dict[str, Any]
+
+SHOWN = 10
+"""Most misses, holds and long responses in the text; report.json has them all."""
+
+COUNTS = ("task", "R", "cycles", "missed", "skipped")
+BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
+"""Times relative to a release or a time slice: they mean nothing in lockstep."""
+USED = ("exec p50", "exec p99", "exec max", "comm p99", "proc p99", "plan age max")
+JUDGED = {True: "ok", False: "FAILS", None: "-"}
+DROPPED = (
+    *("deviation", "comm p99", "proc p99", "late p50", "exec p50", "alpha", "late p99", "exec p99"),
+    *("plan age max", "R", "cycles"),
+)
+"""Columns that a narrow terminal leaves out, the first of them first."""
+
+
+def the_most(rows: Sequence[Any], which: str) -> str:
+    """Return, for a heading, which of the rows are shown; "" if all are."""
+    return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
+
+
+def times_text(report: Report) -> Iterator[str | TextTable]:
+    """Yield the table of cycles, without what means nothing in lockstep."""
+    is_lockstep = report["mode"] == "lockstep"
+    yield from ("", "## Cycles, ms", "")
+    if is_lockstep:
+        yield (
+            "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no"
+            " lateness, no residuals."
+        )
+        yield ""
+    for name, (traced, ran) in report["untraced"].items():
+        yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
+    head = (*COUNTS, *(() if is_lockstep else BY_THE_CLOCK), *USED)
+    cells = [_times_row(name, task) for name, task in report["tasks"].items()]
+    yield TextTable(head, [[row[name] for name in head] for row in cells], DROPPED)
+
+
+def _times_row(name: str, task: Report) -> dict[str, str]:
+    row = {"task": name, "R": f"{task['slice_ms']:g}"}
+    row |= {key: str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")}
+    for title, key in (("late", "lateness_ms"), ("exec", "execution_ms")):
+        row |= {f"{title} {part}": figure(task[key], part) for part in ("p50", "p99", "max")}
+    row |= {key: decimal(task[f"{key}_ms"]) for key in ("deviation", "alpha")}
+    row |= {
+        "comm p99": figure(task["communication_ms"], "p99"),
+        "proc p99": figure(task["processor_ms"], "p99"),
+    }
+    row |= {
+        "residual min": figure(task["residual_ms"], "min"),
+        "plan age max": figure(task.get("plan_age_ms"), "max"),
+    }
+    return row
+
+
+def misses_text(report: Report) -> Iterator[str | TextTable]:
+    """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
+    misses = report["misses"]
+    if not misses:
+        return
+    late, skipped = counted(misses)
+    yield from (
+        "",
+        f"## Missed and skipped cycles: {late} and {skipped}{the_most(misses, 'first')}",
+        "",
+    )
+    if (late, skipped) != (report["missed"], report["skipped"]):
+        of_all = f"{report['missed']} and {report['skipped']}"
+        why = (
+            "the recorder lost rows"
+            if report["rows_lost"]
+            else "the recording does not hold all of it"
+        )
+        yield from (f"The tasks counted {of_all}; {why}.", "")
+    rows = [
+        [
+            str(miss["tick"]),
+            miss["task"],
+            miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
+            *(decimal(miss.get(key)) for key in ("started_ms", "took_ms")),
+        ]
+        for miss in misses[:SHOWN]
+    ]
+    yield TextTable(("tick", "task", "what", "started late, ms", "took, ms"), rows)
+
+
+def response_text(response: Report | None) -> Iterator[str | TextTable]:
+    """Yield the responses of all chains of levels against their bounds, and what is beyond."""
+    if response is None:
+        return
+    yield from ("", "## System response, ms of simulated time")
+    for found in (response, *response["others"]):
+        yield from _response_along(found)
+
+
+def _response_along(response: Report) -> Iterator[str | TextTable]:
+    yield ""
+    bounds = (
+        f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
+    )
+    yield (
+        f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its"
+        " cycle."
+    )
+    yield ""
+    ways = {"command, down": response["command"], "status, up": response["status"]}
+    rows = [
+        [
+            (
+                way
+                if len(found["levels"]) == len(response["levels"])
+                else f"{way} from {found['levels'][0]}"
+            ),
+            *(figure(found["measured_ms"], key) for key in ("p50", "max")),
+            f"{found['bound_ms']:g}",
+            JUDGED[found["holds"]],
+        ]
+        for way, found in ways.items()
+        if found["levels"]
+    ]
+    yield TextTable(("way", "measured p50", "measured max", "bound", ""), rows)
+    for way, found in ways.items():
+        if found["beyond"]:
+            yield from (
+                "",
+                (
+                    f"{way}: {len(found['beyond'])} beyond the"
+                    f" bound{the_most(found['beyond'], 'longest')}:"
+                ),
+            )
+        for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
+            why = "; ".join(each["delayed_by"]) or "no cause is recorded"
+            yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
+        if found["unseen"]:
+            yield from (
+                "",
+                f"{way}: {found['unseen']} not measured: messages are missing in the recording.",
+            )
