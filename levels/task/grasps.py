@@ -21,10 +21,9 @@ from rack.levels.task.program import DOWN, Transfer
 UP = np.array([0.0, 0.0, 1.0])
 QUARTERS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
-TILTS_DEG = (*range(10, 91, 10), *range(15, 80, 10))
+TILTS_DEG = (*range(10, 91, 10), *range(15, 90, 10))
 """Angles from straight down at which the tool may take an object that it cannot take so, in the
 order of trying."""
-# Not 85: the PUMA has let a block slip by 12 mm in its fingers.
 FULL_ORIENTATION = 6
 """Joints that bring the tool to a place in every orientation; one of fewer leans away from its
 base alone."""
