@@ -126,7 +126,10 @@ class SilenceWatch:
 
     def _is_mute(self, tick: int) -> bool:
         """Say whether the writer has finished a release that writes a message, and the newest is of
-        an earlier one."""
+        an earlier one.
+
+        A release before the reader's own pause may have been skipped by the clock.
+        """
         accesses = self._reader.accesses
         if any(
             self._episodes.is_open(code, accesses, tick)
@@ -141,6 +144,8 @@ class SilenceWatch:
         # A serial without a message was lost on the way, not suppressed.
         spec = self._reader.spec
         due = finished - (finished + spec.ahead - spec.phase) % spec.every
+        if due < self._task.since:
+            return False
         return slots.copy(head) and slots.serial == head and slots.tick < due
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:

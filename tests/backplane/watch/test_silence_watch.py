@@ -148,6 +148,22 @@ def test_after_a_pause_of_the_clock_no_writer_is_silent(
     assert not any(seen.is_lost for seen in rack.reader.seen)
 
 
+def test_a_message_that_was_due_in_a_pause_of_the_clock_was_not_suppressed(
+    link: MakeLink,
+) -> None:
+    # Written in each eighth cycle of its writer, as scenes are.
+    rack = link(cycles=8)
+    rack.run(0, 80)
+    # Those of ticks 87, 95 and 103 were skipped; the next is of 111.
+    rack.run(105, 130)
+    assert rack.alarms() == []
+    for tick in range(130, 180):
+        rack.writer.end(tick)
+        rack.reader.cycle(tick)
+    # The newest is of tick 127: three of its periods later.
+    assert rack.alarms() == [(151, Alarm.MUTE)]
+
+
 def test_a_pause_does_not_hide_a_writer_that_stays_away(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
