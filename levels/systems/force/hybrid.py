@@ -62,7 +62,7 @@ class HybridExecutor(WristLevel):
         self._watch = ComplianceWatch(cell.wrist.most, context.every)
         self._law = HybridLaw(cell, read_params(HybridGains, context.params))
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
-        self._boards = JointBoards(context.robot.joints)
+        self._boards = JointBoards(context.robot.joints, cell.bounds.position)
         self._target: Array = cell.home.copy()  # (joints,), rad: commanded last
         # (joints,), rad/s: of the motion alone, without that for forces.
         self._moving = np.zeros(len(cell.home))

@@ -14,7 +14,8 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload
 
 MOVED_RAD = 0.01
-"""Distance of a joint from where the loads were computed at which they are computed again."""
+"""Distance of a joint from where the loads were computed at which they are computed again; and
+beyond its range at which a position is a mistake, not rounding."""
 AT = slice(0, 2)
 DUE = slice(2, 4)
 """Rows of inertia, kg m2, and load, N m: at the beginning of an interval, and at its end."""
@@ -29,22 +30,41 @@ class JointLoads:
         self.table = np.zeros((4, joints))  # in the rows `AT` and `DUE`
         self._begin = self._due = 0  # tick
         self._payload = Payload(0.0, np.zeros(3))
+        self._home = cell.home
+        self._most = cell.bounds.torque
+        # What these torques accelerate as far as the arm may.
+        self._most_inertia = self._most / cell.limits.acceleration
+        low, high = cell.bounds.position.T
+        self._low = low - MOVED_RAD
+        self._high = high + MOVED_RAD
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(joints)
         # (joints,), rad; NaN: they are those of a reference.
         self._computed_at = np.full(joints, np.nan)
 
-    @staticmethod
-    def are_good(command: Message) -> bool:
-        """Return whether a `JOINT_REFERENCE` has inertias and loads that a torque can rest on."""
-        return bool(
-            np.isfinite(command.load).all()
-            and np.isfinite(command.inertia).all()
-            and command.inertia.min() > 0
-        )
+    def misfit(self, command: Message) -> str:
+        """Return the field of a `JOINT_REFERENCE` that asks for more than the arm can do; empty:
+        none does."""
+        # Written so that NaN is too much.
+        within = {
+            "position": (self._low <= command.position) & (command.position <= self._high),
+            "inertia": (command.inertia > 0.0) & (command.inertia <= self._most_inertia),
+            "load": np.abs(command.load) <= self._most,
+            "payload_mass": self._can_hold(command),
+        }
+        return next((name for name, fits in within.items() if not np.all(fits)), "")
+
+    def _can_hold(self, command: Message) -> bool:
+        """Return whether the motors hold the arm at home with the payload of a reference."""
+        mass = command.payload_mass
+        offset = command.payload_offset
+        if mass == self._payload.mass and (offset == self._payload.offset).all():
+            return True
+        bias = self._dynamics.terms(self._home, self._still, Payload(mass, offset)).bias
+        return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
     def take(self, command: Message, tick: int) -> None:
-        """Go over to those of a good `JOINT_REFERENCE` until it is due."""
+        """Go over to those of a `JOINT_REFERENCE` that fits, until it is due."""
         self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick

@@ -101,6 +101,7 @@ class JointServo(Executor):
         self._shown_numbers: tuple[Array, ...] = ()  # of the messages to write
         self._offered: Message | None = None  # reference whose loads are not yet taken
         self._command = self._rests_on = self._due = 0
+        self._refused = ""  # why the newest reference was not taken
         self._shown: tuple[Any, ...] = ()  # in the last status
         self._met = False  # a status of the arm has come
 
@@ -227,7 +228,11 @@ class JointServo(Executor):
             command: Message = read.command.value
             self._command = command.id
             self._rests_on = command.operator
-            if not self.loads.are_good(command):
+            self._refused = ""
+            if misfit := self.loads.misfit(command):
+                # Before there is a set point, all is zero.
+                if command.due:
+                    self._refused = f"rejected: a reference whose {misfit} is out of range"
                 return
             self.reference.take(command)
             self._offered = command
@@ -258,7 +263,7 @@ class JointServo(Executor):
             kept = f"arm: {arm.reason}"
             if arm.state == State.ERROR:
                 error = Error(arm.error)
-        note = kept or self._modified.reason
+        note = kept or self._refused or self._modified.reason
         shown = self._command, holding, stopped or operator.stands, self._due, note, error
         if shown == self._shown:
             return

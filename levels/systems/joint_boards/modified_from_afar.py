@@ -131,12 +131,13 @@ class ModifiedFromAfar(JointServo):
     def _obey_from_afar(self, asked: Message, answer: Message) -> None:
         own = f"{self.context.board}."
         wanted = {name.removeprefix(own) for name in asked.wanted.split() if name.startswith(own)}
-        refused = [
-            why
+        refused = {
+            name: why
             for name in sorted(wanted ^ self._asked)
             if (why := self._modified.switch(name, name in wanted))
-        ]
-        self._asked = wanted
+        }
+        # Those refused are asked for in every message, and each answer says so.
+        self._asked = wanted.difference(refused)
         answer.echo = asked.id
         answer.error = len(refused)
-        answer.reason = "; ".join(refused)
+        answer.reason = "; ".join(refused.values())

@@ -8,6 +8,7 @@ from rack.backplane.message import Message, State
 from rack.levels.level import Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import TASK_STATUS
 from rack.levels.peer import PEER, Presence
+from rack.levels.servo.reference import MAX_AHEAD_S
 from rack.levels.systems.joint_boards.gateway import (
     LEAD_CYCLES,
     GatewayParams,
@@ -62,6 +63,7 @@ class NetworkGateway(JointGateway):
         self._ahead = self._period + LEAD_CYCLES * context.every
         self._above = "lan"
         self._arrived = Message(JOINT_REFERENCE.dtype(context.sizes))
+        self._refused = ""  # why the newest reference was not taken
         self._their_s = 0.0  # simulated time there less that here
         self._program: Message
 
@@ -74,6 +76,9 @@ class NetworkGateway(JointGateway):
             # Its references would not be followed, and its motion would begin without the arm.
             write.status.stopped = True
             write.status.reason = "the clocks of both racks are not compared yet"
+        elif self._refused:
+            write.status.state = State.HOLDING
+            write.status.reason = self._refused
         program: Message = read.program.value
         if program.state in (State.DONE, State.ERROR):
             write.status.state = program.state
@@ -96,8 +101,13 @@ class NetworkGateway(JointGateway):
             arrived = self._arrived
             arrived.copy_from(command.value)
             arrived.operator = 0  # of the other rack's operators, whose numbers mean nothing here
+            self._refused = ""
             if arrived.due:
                 due_s = arrived.due * self._tick_s - self._their_s
+                ahead_s = due_s - tick * self.context.tick_s
+                if abs(ahead_s) > MAX_AHEAD_S:
+                    self._refused = f"rejected: a reference due in {ahead_s:.3g} s"
+                    return
                 arrived.due = round(due_s / self.context.tick_s)
             begins = arrived.due + self.latency - self._ahead if arrived.due else tick
             self._down.append((begins, bytes(arrived.raw)))

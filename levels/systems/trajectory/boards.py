@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rack.levels.algebra import Array
 from rack.levels.level import Reading
 
 HANDOVER_CYCLES = 4
@@ -24,9 +25,13 @@ class JointBoards:
     there.
     """
 
-    def __init__(self, joints: Sequence[str], handover: int = HANDOVER_CYCLES) -> None:
-        """Await the joints' answer to the first set point for `handover` cycles."""
+    def __init__(
+        self, joints: Sequence[str], ranges: Array, handover: int = HANDOVER_CYCLES
+    ) -> None:
+        """Await the joints' answer to the first set point for `handover` cycles. `ranges`,
+        (joints, 2), rad: where joints can be."""
         self._joints = joints
+        self._low, self._high = ranges.T
         self._handover = handover
         self.in_step = False
         self.position = np.zeros(len(joints))  # (joints,), rad: where the boards hold the joints
@@ -74,12 +79,16 @@ class JointBoards:
         for board, reading in statuses.items():
             status = reading.value
             mine = status.driven.astype(bool)
-            # Written so that NaN does not count as rest.
+            # Written so that NaN does not count as rest, nor as a place.
             resting = (np.abs(status.target_velocity[mine]) <= MAX_REST_RAD_S).all()
-            if self._silent[board] or not (
-                status.holding and resting and np.isfinite(status.target[mine]).all()
-            ):
+            if self._silent[board] or not (status.holding and resting):
                 self.awaited = f"waiting for {board}: it does not hold its joints at rest"
+                return False
+            inside = (self._low <= status.target) & (status.target <= self._high)
+            if (astray := mine & ~inside).any():
+                joint = int(astray.argmax())
+                place = f"'{self._joints[joint]}' at {status.target[joint]:.3g} rad"
+                self.awaited = f"waiting for {board}: it holds {place}, out of its range"
                 return False
             self.position[mine] = status.target[mine]
             driven |= mine

@@ -74,7 +74,7 @@ class TrajectoryExecutor(Executor):
         self._agenda = Agenda()
         self._motion = SampledMotion(cell.limits, robot.joints, context.period_s, cell.home)
         self._work = self.work(self._agenda, self._motion, tools)
-        self._boards = JointBoards(robot.joints, params.handover)
+        self._boards = JointBoards(robot.joints, cell.bounds.position, params.handover)
         self._guard = TouchGuard(context.period_s)
         self._orders = Orders(self.commands)
         self._dynamics = Dynamics(cell)

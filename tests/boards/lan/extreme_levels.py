@@ -31,10 +31,7 @@ class Extremes(Executor):
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
         """Return the port that sends."""
-        kind = ImportConfig.model_validate(
-            {"from": "x/x.x", "type": params["type"], "rate_hz": 1, "max_age_ms": 1}
-        ).message_type()
-        return MadePorts(outputs={params["port"]: Output(kind)})
+        return MadePorts(outputs={params["port"]: Output(message_type(params["type"]))})
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Write the next one."""
@@ -42,14 +39,22 @@ class Extremes(Executor):
         getattr(write, self.context.params["port"]).raw[:] = self._rows[at]
 
 
-def cases(kind: MessageType, base: Mapping[str, Any]) -> Iterator[Case]:
+def message_type(name: str) -> MessageType:
+    """Return a message type by its name in a config."""
+    table = {"from": "x/x.x", "type": name, "rate_hz": 1, "max_age_ms": 1}
+    return ImportConfig.model_validate(table).message_type()
+
+
+def cases(
+    kind: MessageType, base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
+) -> Iterator[Case]:
     """Yield the base itself, and the base with each field at each of its extremes. A group's are
     those of its first."""
-    plain = filled(kind, base)
+    plain = filled(kind, base, sizes)
     yield "plain", bytes(plain.raw), True
     for path, field in _leaves(kind.fields):
         for value in _extremes(field, plain.record.dtype, path):
-            message = filled(kind, base)
+            message = filled(kind, base, sizes)
             message.record[path[0]][...] = message.record[path[0]]
             at: Any = message.record
             for name in path[:-1]:
@@ -64,9 +69,11 @@ def cases(kind: MessageType, base: Mapping[str, Any]) -> Iterator[Case]:
                 )
 
 
-def filled(kind: MessageType, base: Mapping[str, Any]) -> Message:
+def filled(
+    kind: MessageType, base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
+) -> Message:
     """Return a message with these fields."""
-    message = Message(kind.dtype({}))
+    message = Message(kind.dtype(sizes or {}))
     for name, value in base.items():
         if isinstance(value, Mapping):
             for inner, number in value.items():

@@ -92,11 +92,24 @@ def test_an_arm_that_holds_a_part_carries_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("inertia", "load"), [(0.0, 1.0), (math.nan, 1.0), (math.inf, 1.0), (1.0, math.nan)]
+    ("field", "value"),
+    [
+        *(("inertia", value) for value in (0.0, math.nan, math.inf, 1e308)),
+        *(("load", value) for value in (math.nan, 1e3, -1e308)),
+        *(("position", value) for value in (math.nan, 7.0, -1e308)),
+        *(("payload_mass", value) for value in (-1.0, 100.0, 1e308)),
+    ],
 )
-def test_a_reference_on_which_no_torque_can_rest_is_not_taken(inertia: float, load: float) -> None:
-    assert JointLoads.are_good(reference(20, 1.0, 1.0))
-    assert not JointLoads.are_good(reference(20, inertia, load))
+def test_a_reference_that_asks_for_more_than_the_arm_can_do_is_named(
+    field: str, value: float
+) -> None:
+    puma = cell("puma560")
+    loads = JointLoads(puma)
+    message = reference(20, 1.0, 1.0)
+    message.position = puma.home
+    assert loads.misfit(message) == ""
+    setattr(message, field, value)
+    assert loads.misfit(message) == field
 
 
 def test_torques_of_all_boards_are_added_up() -> None:
