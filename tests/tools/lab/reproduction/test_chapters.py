@@ -24,17 +24,31 @@ from rack.tools.lab.reproduction.experiments.determinism import (
     ComparedRuns,
 )
 from rack.tools.lab.reproduction.experiments.experiment import KEPT, Experiment, Found, Workshop
+from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
 from rack.tools.lab.reproduction.experiments.measured import (
     PARTITION,
     SWITCH,
     SwitchRun,
 )
-from rack.tools.lab.reproduction.experiments.sharing import CHAINS, ChainRun, Chains
+from rack.tools.lab.reproduction.experiments.sharing import (
+    CHAINS,
+    ChainRun,
+    Chains,
+)
 from rack.tools.lab.reproduction.experiments.tables import TABLES, FiredRow, TableRun, TableRuns
+from rack.tools.lab.reproduction.experiments.tasks import NetworkRun
 from rack.tools.lab.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
 from rack.tools.lab.reproduction.sections import application, model, opening, timing
-from rack.tools.lab.reproduction.sections.page import Assessment, Chapter, Findings, Ruling
+from rack.tools.lab.reproduction.sections.page import (
+    DONE,
+    Assessment,
+    Chapter,
+    Findings,
+    Ruling,
+)
+from rack.tools.lab.reproduction.sections.sharing import judge_background, judge_loose
 from rack.tools.recording.history import Difference
+from rack.tools.timing.charts.panel import Count
 
 SECTIONS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
 NOWHERE = Workshop(Path("nowhere"), share=True)
@@ -153,6 +167,48 @@ def test_state_tables_must_answer_the_disturbance() -> None:
     ):
         found = TableRuns(disturbed, calm)
         assert judged(application.CHAPTER, "state-tables", TABLES, found).ruling is ruling
+
+
+@pytest.mark.parametrize(
+    ("late", "blocks", "in_line", "ruling"),
+    [
+        (0, 9, 99, Ruling.HOLDS),
+        (2, 9, 99, Ruling.BOUNDED),
+        (3, 9, 99, Ruling.FAILS),
+        (0, 0, 99, Ruling.FAILS),
+        (0, 9, 9, Ruling.FAILS),
+    ],
+    ids=["in time", "stray", "late", "nothing stored", "in time in the cycle, too"],
+)
+def test_background_work_is_done_and_makes_no_cycle_late(
+    late: int, blocks: int, in_line: int, ruling: Ruling
+) -> None:
+    behind, line = (
+        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, (), {}, 0, 0, {})
+        for bad in (late, in_line)
+    )
+    assert judge_background(behind, line).ruling is ruling
+
+
+@pytest.mark.parametrize(
+    ("missed", "response_ms", "ended", "ruling"),
+    [
+        (0.0, 150.0, DONE, Ruling.HOLDS),
+        (0.01, 150.0, DONE, Ruling.BOUNDED),
+        (0.03, 150.0, DONE, Ruling.FAILS),
+        (0.0, 60.0, DONE, Ruling.FAILS),
+        (0.0, 250.0, DONE, Ruling.FAILS),
+        (0.0, None, DONE, Ruling.FAILS),
+        (0.0, 150.0, "time over", Ruling.FAILS),
+    ],
+    ids=["follows", "stray", "late servo", "too early", "too late", "no response", "undone"],
+)
+def test_a_slower_network_delays_the_response_and_no_servo_cycle(
+    missed: float, response_ms: float | None, ended: str, ruling: Ruling
+) -> None:
+    plain = NetworkRun(DONE, 8.0, 0.0, {}, 0.0, 50.0)
+    later = replace(plain, ended=ended, servo_missed=missed, response_ms=response_ms)
+    assert judge_loose(plain, later).ruling is ruling
 
 
 TIMES = {"min": 4.0, "p50": 5.0, "p99": 9.0, "p99_9": 9.0, "max": 12.0}

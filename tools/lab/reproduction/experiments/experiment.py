@@ -58,7 +58,7 @@ class Workshop:
     holds."""
 
     def __init__(self, folder: Path, share: bool) -> None:
-        self.folder = folder
+        self.folder = folder.absolute()
         self.share = share
 
     @property

@@ -14,6 +14,7 @@ from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.trace_times import plans
+from rack.tools.lab.benches import storing
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
@@ -31,6 +32,9 @@ LAUNCH_S = 2.5
 LEVEL = "level"
 PLANNER = "level.planner"
 """Tasks of these racks."""
+STORING_MS = 30.0
+"""About how long a block takes to store."""
+PARTS = {"planner": "plan_ms", "executor": "process_ms"}
 COMMON = 4
 """Patterns of a lane that are kept, the most frequent ones."""
 MS = 1e-6
@@ -39,23 +43,28 @@ MS = 1e-6
 @dataclass(frozen=True)
 class FigureRack:
     """A figure of the paper: its config, drawn over so many cycles, with another X, ms, or another
-    protocol for the plan, if given."""
+    protocol for the plan, if given; or with a task, "planner" or "executor", that stores data."""
 
     config: str
     cycles: int
     process_ms: float | None = None
     protocol: str = ""
+    stores: str = ""
 
     @property
     def label(self) -> str:
         """Name of its experiment and of its pictures."""
-        if self.protocol:
-            return f"{self.config}-{self.protocol}"
+        if variant := self.protocol or self.stores:
+            return f"{self.config}-{variant}"
         return self.config if self.process_ms is None else f"{self.config}-x{self.process_ms:g}"
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The settings with which its executor takes this X, or its plan this way."""
+        """The settings for this X, for its plan this way, or with which a task stores."""
+        if self.stores:
+            level = f"board.{LEVEL}"
+            task = f'{level}.{self.stores}="{storing.__name__}:Storing{self.stores.capitalize()}"'
+            return task, f"{level}.budget.{PARTS[self.stores]}={STORING_MS}"
         if self.protocol:
             return (f'protocol.mailbox={{ "{LEVEL}.plan" = "{self.protocol}" }}',)
         return () if self.process_ms is None else settings_of(self.config, self.process_ms)

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import partition, switch
 from rack.tools.lab.benches.observed import Runs
@@ -22,9 +20,8 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     inputs,
     need_real_time,
 )
-from rack.tools.recording.history import counted, misses
 
-COMMANDS = 16
+COMMANDS = 12
 TWINS = 1
 SEED = 1
 PARTITION_S = 12.0
@@ -33,19 +30,6 @@ SYSTEM_S = 4.0
 SYSTEM_LASTS_S = 15.0
 POSES_LAST_S = 19.0
 """About how long a rack takes, and how much longer one with a PUMA."""
-TASKS_S = {
-    "rccl": 17.5,
-    "hic": 14.2,
-    "condor": 14.3,
-    "ibm": 28.1,
-    "chimera": 31.9,
-    "penn": 26.2,
-    "brown": 8.2,
-}
-"""The systems, with the simulated time of their tasks; experiments of their own run the tasks of
-NASREM and of the state tables."""
-ONE_RACK = {"brown": "brown/one-machine"}
-"""The config in which a system is one rack, where its main one needs another rack."""
 LAUNCH_S = 3.0
 NAME = "nasrem"
 
@@ -95,7 +79,7 @@ def _response(workshop: Workshop) -> ResponseRun:
 RESPONSE = Experiment(
     "response",
     "holds and resumes by an operator",
-    80.0,
+    62.0,
     ResponseRun,
     inputs(NAME, commands=COMMANDS, twins=TWINS, seed=SEED),
     _response,
@@ -142,40 +126,3 @@ def compared(each: Sequence[Systems]) -> Systems:
 
 SYSTEMS = tuple(system_experiment(name) for name in systems())
 """Every rack that models a system, NASREM first."""
-
-
-@dataclass(frozen=True)
-class TaskRun:
-    """A system's whole task in real time: how it ended, the part of all cycles missed or skipped,
-    and the messages in each mailbox."""
-
-    ended: str
-    lasted_s: float
-    missed: float
-    messages: dict[str, int]
-
-
-def _task(name: str, workshop: Workshop) -> TaskRun:
-    need_real_time()
-    result, recording = workshop.run(f"task-{name}", workshop.config(ONE_RACK.get(name, name)))
-    cycles = sum(map(len, recording.cycles.values()))
-    boxes = {box: recording.signal(box, "serial") for box in recording.mailboxes}
-    return TaskRun(
-        ended=result.outcome.cause,
-        lasted_s=result.outcome.ticks * recording.layout.clock_ns * 1e-9,
-        missed=sum(counted(misses(recording))) / cycles,
-        messages={box: len(np.unique(serials)) for box, serials in boxes.items()},
-    )
-
-
-TASKS = {
-    name: Experiment(
-        f"task-{name}",
-        f"the whole task of {name} in real time",
-        lasts_s + LAUNCH_S,
-        TaskRun,
-        inputs(ONE_RACK.get(name, name)),
-        partial(_task, name),
-    )
-    for name, lasts_s in TASKS_S.items()
-}

@@ -11,12 +11,8 @@ from rack.tools.lab.benches.systems.bench import systems
 from rack.tools.lab.benches.systems.figures import SystemFigures, SystemPrediction, prediction
 from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
-from rack.tools.lab.reproduction.experiments.measured import (
-    SYSTEMS,
-    TASKS,
-    TaskRun,
-    compared,
-)
+from rack.tools.lab.reproduction.experiments.measured import SYSTEMS, compared
+from rack.tools.lab.reproduction.experiments.tasks import TASKS, TaskRun
 from rack.tools.lab.reproduction.sections.page import (
     DONE,
     STRAY,
@@ -194,7 +190,15 @@ LINKS: dict[str, dict[str, int]] = {
     "chimera": {"command.requests": 1, "bridge.requests": 1},
     "condor": {"workstation.plan": 1, "adapter.plan": 1},
     "penn": {"coordinator.requests": 1, "bridge.requests": 1},
-    "brown": {"planning.plan": 1, "trajectory.command": 100, "supervisor.command": 500},
+    # Rates of the general machine; of the servo rack, which begins later, and of the network four
+    # messages of five.
+    "brown": {
+        "planning.plan": 1,
+        "trajectory.command": 50,
+        "lan.reference": 40,
+        "lan.joints": 40,
+        "supervisor.command": 400,
+    },
     "ibm": {"bridge.requests": 1, "bridge.sensors": 50, "bridge.motion": 200},
     SERVICES: {"workstation.plan": 1, "adapter.hand": 50, "adapter.world": 50},
     "hic": {"tendon.command": 500, "joint.command": 500, "fingertip.command": 125},

@@ -12,8 +12,24 @@ from rack.tools.lab.reproduction.experiments.sharing import (
     Chains,
     Waits,
 )
-from rack.tools.lab.reproduction.sections.gantt import BUFFERED, FIG3, FIG4, judge_both, ran_all
+from rack.tools.lab.reproduction.experiments.tasks import (
+    LATER,
+    LATER_MS,
+    NETWORK,
+    NetworkRun,
+)
+from rack.tools.lab.reproduction.sections.gantt import (
+    BEHIND,
+    BUFFERED,
+    FIG3,
+    FIG4,
+    IN_LINE,
+    MOSTLY,
+    judge_both,
+    ran_all,
+)
 from rack.tools.lab.reproduction.sections.page import (
+    DONE,
     STRAY,
     ClaimVerdict,
     Columns,
@@ -24,6 +40,10 @@ from rack.tools.lab.reproduction.sections.page import (
     ruled,
     ruled_strays,
 )
+
+EXCHANGE_MS = 40.0
+"""Largest difference between two waits for an exchange: a cycle of 20 ms above, two of 10 ms on the
+network."""
 
 
 def judge_speedup(one: FigureRun, two: FigureRun) -> ClaimVerdict:
@@ -94,6 +114,44 @@ def judge_waits(found: Waits) -> ClaimVerdict:
     )
 
 
+def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
+    """Count the cycles that are late while a level stores data in the background, and compare with
+    storing in the cycle."""
+    cycles = behind.tasks[LEVEL]
+    blocks = behind.tasks[PLANNER].jobs
+    late = Requirement("in the cycle: part of cycles late", in_line.late(LEVEL), ">=", MOSTLY)
+    stored = (Requirement("blocks stored in the background", blocks, ">=", 1), late)
+    what = "in the background: cycles late"
+    return ruled(
+        (Requirement(what, cycles.late, "=", 0), *stored),
+        f"The time that the executor left was enough to store {blocks} blocks, and none of its"
+        f" {cycles.jobs} cycles was late for them; with a block in each cycle they are.",
+        here=(Requirement(f"{what}, part of all", behind.late(LEVEL), "<=", STRAY), *stored),
+    )
+
+
+def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
+    """Compare the servo rack's cycles, and when it responds to the machine above, with a network
+    and with a slower one."""
+    runs = {"network": plain, f"{LATER_MS} ms slower": later}
+    shares = [
+        (f"{name}: part of the servo rack's cycles missed", run) for name, run in runs.items()
+    ]
+    answered = [run.response_ms for run in runs.values() if run.response_ms is not None]
+    slower_ms = answered[-1] - answered[0] if len(answered) == len(runs) else 0.0
+    always = (
+        Requirement("whole tasks done", sum(run.ended == DONE for run in runs.values()), "=", 2),
+        Requirement("response later by", slower_ms, ">=", LATER_MS - EXCHANGE_MS, "ms"),
+        Requirement("response later by", slower_ms, "<=", LATER_MS + EXCHANGE_MS, "ms"),
+    )
+    return ruled(
+        (*(Requirement(name, run.servo_missed, "=", 0.0) for name, run in shares), *always),
+        "The servo rack kept its cycles with both; the response to the machine above is as much"
+        " later as the network is slower, and the task is done.",
+        here=(*(Requirement(name, run.servo_missed, "<=", STRAY) for name, run in shares), *always),
+    )
+
+
 def judge_replication() -> ClaimVerdict:
     """Refuse to rule: nothing here takes over the work of a board."""
     built = Requirement("boards that a replica can replace", 0, ">=", 1)
@@ -132,6 +190,21 @@ def _waits(findings: Findings) -> Side:
     return [Columns(("waits by", "late, median, us", "99th percentile", "longest"), rows)]
 
 
+def _networks(findings: Findings) -> Side:
+    rows = []
+    for later_ms, experiment in ((0, NETWORK), (LATER_MS, LATER)):
+        run = findings.of(experiment)
+        response = "-" if run.response_ms is None else f"{run.response_ms:.0f}"
+        rows.append((later_ms, response, f"{100 * run.servo_missed:.2f}", run.ended))
+    head = (
+        "network slower by, ms",
+        "a modification wanted above is in force after, ms",
+        "missed by the servo rack, %",
+        "end of the task",
+    )
+    return [Columns(head, rows, "Brown's two racks, in real time.")]
+
+
 SPEEDUP = Statement(
     "speedup", (FIG3.experiment, FIG4.experiment), judge_speedup, measured=ran_all(FIG3, FIG4)
 )
@@ -141,6 +214,13 @@ LOCK = Statement("locks", (CHAINS,), judge_locks, measured=_chains)
 PIPELINE = Statement("pipeline", (CHAINS,), judge_pipeline, _pipeline, _chains)
 UPDATE = Statement("update", (FIG3.experiment,), judge_update, measured=_updates)
 WAITING = Statement("waiting", (WAITS,), judge_waits, measured=_waits)
+BACKGROUND = Statement(
+    "background",
+    (BEHIND.experiment, IN_LINE.experiment),
+    judge_background,
+    measured=ran_all(BEHIND, IN_LINE),
+)
+LOOSE = Statement("loosely-coupled", (NETWORK, LATER), judge_loose, measured=_networks)
 EXCHANGE = Statement(
     "slices-and-buffers",
     (FIG4.experiment, BUFFERED.experiment),

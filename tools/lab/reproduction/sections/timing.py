@@ -34,7 +34,13 @@ from rack.tools.lab.reproduction.sections.page import (
     ruled,
     text,
 )
-from rack.tools.lab.reproduction.sections.sharing import EXCHANGE, UPDATE, WAITING
+from rack.tools.lab.reproduction.sections.sharing import (
+    BACKGROUND,
+    EXCHANGE,
+    LOOSE,
+    UPDATE,
+    WAITING,
+)
 
 HURRIED = ("timing.response_ms=1000",)
 """A response within 1 s is demanded of the same four levels."""
@@ -190,6 +196,8 @@ LOW = Chapter(
 HIGH = Chapter(
     "3.3",
     (
+        BACKGROUND,
+        LOOSE,
         GRID.statement(),
         WAITING,
         TIGHT.statement(),

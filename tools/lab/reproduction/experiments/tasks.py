@@ -1,0 +1,191 @@
+"""Whole tasks of the paper's systems in real time: each is one rack, but Brown's, which is two
+joined by a network."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from contextlib import chdir
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rack.boards.config import RackConfig, load
+from rack.tools.console.answer import Failure
+from rack.tools.lab.reproduction.experiments.experiment import (
+    RUNS,
+    Experiment,
+    Workshop,
+    inputs,
+    need_real_time,
+)
+from rack.tools.live.launch import RunResult
+from rack.tools.recording.history import counted, misses
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.time_line import RackGrid
+
+TASKS_S = {"rccl": 17.5, "hic": 14.2, "condor": 14.3, "ibm": 28.1, "chimera": 31.9, "penn": 26.2}
+"""The systems of one rack, with the simulated time of their tasks; experiments of their own run the
+tasks of NASREM and of the state tables."""
+BROWN = "brown"
+SERVO = "brown/servo"
+BROWN_S = 8.3
+LAUNCH_S = 3.0
+LATER_MS = 100
+"""What the machine above sends comes so much later in the second run, and is due so much later."""
+DELAYED = ("lan.reference", "lan.modifications")
+MODIFICATION = "pd"
+"""The first modification of the task."""
+
+
+@dataclass(frozen=True)
+class TaskRun:
+    """A system's whole task in real time: how it ended, the part of all cycles missed or skipped,
+    and the messages in each mailbox."""
+
+    ended: str
+    lasted_s: float
+    missed: float
+    messages: dict[str, int]
+
+
+@dataclass(frozen=True)
+class NetworkRun(TaskRun):
+    """The same of two racks: the end is that of the machine above, which ends in error with the
+    servo rack.
+
+    `servo_missed` is the servo rack's part alone; `response_ms` the time from a modification wanted
+    above until a servo law is so modified, None: it never was.
+    """
+
+    servo_missed: float
+    response_ms: float | None
+
+
+def _run(name: str, workshop: Workshop) -> TaskRun:
+    need_real_time()
+    return _found(*workshop.run(f"task-{name}", workshop.config(name)))
+
+
+def _found(result: RunResult, *recordings: Recording) -> TaskRun:
+    boxes = {box: one.signal(box, "serial") for one in recordings for box in one.mailboxes}
+    first = recordings[0]
+    return TaskRun(
+        ended=result.outcome.cause,
+        lasted_s=result.outcome.ticks * first.layout.clock_ns * 1e-9,
+        missed=_missed(*recordings),
+        messages={box: len(np.unique(serials)) for box, serials in boxes.items()},
+    )
+
+
+def _missed(*recordings: Recording) -> float:
+    cycles = sum(len(rows) for one in recordings for rows in one.cycles.values())
+    return sum(sum(counted(misses(one))) for one in recordings) / cycles
+
+
+def _run_two(later_ms: int, workshop: Workshop) -> NetworkRun:
+    """Run Brown's racks with a network that takes so much longer."""
+    need_real_time()
+    label = f"task-{BROWN}-{later_ms}"
+    path = workshop.folder / f"{label}-servo.toml"
+    path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
+    with chdir(workshop.folder):
+        # What it launches records its run below where it is.
+        result, general = workshop.run(label, _general(workshop, path))
+    (other,) = result.others
+    assert other.folder is not None, "it is recorded, as the other is"
+    folder = workshop.folder / RUNS / f"{label}-servo"
+    shutil.rmtree(folder, ignore_errors=True)
+    servo = Recording((workshop.folder / other.folder).rename(folder))
+    if lost := [one.layout.rack for one in (general, servo) if one.lost]:
+        raise Failure(f"not all of {' and '.join(lost)} is recorded")
+    return NetworkRun(
+        **vars(_found(result, general, servo)),
+        servo_missed=_missed(servo),
+        response_ms=_response_ms(general, servo),
+    )
+
+
+def _servo(workshop: Workshop, later_ms: int) -> RackConfig:
+    peer = f"lan.peer_{workshop.rack.replace('-', '_')}"
+    more = [f'adapter.lan.listen=["{_socket(workshop)}"]', f'board.supervisor.reads.peer="{peer}"']
+    if later_ms:
+        given = load(SERVO)
+        assert given.adapter.lan is not None
+        by = round(1e-3 * later_ms * given.adapter.lan.rate_hz)
+        faults = [f'{{kind="delay", board="lan", mailbox="{box}", by={by}}}' for box in DELAYED]
+        delay = given.board["supervisor"].params["delay"] + 1e-3 * later_ms
+        more += [f"board.supervisor.params.delay={delay}", f"fault=[{', '.join(faults)}]"]
+    return _renamed(workshop, SERVO, more)
+
+
+def _general(workshop: Workshop, launched: Path) -> RackConfig:
+    ways = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{launched}"]'
+    return _renamed(workshop, BROWN, ways)
+
+
+def _socket(workshop: Workshop) -> str:
+    return f"unix/{workshop.rack}-servo"
+
+
+def _renamed(workshop: Workshop, name: str, more: Sequence[str]) -> RackConfig:
+    """Return one of both racks under a name of its own, by which the other knows it."""
+    given = load(name)
+    assert given.adapter.lan is not None
+    own = {BROWN: workshop.rack, f"{BROWN}-servo": f"{workshop.rack}-servo"}
+    imports = [
+        f'adapter.lan.import.{port}.from="{own[entry.rack]}/{entry.mailbox}"'
+        for port, entry in given.adapter.lan.imports.items()
+    ]
+    return load(workshop.source(name), [*imports, *more, f"name={own[given.name]}"])
+
+
+def _response_ms(general: Recording, servo: Recording) -> float | None:
+    """Return the time from the first message that wants a modification to the status that says it
+    is in."""
+    wanted_ns = _first_ns(general, "modifications.command", "wanted")
+    is_in_ns = _first_ns(servo, "shoulder.status", "reason")
+    return None if wanted_ns is None or is_in_ns is None else 1e-6 * (is_in_ns - wanted_ns)
+
+
+def _first_ns(recording: Recording, box: str, field: str) -> int | None:
+    """Return when the first message that names the modification is visible: on CLOCK_MONOTONIC, in
+    lockstep in the simulated time of both."""
+    named = [MODIFICATION in str(text) for text in recording.signal(box, field)]
+    ticks = recording.signal(box, "visible_at")[named]
+    if not len(ticks):
+        return None
+    grid = RackGrid(recording)
+    if grid.is_lockstep:
+        return int(ticks[0]) * grid.clock_ns
+    return int(grid.stamp_ns(ticks[:1])[0])
+
+
+def _two_racks(later_ms: int, about: str) -> Experiment[NetworkRun]:
+    def depends() -> dict[str, str | int]:
+        return {"general": load(BROWN).text(), "servo": load(SERVO).text(), "later": later_ms}
+
+    name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
+    lasts_s = BROWN_S + 2 * LAUNCH_S
+    return Experiment(name, about, lasts_s, NetworkRun, depends, partial(_run_two, later_ms))
+
+
+NETWORK = _two_racks(0, "the whole task of brown's two racks in real time")
+LATER = _two_racks(LATER_MS, f"the same, with a network slower by {LATER_MS} ms")
+TASKS: dict[str, Experiment[Any]] = {
+    **{
+        name: Experiment(
+            f"task-{name}",
+            f"the whole task of {name} in real time",
+            lasts_s + LAUNCH_S,
+            TaskRun,
+            inputs(name),
+            partial(_run, name),
+        )
+        for name, lasts_s in TASKS_S.items()
+    },
+    BROWN: NETWORK,
+}
