@@ -98,7 +98,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 DEADLINE = 100
 """Stands for SCHED_DEADLINE among SCHED_FIFO's priorities, which end at 99: it precedes all."""
-_SCHED_DEADLINE = 6
+SCHED_DEADLINE = 6
 _RESET_ON_FORK = 1
 _RECLAIM = 2
 """Lets a process that exceeds its reservation use what others leave: a first cycle takes longer."""
@@ -135,7 +135,7 @@ def _reserve(reservation: Reservation) -> bool:
     runtime_ns, period_ns = reservation
     times = runtime_ns, period_ns, period_ns
     record = Struct("=IIQiIQQQ")
-    wanted = record.pack(record.size, _SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
+    wanted = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
     number = _SCHED_SETATTR.get(platform.machine())
     return number is not None and _libc.syscall(number, 0, wanted, 0) == 0
 

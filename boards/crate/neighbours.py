@@ -15,6 +15,7 @@ from pathlib import Path
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import SegmentError
+from rack.backplane.process import SCHED_DEADLINE
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Block, Run, System
 from rack.boards.config.layout import obtained_core
@@ -64,7 +65,8 @@ def _seen(rack: str) -> dict[int, Holder]:
         with suppress(OSError):  # it has ended meanwhile
             # The kernel keeps 15 characters: see `process.name_process`.
             name = (folder / "comm").read_text().strip()
-            if name.startswith(f"{rack}:"[:15]) and os.sched_getscheduler(pid) == os.SCHED_FIFO:
+            policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
+            if name.startswith(f"{rack}:"[:15]) and policy in (os.SCHED_FIFO, SCHED_DEADLINE):
                 for core in os.sched_getaffinity(pid):
                     others = held[core].tasks if core in held else ()
                     held[core] = Holder(rack, pid, (*others, name.removeprefix(f"{rack}:")))

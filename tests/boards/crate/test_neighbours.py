@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from rack.backplane.process import Reservation, name_process, take_core
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.neighbours import holders
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
-from tests.machine import needs_fifo, needs_two_cores
-from tests.processes import FORKS, RACK, exit_status, fork
+from tests.machine import needs_deadlines, needs_fifo, needs_two_cores
+from tests.processes import FORKS, RACK, exit_status, fork, forked, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
@@ -73,6 +75,23 @@ def test_a_core_held_by_another_users_rack_is_seen(first: Rack) -> None:
         return str(holders("another").get(0)).startswith(f"rack '{first.config.name}' (process ")
 
     assert exit_status(fork(look)) == 0
+
+
+@needs_deadlines
+@pytest.mark.filterwarnings(FORKS)
+def test_a_task_that_has_reserved_time_is_seen_without_its_segment(
+    rack_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rack.boards.crate.neighbours.racks", lambda: [rack_name])
+
+    def reserve() -> None:
+        take_core(0, 0, Reservation(100_000, 10_000_000))
+        name_process(f"{rack_name}:wave")
+        signal.pause()
+
+    with forked(reserve) as pid:
+        wait_until(lambda: holders("another"))
+        assert holders("another")[0].launcher == pid
 
 
 @pytest.mark.slow
