@@ -217,13 +217,12 @@ def _difference(one: Recording, other: Recording, mailbox: str) -> Difference | 
     serials = [recording.signal(mailbox, "serial") for recording in both]
     # One that continues another run begins later.
     begins = [int(np.searchsorted(each, max(s[0] for s in serials))) for each in serials]
-    # The chain covers serial, tick and content of a message and of all before it.
+    # The chain of a message covers serial, tick and content of all before it.
     chains = [run.signal(mailbox, "chain")[at:] for run, at in zip(both, begins, strict=True)]
     length = min(len(chain) for chain in chains)
     differs = np.flatnonzero(chains[0][:length] != chains[1][:length])
     if not len(differs):
         return None
-    ticks = [
-        run.signal(mailbox, "tick")[at + differs[0]] for run, at in zip(both, begins, strict=True)
-    ]
+    first = max(differs[0] - 1, 0)
+    ticks = [run.signal(mailbox, "tick")[at + first] for run, at in zip(both, begins, strict=True)]
     return Difference(int(min(ticks)), mailbox)
