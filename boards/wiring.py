@@ -41,13 +41,17 @@ class BusTimes:
 class Keeping:
     """Checkpoints of a run: into which folder, every how many ticks; 0: none.
 
-    `origin`: the file of the one that the run continues from. Classes in it are those of the rack,
-    or of modules in `packages`. It has the first `faults` and `commands` of the config in its
-    tables; `losses` are the boards that were lost before it, and when.
+    `at`: the tick of the first one, in place of the next multiple of `every`. `shows`: each task
+    leaves the attributes of its level next to each. `origin`: the file of the one that the run
+    continues from. Classes in it are those of the rack, or of modules in `packages`. It has the
+    first `faults` and `commands` of the config in its tables; `losses` are the boards that were
+    lost before it, and when.
     """
 
     folder: Path = Path()
     every: int = 0
+    at: int | None = None
+    shows: bool = False
     origin: Path | None = None
     packages: tuple[Path, ...] = ()
     faults: int = 0

@@ -151,7 +151,9 @@ class ClockDriver(ABC):
         stop = words[_STOP_TICK]
         if words[_STOP_REQUEST] and (not stop or stop > tick):
             stop = words[_STOP_TICK] = max(tick, 1)
-        if not stop and (found := self._ended(tick)) is not None:
+        # Asked in any case: a run that continues from here may end by it.
+        found = self._ended(tick)
+        if not stop and found is not None:
             stop = words[_STOP_TICK] = max(found, 1)
         return bool(stop) and tick >= stop
 

@@ -23,6 +23,8 @@ VERSION = 1
 FOLDER = "checkpoints"
 """Where they lie in the folder of a run."""
 NAME = "{:09d}.checkpoint"
+ATTRIBUTES = ".attributes"
+"""Suffix of the file, next to a checkpoint, with the attributes of a task's level as JSON."""
 _HEAD = struct.Struct("<8sIII")
 """Magic, version, size of the head as JSON, and CRC of that size and all that follows."""
 _OF_MACHINE = ("core", "priority", "slot")

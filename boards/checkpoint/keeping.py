@@ -7,6 +7,7 @@ a board is taken once the board is back: a process that is not there has no stat
 
 from __future__ import annotations
 
+import json
 import sys
 import zlib
 from functools import partial
@@ -16,10 +17,17 @@ from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.checkpoint.format import Checkpoint, PartState, layout_hash, read
+from rack.boards.checkpoint.format import (
+    ATTRIBUTES,
+    Checkpoint,
+    PartState,
+    layout_hash,
+    read,
+)
 from rack.boards.checkpoint.kinds import Keeper
 from rack.boards.checkpoint.memory import copy, regions
 from rack.boards.checkpoint.parts import Parts
+from rack.boards.checkpoint.shown import Attributes
 from rack.boards.errors import CheckpointError
 from rack.boards.run.task import Task
 from rack.boards.wiring import Keeping
@@ -69,12 +77,18 @@ class TaskKeeper(Keeper):
         self._block = task.block
         self._notify_clock = task.stopwatch.notify_clock
         self._path = keeping.folder / f"{task.spec.name}{STATE}"
+        # A task has its level under the name of its role.
+        self._level = getattr(task, task.spec.role) if keeping.shows else None
 
     def __call__(self) -> None:
         """Save it."""
         result = REFUSED
         try:
             shape = bytes.fromhex(self.parts.shape)
+            if self._level is not None:
+                self._path.with_suffix(ATTRIBUTES).write_text(
+                    json.dumps(Attributes(self.parts).of(self._level))
+                )
             self._path.write_bytes(shape + zlib.compress(self.parts.save(), 1))
             result = 0
         except (CheckpointError, OSError) as error:
@@ -96,15 +110,12 @@ class ClockKeeper(Keeper):
 
     def __call__(self, tick: int) -> None:
         """Take a checkpoint before `tick`, if one is due and every process is there."""
-        every = self._keeping.every
-        if not every:
-            return
+        keeping = self._keeping
         if self._due is None:
-            self._due = tick + 1
-            self._due += -self._due % every
+            self._due = _next(tick, keeping.every) if keeping.at is None else keeping.at
         if tick < self._due or any(task.is_lost or task.is_stopped for task in self._driver.tasks):
             return
-        self._due = tick - tick % every + every
+        self._due = _next(tick, keeping.every)
         self._driver.settle()
         if all(task.is_settled() for task in self._driver.tasks):
             self._take(tick)
@@ -133,6 +144,11 @@ class ClockKeeper(Keeper):
             Checkpoint(tick, self._layout, places, memory, parts).write(self._keeping.folder)
         except (CheckpointError, OSError) as error:
             print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
+
+
+def _next(tick: int, every: int) -> int:
+    """Return the first multiple of `every` after `tick`."""
+    return tick - tick % every + every if every else sys.maxsize
 
 
 def _has_saved(block: memoryview) -> bool:

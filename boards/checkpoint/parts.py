@@ -84,8 +84,12 @@ class Parts:
             self._all.append(thing)
             self._places.append(place)
 
-    def save(self) -> bytes:
-        """Return what has changed since. Raises `CheckpointError` for what cannot be kept."""
+    def number(self, thing: object) -> int:
+        """Return the place of a part in the walk; -1 for what was made since."""
+        return self._numbers.get(id(thing), (-1, None))[0]
+
+    def changed(self) -> dict[int, Any]:
+        """Return what has changed since in each part, by its number, as `kinds.changes` does."""
         changed = {}
         for number, before in self._before.items():
             thing = self._all[number]
@@ -93,6 +97,11 @@ class Parts:
             assert contents is not None, "it had some before"
             if (found := changes(contents(thing), before)) is not None:
                 changed[number] = found
+        return changed
+
+    def save(self) -> bytes:
+        """Return what has changed since. Raises `CheckpointError` for what cannot be kept."""
+        changed = self.changed()
         try:
             return self._pickled(changed)
         except UNPICKLABLE as error:

@@ -130,7 +130,8 @@ class Rack:
         return cls(load(str(name_or_path), overrides))
 
     def __enter__(self) -> Self:
-        self.launch()
+        if not hasattr(self, "segment"):
+            self.launch()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
@@ -160,7 +161,7 @@ class Rack:
         self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         # A level's module may have ended it: then resolving says which.
-        crate.ask(Preload(classes(self.config), tuple(sys.path), _cell(self.config)))
+        crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
         plan = resolve(self.config)
         self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
         if self._keeping is not None:
@@ -506,5 +507,6 @@ class Rack:
         return self._crate
 
 
-def _cell(config: RackConfig) -> CellConfig | None:
+def cell_of(config: RackConfig) -> CellConfig | None:
+    """Return what the crate needs to compile the cell of a rack; None without an arm."""
     return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)

@@ -245,10 +245,15 @@ class OperatorDesk:
 
 
 class EndOfRun:
-    """Decides at which tick a run ends, by ticks alone."""
+    """Decides at which tick a run ends, by ticks alone.
+
+    The end of the task is noted even where the run ends at a given tick: one that continues it may
+    end with its task.
+    """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
         self._stop_tick = wiring.stop_tick or None
+        self._task_ends: int | None = None
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
         self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
@@ -268,7 +273,7 @@ class EndOfRun:
         final = tick - 1
         if (
             final >= self._next
-            and self._stop_tick is None
+            and self._task_ends is None
             and self._reader is not None
             and self._writer is not None
         ):
@@ -279,8 +284,10 @@ class EndOfRun:
                 self._heard = boundary
             is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
             if is_over or boundary - self._heard >= self._silent:
-                self._stop_tick = max(boundary + self._linger, tick)
-        return self._stop_tick
+                self._task_ends = boundary + self._linger
+        if self._stop_tick is not None or self._task_ends is None:
+            return self._stop_tick
+        return max(self._task_ends, tick)
 
 
 def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:

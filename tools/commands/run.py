@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ import typer
 
 from rack.boards.config.files import assembled, named_classes
 from rack.boards.crate.requests import Preload
+from rack.boards.wiring import Keeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Faults, Json, Settings, View, config_names
@@ -88,8 +90,8 @@ Origin = Annotated[
         "--from",
         metavar="RUN@TIME",
         help=(
-            "continue a run, in place of CONFIG, from its last checkpoint at TIME s or before, bit"
-            " for bit; a branch of it with --set or --faults"
+            "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or --faults a"
+            " branch of it from there"
         ),
     ),
 ]
@@ -123,7 +125,8 @@ def run(
     elsewhere one line a second is printed. --json prints the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
 
-    With --from, --seconds counts from the beginning of the run that is continued, as there.
+    With --from, the rack first goes on unchanged from the checkpoint before to TIME. --seconds
+    counts from the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
@@ -150,9 +153,9 @@ def run(
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
+    if checkpoint is not None or origin is not None:
+        from rack.tools.live.continued import continued, keeping_for, run_of
     if origin is not None:
-        from rack.tools.live.continued import run_of
-
         config = str(run_of(origin))
     assert config is not None
     tables = assembled(config, overrides, faults)
@@ -162,8 +165,6 @@ def run(
     from rack.tools.live.folder import folder_of
     from rack.tools.live.launch import NO_TIME, run_rack
 
-    if checkpoint is not None or origin is not None:
-        from rack.tools.live.continued import keeping_for
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
 
@@ -172,11 +173,15 @@ def run(
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
     keeping = None
-    if checkpoint is not None or origin is not None:
-        keeping = keeping_for(found, folder, checkpoint, origin)
-    # From the start of the run to the end of its report; during the launch a signal ends the
-    # command at once.
-    with INTERRUPT.orderly(unfinished=NO_TIME.format(folder) if folder else ""):
+    if checkpoint is not None:
+        keeping = keeping_for(found, folder, checkpoint)
+    with ExitStack() as stack:
+        if origin is not None:
+            keeping = stack.enter_context(continued(found, origin, keeping or Keeping()))
+        # From the start of the run to the end of its report; during the launch a signal ends the
+        # command at once.
+        unfinished = NO_TIME.format(folder) if folder else ""
+        stack.enter_context(INTERRUPT.orderly(unfinished=unfinished))
         with display_for(silent=as_json) as display:
             again = None if entries is None else recorded_entries(found, entries)
             result = run_rack(

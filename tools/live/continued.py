@@ -1,14 +1,35 @@
-"""Checkpoints as a user asks for them: `rack run --checkpoint S`, and `--from RUN@TIME`."""
+"""Checkpoints as a user asks for them: `rack run --checkpoint S`, `--from RUN@TIME`, and the state
+of a run at any tick.
+
+Between two checkpoints the rack goes on from the earlier one, unchanged, to the tick, and keeps its
+state there. That is what a branch begins from: only there may it differ.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from rack.boards.checkpoint.format import FOLDER, checkpoints
+import numpy as np
+
+from rack.backplane.mailbox.history import chains
+from rack.backplane.segment import Segment
+from rack.boards import Rack
+from rack.boards.checkpoint.format import ATTRIBUTES, FOLDER, NAME, checkpoints
+from rack.boards.config.files import assembled
+from rack.boards.config.resolved import validated
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import CrateLine
 from rack.boards.wiring import Keeping
 from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
@@ -24,52 +45,169 @@ def run_of(origin: str) -> Path:
     return path
 
 
-def keeping_for(
-    config: RackConfig, folder: Path | None, every_s: float | None, origin: str | None
-) -> Keeping | None:
-    """Return the checkpoints that a run takes, and the one that it continues from. Raises
-    `Failure`."""
-    found = None if origin is None else _continued(config, origin)
-    if every_s is None:
-        return found
+def keeping_for(config: RackConfig, folder: Path | None, every_s: float) -> Keeping:
+    """Return the checkpoints that a run takes. Raises `Failure`."""
     if folder is None:
         raise Failure("--checkpoint and --no-record: checkpoints lie in the run's folder", 2)
     every = max(1, round(every_s * 1e9 / config.clock_ns))
-    return replace(found or Keeping(), folder=(folder / FOLDER).resolve(), every=every)
+    return Keeping((folder / FOLDER).resolve(), every)
 
 
-def _continued(config: RackConfig, origin: str) -> Keeping:
-    path = run_of(origin)
-    run, _, text = origin.rpartition("@")
-    kept = checkpoints(path.parent)
+@contextmanager
+def continued(config: RackConfig, origin: str, taken: Keeping) -> Iterator[Keeping]:
+    """Yield what a rack with this config, a branch perhaps, continues from at RUN@TIME, for as long
+    as it runs; it takes the checkpoints of `taken`. Raises `Failure`."""
+    recording = Recording(run_of(origin).parent)
+    tick = tick_of(origin.rpartition("@")[2], config.clock_ns)
+    with state_at(recording, tick, asked=f"--from {origin}") as state:
+        packages = config.python_path
+        yield replace(state.keeping, packages=packages, folder=taken.folder, every=taken.every)
+
+
+@dataclass(frozen=True)
+class RunState:
+    """The state of a run before a tick: what a rack continues from and, if asked for, the
+    attributes of its levels, by task."""
+
+    keeping: Keeping
+    attributes: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@contextmanager
+def state_at(
+    recording: Recording,
+    tick: int,
+    *,
+    asked: str = "",
+    shows: bool = False,
+    crate: CrateLine | None = None,
+) -> Iterator[RunState]:
+    """Yield the state of a run before `tick`, for as long as a rack runs that continues from it;
+    with `shows`, with the attributes of its levels.
+
+    A `crate` that was started earlier saves time. A state that is not that of the recording is
+    noted on stderr. Raises `Failure`, which begins with what was `asked`.
+    """
+    asked = asked or f"{recording.folder}@{tick * recording.layout.clock_ns * 1e-9:g}"
+    begins, before = _before(recording, tick, asked)
+    if begins == tick and not shows:
+        yield RunState(before)
+        return
+    with ExitStack() as stack:
+        with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-") as folder:
+            path = Path(folder)
+            _go_on(
+                recording, tick, replace(before, folder=path, at=tick, shows=shows), crate, asked
+            )
+            kept = stack.enter_context((path / NAME.format(tick)).open("rb"))
+            attributes = {
+                found.stem: json.loads(found.read_bytes()) for found in path.glob(f"*{ATTRIBUTES}")
+            }
+        # The file has no name any more: however this process ends, nothing is left. Boards open it
+        # by this process's descriptor.
+        origin = Path(f"/proc/{os.getpid()}/fd/{kept.fileno()}")
+        yield RunState(replace(before, origin=origin, losses=_losses(recording, tick)), attributes)
+
+
+def tick_of(text: str, clock_ns: int) -> int:
+    """Return the tick of a time, s; -1 for what is no time."""
+    try:
+        return round(float(text) * 1e9 / clock_ns)
+    except (ValueError, OverflowError):
+        return -1
+
+
+def tick_in(recording: Recording, text: str) -> int:
+    """Return the tick of a time, s, in a recorded run. Raises `Failure` for one outside, or between
+    two stretches that were kept."""
+    tick = tick_of(text, recording.layout.clock_ns)
+    is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])
+    begins, ends = ticks_of(recording)
+    if not (begins <= tick < ends and is_kept):
+        first, last = (at * recording.layout.clock_ns * 1e-9 for at in (begins, ends - 1))
+        kept = f"; {recording.kept_text}" if recording.kept else ""
+        raise Failure(f"{text}: permitted: {first:g} to {last:g} s{kept}", 2)
+    return tick
+
+
+def ticks_of(recording: Recording) -> tuple[int, int]:
+    """Return the ticks of a recorded run, [first, end)."""
+    found = [rows["tick"] for rows in recording.cycles.values()]
+    end: int = recording.ended.get("outcome", {}).get("ticks", 0)
+    end = end or max((int(ticks[-1]) + 1 for ticks in found), default=0)
+    return min((int(ticks[0]) for ticks in found), default=0), end
+
+
+def branched(recording: Recording, settings: Sequence[str], faults: str | None) -> RackConfig:
+    """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
+    overrides = [*settings, "clock.mode=lockstep"]
+    return validated(assembled(str(recording.folder / CONFIG), overrides, faults))
+
+
+def _before(recording: Recording, tick: int, asked: str) -> tuple[int, Keeping]:
+    """Return the last checkpoint at `tick` or before, and what continues from it. Raises
+    `Failure`."""
+    kept = checkpoints(recording.folder)
     if not kept:
+        path = recording.folder / CONFIG
         cure = f"from its beginning: rack run {path} --lockstep; --checkpoint S takes some"
-        raise Failure(f"--from {origin}: {run} has no checkpoints; {cure}", 2)
-    recording = Recording(path.parent)
-    ended = recording.ended.get("outcome", {}).get("ticks", max(kept) + 1)
-    tick = _tick(text, config)
-    if not min(kept) <= tick < ended:
-        first, last = (at * config.clock_ns * 1e-9 for at in (min(kept), ended - 1))
+        raise Failure(f"{asked}: {recording.folder} has no checkpoints; {cure}", 2)
+    _, ends = ticks_of(recording)
+    if not min(kept) <= tick < ends:
+        first, last = (at * recording.layout.clock_ns * 1e-9 for at in (min(kept), ends - 1))
         why = f"permitted: {first:g} to {last:g} s, from its first checkpoint to its end"
-        raise Failure(f"--from {origin}: {text}: {why}", 2)
+        raise Failure(f"{asked}: {why}", 2)
     begins = max(at for at in kept if at <= tick)
     ran = recording.rack_config
-    return Keeping(
+    keeping = Keeping(
         origin=kept[begins].resolve(),
-        packages=config.python_path,
+        packages=ran.python_path,
         faults=len(ran.fault),
         commands=len(ran.command),
-        losses=tuple(
-            (event["board"], event["tick"])
-            for event in recording.events
-            if event["kind"] == "died" and event["tick"] < begins
-        ),
+        losses=_losses(recording, begins),
+    )
+    return begins, keeping
+
+
+def _losses(recording: Recording, tick: int) -> tuple[tuple[str, int], ...]:
+    return tuple(
+        (event["board"], event["tick"])
+        for event in recording.events
+        if event["kind"] == "died" and event["tick"] < tick
     )
 
 
-def _tick(text: str, config: RackConfig) -> int:
-    """Return the tick of a time; -1 for what is no time."""
-    try:
-        return round(float(text) * 1e9 / config.clock_ns)
-    except (ValueError, OverflowError):
-        return -1
+def _go_on(
+    recording: Recording, tick: int, keeping: Keeping, crate: CrateLine | None, asked: str
+) -> None:
+    """Let the rack go on, unchanged, to `tick`, and keep its state. Raises `Failure`."""
+    config = recording.rack_config
+    # The run's own name may be in use, by a branch.
+    name = f"{config.name[:16]}-at-{tick}-{os.getpid()}"
+    with Rack(config.model_copy(update={"name": name}), crate=crate, keeping=keeping) as rack:
+        rack.run(tick * config.clock_ns * 1e-9)
+        if not (keeping.folder / NAME.format(tick)).is_file():
+            printed = [event.text for event in rack.events if event.kind == "printed"]
+            why = (
+                printed[-1]
+                if printed
+                else "a board is lost then; ask for a time at which it is back"
+            )
+            raise Failure(f"{asked}: {why}", 2)
+        if differing := _differing(recording, rack.segment, tick):
+            why = (
+                "the code of a level has changed since, or somebody commanded the rack while it ran"
+            )
+            names = ", ".join(differing)
+            print(f"{asked}: {names} are not as recorded: {why}", file=sys.stderr)
+
+
+def _differing(recording: Recording, segment: Segment, tick: int) -> list[str]:
+    """Return the mailboxes whose messages until `tick` are not those of the recording."""
+    found = []
+    for name, (serial, chain) in chains(segment, tick).items():
+        # Each message carries the chain of those before it.
+        at = np.flatnonzero(recording.signal(name, "serial") == serial + 1)
+        if len(at) and recording.signal(name, "chain")[at[0]] != chain:
+            found.append(name)
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 
 from rack.boards import Rack
-from rack.boards.checkpoint.format import FOLDER, checkpoints
+from rack.boards.checkpoint.format import ATTRIBUTES, FOLDER, NAME, checkpoints
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import CheckpointError
 from rack.boards.events import Event, Outcome
@@ -81,6 +82,41 @@ def test_all_that_a_level_remembers_is_in_a_checkpoint(config: MakeConfig, tmp_p
     found = checkpoints(tmp_path)
     for tick in (min(found), 210, max(found)):
         assert continued(rack, found[tick]).digest == outcome.digest
+
+
+@pytest.mark.slow
+def test_a_checkpoint_at_a_tick_comes_with_the_attributes_of_its_levels(
+    config: MakeConfig, tmp_path: Path
+) -> None:
+    rack = config(text=REMEMBERING)
+    keeping = Keeping(tmp_path, at=210, shows=True)
+    with Rack(rack, keeping=keeping) as first:
+        first.run(210 * rack.clock_ns * 1e-9)
+    assert [path.name for path in tmp_path.glob("*.checkpoint")] == [NAME.format(210)]
+    shown = json.loads((tmp_path / f"wave{ATTRIBUTES}").read_text())
+    assert (shown["_factor"], shown["_half"], shown["_list"]) == (1.0, 0.5, "210 items")
+    assert shown["_recent"] == [tick % 7 for tick in range(205, 210)]
+    assert sorted(shown["_odd"]) == [tick for tick in range(13) if len(range(tick, 210, 13)) % 2]
+    turned = 0.125 * len(range(20, 210))
+    assert shown["_turn"] == {"of": [turned, 0.0], "size": 0.125}
+    # Shared state is shown as it is; functions are not.
+    assert shown["_table"] == [[0.0, 0.0, 0.0], [0.0, turned, 0.0]]
+    assert not {"context", "_call", "_next"} & set(shown)
+
+
+@pytest.mark.slow
+def test_a_task_that_has_ended_ends_the_run_that_continues(
+    config: MakeConfig, tmp_path: Path
+) -> None:
+    rack = config("board.wave.params.done_at=100")
+    with Rack(rack) as plain:
+        expected = plain.run()
+    with Rack(rack, keeping=Keeping(tmp_path, at=140)) as first:
+        assert first.run(140 * rack.clock_ns * 1e-9).ticks == 140 < expected.ticks
+    with Rack(rack, keeping=Keeping(origin=tmp_path / NAME.format(140))) as again:
+        outcome = again.run()
+    assert (outcome.cause, outcome.ticks) == ("task done", expected.ticks)
+    assert outcome.digest == expected.digest
 
 
 @pytest.mark.slow

@@ -44,10 +44,48 @@ def test_a_recorded_run_continues_and_its_recording_begins_there(run: Path, tmp_
     one, other = Recording(run), Recording(two)
     for name in other.mailboxes:
         serials = other.signal(name, "serial")
-        assert other.signal(name, "tick")[0] >= 400
+        assert other.signal(name, "tick")[0] >= 480
         assert serials.tolist() == one.signal(name, "serial")[-len(serials) :].tolist()
-    assert other.trace("lower")["tick"][[0, -1]].tolist() == [400, 799]
+    assert other.trace("lower")["tick"][[0, -1]].tolist() == [480, 799]
     assert content(run) == before
+
+
+@pytest.mark.slow
+def test_a_run_in_an_outage_has_no_state_and_the_time_is_refused(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    script = tmp_path / "kill.toml"
+    script.write_text('[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 440\n')
+    one = tmp_path / "one"
+    common = ("--seconds", SECONDS, "--json")
+    names = ("--set", f"name={rack_name}", "--out", one, "--faults", script)
+    whole = rack("run", small, "--lockstep", "--checkpoint", 0.5, *names, *common)
+    refused = rack("run", "--from", f"{one}@1.2", "--no-record", *common)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+    assert "1.2: a board is lost then" in refused.stderr
+    # Back, and restarted, it goes on; the loss counts.
+    later = rack("run", "--from", f"{one}@1.8", "--no-record", *common)
+    assert json.loads(later.stdout)["digest"] == json.loads(whole.stdout)["digest"]
+
+
+@pytest.mark.slow
+def test_a_state_that_is_not_as_recorded_is_noted(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    code = (Path(__file__).parents[2] / "two_levels.py").read_text()
+    levels = tmp_path / "changing_levels.py"
+    levels.write_text(code)
+    text = small.read_text().replace("two_levels:", "changing_levels:")
+    small.write_text(text.replace("python_path = [", f'python_path = ["{tmp_path}", '))
+    one = tmp_path / "one"
+    names = ("--set", f"name={rack_name}", "--out", one)
+    rack("run", small, "--lockstep", "--checkpoint", 0.5, "--seconds", SECONDS, *names)
+    again = ("run", "--from", f"{one}@1.2", "--seconds", SECONDS, "--no-record", "--json")
+    assert not rack(*again).stderr
+    levels.write_text(code.replace(".count + 1", ".count + 1 + 1"))
+    done = rack(*again)
+    assert "are not as recorded: the code of a level has changed since" in done.stderr
+    assert "upper.command" in done.stderr
 
 
 @pytest.mark.slow
