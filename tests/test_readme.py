@@ -31,7 +31,8 @@ BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 ELSEWHERE = re.compile(
     r"<|\.toml|RUN|rack"
-    r" (status|top|watch|mailbox|stop|pause|resume|set|record|replay|inject|estop|command|prompt)"
+    r" (status|top|watch|mailbox|stop|pause|resume|set|record|replay|rewind|inject|estop)"
+    r"|rack (command|prompt)"
     r"|kill-each-board|--view|--step"
     r"|bench (response|systems|lan|hand)|rack run (cell|brown)|--lan|rack lan"
 )

@@ -86,6 +86,11 @@ COMMANDS = (
     ),
     ("export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."),
     (
+        "rewind",
+        "rack.tools.commands.rewind:rewind",
+        "Go back to any tick of a recorded run, look around, and branch off.",
+    ),
+    (
         "report",
         "rack.tools.commands.report:report",
         "Report on a recorded run, or compare two runs.",
@@ -120,7 +125,7 @@ COMMANDS = (
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 GROUPS = {
-    "Run": ("run", "stop", "pause", "resume", "step", "list", "clean"),
+    "Run": ("run", "stop", "pause", "resume", "step", "rewind", "list", "clean"),
     "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "export", "report"),
     "Command and disturb": ("command", "set", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from rack.backplane.layout import MailboxSpec
@@ -19,9 +18,8 @@ from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console, table, terminal_width
-from rack.tools.live.signals import cell
-from rack.tools.recording.parquet import HEAD
-from rack.tools.recording.signal import Signal, mailbox_of
+from rack.tools.live.message_text import MessageText
+from rack.tools.recording.signal import mailbox_of
 
 LOOK_S = 0.1
 PLAIN_S = 1.0
@@ -114,40 +112,16 @@ class Messages:
 
     def __init__(self, segment: Segment, box: MailboxSpec) -> None:
         self._segment = segment
-        self._box = box
         self._ring = MailboxRing(segment, box.name)
         self._has_looked = False
-        self._signals = [*Signal.all([box]).values()]
+        self._text = MessageText(box, segment.layout.clock_ns)
+        self.lines = self._text.lines
 
     def new(self) -> Iterator[dict[str, Any]]:
         """Yield the messages written since the last look; at the first one the newest alone."""
         rows = self._ring.drain().rows
         if not self._has_looked:
             rows = rows[-1:]
-        yield from map(self._document, rows)
+        for row in rows:
+            yield self._text.document(row, self._segment.words[System.TICK])
         self._has_looked = True
-
-    def _document(self, row: np.ndarray) -> dict[str, Any]:
-        message = row["message"][None]
-        return {
-            "mailbox": self._box.name,
-            **{name: int(row[name]) for name in HEAD},
-            "age_ticks": self._segment.words[System.TICK] - int(row["tick"]),
-            "fields": {
-                signal.name.removeprefix(f"{self._box.name}."): signal.plain(message)[0]
-                for signal in self._signals
-            },
-        }
-
-    def lines(self, document: dict[str, Any]) -> list[str]:
-        """Return a message as lines for people."""
-        age_ms = document["age_ticks"] * self._segment.layout.clock_ns * 1e-6
-        head = (
-            f"{self._box.name}: serial {document['serial']}, of tick {document['tick']},"
-            f" {document['age_ticks']} ticks ({age_ms:g} ms) old"
-        )
-        rows = [
-            [name, cell(value), signal.unit]
-            for (name, value), signal in zip(document["fields"].items(), self._signals, strict=True)
-        ]
-        return [head, *table(("field", "value", "unit"), rows, terminal_width())]

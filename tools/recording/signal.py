@@ -99,6 +99,11 @@ class Signal:
         found: np.ndarray = values[place]
         return found
 
+    def in_message(self, message: np.ndarray) -> Any:
+        """Return it in one message: an array or a number; a state by its name."""
+        value = self.named(self.values(message[None]))[0]
+        return value.decode() if isinstance(value, bytes) else value
+
     def named(self, values: np.ndarray) -> np.ndarray:
         """Return its values with names in place of the numbers that stand for them."""
         if not self.column.values:

@@ -84,8 +84,7 @@ class AttachedRack:
         reading = self.read(signal.mailbox)
         if not reading.is_there:
             raise Failure(f"mailbox '{signal.mailbox}' has no message yet")
-        value = signal.named(signal.values(reading.value.record[None]))[0]
-        return value.decode() if isinstance(value, bytes) else value
+        return signal.in_message(reading.value.record)
 
     @as_failure()
     def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:

@@ -11,8 +11,11 @@ import numpy as np
 
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
+from rack.tools.live.continued import tick_in
+from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, mailbox_of
+from rack.tools.scripting.moment import RecordedMoment
 from rack.tools.timing.analysis.stored import newest_report
 
 if TYPE_CHECKING:
@@ -30,9 +33,15 @@ class RecordedRun:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._recording = Recording(folder)
+        self._in_force = InForce(self._recording)
         self.signals = RecordedSignals(self._recording)
         """Every field of every mailbox; also found is a number of one, as in
         `servo.status.position[2]`."""
+
+    def at(self, time_s: float) -> RecordedMoment:
+        """Return the run at a simulated time, s. Raises `Failure` for one outside."""
+        tick = tick_in(self._recording, str(time_s))
+        return RecordedMoment(self._recording, self._in_force, tick)
 
     @cached_property
     def events(self) -> list[Event]:

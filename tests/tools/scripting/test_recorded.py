@@ -10,9 +10,14 @@ import pytest
 
 import rack
 from rack.boards import Rack
+from rack.boards.checkpoint.format import FOLDER
 from rack.boards.config import load
+from rack.boards.wiring import Keeping
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED
+from tests.conftest import SMALL
 from tests.shared_runs import nasrem_run, small_run
 
 pytestmark = pytest.mark.slow
@@ -40,6 +45,38 @@ def test_a_signal_is_an_array_with_its_ticks_and_unit(
     levels = run.to_pandas("task.status")
     assert set(levels["task.status.state"]) <= {"idle", "executing", "holding"}
     assert len(levels) == len(run.signals["task.status.state"].ticks)
+
+
+def test_a_run_at_a_time_has_the_messages_that_are_read_there(small: Path) -> None:
+    moment = rack.open_run(small).at(1.2)
+    assert (moment.tick, moment.time_s) == (480, 1.2)
+    status = rack.open_run(small).signals["lower.status.count"]
+    # Written in the tick before, visible now.
+    assert moment["lower.status.count"] == moment.read("lower.status").count
+    assert moment["lower.status.count"] == status.values[status.ticks == 479]
+    assert moment["upper.status.state"] == "idle"
+    assert {"lower.status", "upper.command", "lower.plan"} <= set(moment.mailboxes)
+    with pytest.raises(rack.Failure, match=r"no message yet at 0 s"):
+        rack.open_run(small).at(0).read("lower.status")
+    with pytest.raises(rack.Failure, match=r"^4\.1: permitted: 0 to 3\.9975 s$"):
+        rack.open_run(small).at(4.1)
+    with pytest.raises(rack.Failure, match="has no checkpoints"):
+        rack.open_run(small).at(1.2).resume()
+
+
+def test_a_run_is_resumed_from_a_time_in_the_background(tmp_path: Path, rack_name: str) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    config = load(path, [f"name={rack_name}"])
+    run = tmp_path / "run"
+    run_rack(config, 2.0, run, Display(), keeping=Keeping(run / FOLDER, 200))
+    expected = Recording(run).ended["outcome"]
+    with rack.open_run(run).at(1.2025).resume(seconds=2.0) as resumed:
+        outcome = resumed.wait(20)
+    assert outcome is not None
+    assert (outcome.digest, outcome.ticks) == (expected["digest"], expected["ticks"])
+    with pytest.raises(rack.Failure, match=r"board\.upper\.more = 1: unknown key"):
+        rack.open_run(run).at(1.2025).resume("board.upper.more=1")
 
 
 def test_a_name_with_a_typo_gets_the_nearest(small: Path) -> None:

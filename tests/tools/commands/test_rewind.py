@@ -1,0 +1,162 @@
+"""`rack rewind`: any tick of a run again, forwards, backwards, by a condition, and branches."""
+
+from __future__ import annotations
+
+import json
+import sys
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.checkpoint.format import FOLDER
+from rack.boards.config import load
+from rack.boards.wiring import Keeping
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.tools.command_line import rack
+
+pytestmark = pytest.mark.slow
+SECONDS = 2.0
+EVERY = 200
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 800 ticks with checkpoints at 200, 400 and 600."""
+    folder = tmp_path_factory.mktemp("rewound")
+    path = folder / "remembering.toml"
+    path.write_text(REMEMBERING)
+    run = folder / "run"
+    config = load(path, [f"name=test-rewind-{folder.name}"])
+    run_rack(config, SECONDS, run, Display(), keeping=Keeping(run / FOLDER, EVERY))
+    return run
+
+
+class Asked:
+    """Asks `rack rewind --json` for lines; `status` is that of the last time."""
+
+    def __init__(self, run: Path, patch: pytest.MonkeyPatch) -> None:
+        self._run = run
+        self._patch = patch
+        self.status = 0
+
+    def __call__(self, *lines: str) -> list[dict[str, Any]]:
+        self._patch.setattr(sys, "stdin", StringIO("\n".join(lines)))
+        done = rack("rewind", self._run, "--json")
+        self.status = done.returncode
+        assert not done.stderr
+        return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture
+def asked(run: Path, monkeypatch: pytest.MonkeyPatch) -> Asked:
+    """Ask for lines on the run."""
+    return Asked(run, monkeypatch)
+
+
+def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> None:
+    found = asked(
+        *("goto 1.2", "show wave.status", "show wave.status.value", "step", "step 10", "back 3"),
+        *("show wave.status", "goto 0", "back", "show wave.status", "quit", "goto 1"),
+    )
+    value = dict(
+        zip(*(Recording(run).signal("wave.status", n) for n in ("tick", "value")), strict=True)
+    )
+    assert found[0] == {"tick": 480, "time_s": 1.2}
+    first = found[1]["value"]
+    assert (first["tick"], first["age_ticks"], first["serial"]) == (479, 1, 480)
+    assert first["fields"]["value"] == found[2]["value"] == value[479]
+    assert [one["tick"] for one in found[3:6]] == [481, 491, 488]
+    assert found[6]["value"]["fields"]["value"] == value[487]
+    assert found[8]["error"].startswith("-0.0025: permitted: 0 to 1.9975 s")
+    assert "wave.status: no message yet at 0 s" in found[9]["error"]
+    # Nothing is done after quit.
+    assert len(found) == 10
+    assert asked.status == 2
+
+
+def test_a_condition_leads_to_where_it_begins_to_hold_forwards_and_backwards(
+    run: Path, asked: Asked
+) -> None:
+    ticks, value = (Recording(run).signal("wave.status", name) for name in ("tick", "value"))
+    limit = float(value[300]) + 1.0
+    held = value > limit
+    begins = ticks[held & ~held.astype(bool).take(range(-1, len(held) - 1))] + 1
+    begins = begins[begins > 1].tolist()
+    condition = f'--when "wave.status.value > {limit!r}"'
+    found = asked(*(f"goto {condition}" for _ in range(len(begins) + 1)), f"back {condition}")
+    assert [one["tick"] for one in found[: len(begins)]] == begins
+    assert "does not begin to hold after" in found[len(begins)]["error"]
+    if len(begins) > 1:
+        assert found[-1]["tick"] == begins[-2]
+    else:
+        assert "does not begin to hold before" in found[-1]["error"]
+
+
+def test_a_level_is_shown_as_it_was_at_that_tick(asked: Asked) -> None:
+    found = asked("goto 1.2", "show wave", "goto 1", "show wave", "goto 0.3", "show wave")
+    assert found[1]["value"]["_recent"] == [tick % 7 for tick in range(475, 480)]
+    # At a checkpoint, and before the first.
+    assert found[3]["value"]["_recent"] == [tick % 7 for tick in range(395, 400)]
+    assert "permitted: 0.5 to 1.9975 s, from its first checkpoint" in found[5]["error"]
+
+
+def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
+    run: Path, asked: Asked, tmp_path: Path
+) -> None:
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    same, other = tmp_path / "same", tmp_path / "other"
+    found = asked(
+        "goto 1.2",
+        f"branch --seconds {SECONDS} --out {same}",
+        f"branch --set board.wave.params.factor=2 --seconds {SECONDS} --out {other}",
+        f"branch --out {other}",
+        "branch --set board.wave.parms.factor=2",
+    )
+    expected = Recording(run).ended["outcome"]["digest"]
+    assert (found[1]["first_difference"], found[1]["outcome"]["digest"]) == (None, expected)
+    assert found[2]["first_difference"] == {"tick": 480, "mailbox": "wave.status"}
+    assert Recording(other).signal("wave.status", "tick")[0] == 480
+    assert "exists already" in found[3]["error"]
+    assert "board.wave.parms = " in found[4]["error"]
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
+    lines = {
+        "goot 3": "goot: no such command; nearest: goto",
+        "goto": 'goto: permitted: goto TIME, as in 12.5; or goto --when "',
+        "goto soon": "soon: permitted: 0 to 1.9975 s",
+        "goto nan": "nan: permitted: 0 to 1.9975 s",
+        "step x": "step: argument ticks: invalid int value: 'x'; permitted: step [TICKS]",
+        'goto --when "wave.status.valeu > 1"': "nearest: wave.status.value",
+        "show wavf": "wavf: no such level, mailbox or signal; nearest: wave",
+        "show wave.status.value[3]": "no such index",
+        "events -1": "-1: permitted: 0 to 1e+09 s",
+        'show "wave': "No closing quotation",
+        "help got": "got: no such command; nearest: goto",
+    }
+    found = asked(*lines, "", "# a comment", "help goto")
+    assert [why in one["error"] for why, one in zip(lines.values(), found, strict=False)] == [
+        True
+    ] * len(lines), found
+    assert "begun to hold" in found[-1]["help"]
+    assert len(found) == len(lines) + 1
+    assert asked.status == 2
+    asked("goto 1", "events 2")
+    assert asked.status == 0
+
+
+def test_a_script_without_json_prints_text(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", StringIO("goto 1.2\nshow wave.status.value\nevents 5\nhelp"))
+    done = rack("rewind", run)
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
+    assert lines[0] == "1.2 s, tick 480"
+    assert lines[1].startswith("wave.status.value = ")
+    assert any("time over after 800 ticks" in line for line in lines)
+    assert rack("rewind", run.parent).returncode == 2

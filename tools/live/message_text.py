@@ -1,0 +1,48 @@
+"""A message as a document, and as lines for people, field by field with units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.layout import MailboxSpec
+from rack.tools.console.tables import table, terminal_width
+from rack.tools.live.signals import cell
+from rack.tools.recording.parquet import HEAD
+from rack.tools.recording.signal import Signal
+
+
+class MessageText:
+    """Shows the messages of one mailbox of a rack whose ticks last `clock_ns`."""
+
+    def __init__(self, box: MailboxSpec, clock_ns: int) -> None:
+        self._box = box
+        self._clock_ns = clock_ns
+        self._signals = [*Signal.all([box]).values()]
+
+    def document(self, row: np.ndarray, tick: int) -> dict[str, Any]:
+        """Return a message, a row of the mailbox's ring, as a document, as of `tick`."""
+        message = row["message"][None]
+        return {
+            "mailbox": self._box.name,
+            **{name: int(row[name]) for name in HEAD},
+            "age_ticks": tick - int(row["tick"]),
+            "fields": {
+                signal.name.removeprefix(f"{self._box.name}."): signal.plain(message)[0]
+                for signal in self._signals
+            },
+        }
+
+    def lines(self, document: dict[str, Any]) -> list[str]:
+        """Return a message as lines for people."""
+        age_ms = document["age_ticks"] * self._clock_ns * 1e-6
+        head = (
+            f"{self._box.name}: serial {document['serial']}, of tick {document['tick']},"
+            f" {document['age_ticks']} ticks ({age_ms:g} ms) old"
+        )
+        rows = [
+            [name, cell(value), signal.unit]
+            for (name, value), signal in zip(document["fields"].items(), self._signals, strict=True)
+        ]
+        return [head, *table(("field", "value", "unit"), rows, terminal_width())]

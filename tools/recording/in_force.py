@@ -1,0 +1,37 @@
+"""The messages of a recorded run that are in force at a tick, and the ticks at which a condition
+begins to hold: what readers released then find. Any tick comes from the recording alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.signal import Trigger
+
+
+class InForce:
+    """The messages of a run by the tick at which they are read; mailboxes load on first use."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._rows: dict[str, np.ndarray] = {}
+
+    def row(self, mailbox: str, tick: int) -> np.ndarray | None:
+        """Return the newest row of a mailbox that is visible at `tick`; None before the first."""
+        rows = self._of(mailbox)
+        visible = np.flatnonzero(rows["visible_at"] <= tick)
+        return rows[visible[-1]] if len(visible) else None
+
+    def begins(self, condition: Trigger) -> np.ndarray:
+        """Return the ticks at which readers find a condition to hold that did not hold in the
+        message before, (times,), the earliest first."""
+        rows = self._of(condition.signal.mailbox)
+        holds = condition.holds(rows["message"])
+        held_before = np.concatenate((np.zeros(1, bool), holds[:-1]))
+        ticks: np.ndarray = np.unique(rows["visible_at"][holds & ~held_before])
+        return ticks
+
+    def _of(self, mailbox: str) -> np.ndarray:
+        if mailbox not in self._rows:
+            self._rows[mailbox] = self._recording.rows(mailbox)
+        return self._rows[mailbox]

@@ -1,0 +1,211 @@
+"""A recorded run that one goes through tick by tick: where one is, what is there, and branches.
+
+`rack rewind` is the prompt to it. What is shown at a tick is what the tasks released then find,
+before they begin: the messages in force, which the recording has, and the objects of the levels,
+read in their own processes, which go on to that tick from the checkpoint before.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Self
+
+from rack.boards.checkpoint.format import checkpoints
+from rack.boards.config.resolved import classes
+from rack.boards.crate.line import CrateLine
+from rack.boards.crate.rack import cell_of
+from rack.boards.crate.requests import Preload
+from rack.boards.events import Event
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import table, terminal_width
+from rack.tools.live.continued import branched, state_at, tick_in, ticks_of
+from rack.tools.live.display import Display, event_line
+from rack.tools.live.folder import folder_of
+from rack.tools.live.launch import run_rack
+from rack.tools.live.message_text import MessageText
+from rack.tools.live.signals import cell
+from rack.tools.recording.history import first_difference
+from rack.tools.recording.in_force import InForce
+from rack.tools.recording.recording import Recording
+from rack.tools.recording.signal import NEAREST, Signal, Trigger
+from rack.tools.scripting.moment import RecordedMoment
+from rack.tools.timing.analysis.report import write_report
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What a step of going through a run found: for programs, and as lines for people."""
+
+    document: dict[str, Any]
+    lines: Iterable[str]
+
+
+class RewoundRun:
+    """A run, and the `tick` at which one looks at it. Use it as a context: it keeps a crate ready,
+    from which boards are forked."""
+
+    def __init__(self, folder: Path) -> None:
+        self.recording = Recording(folder)
+        self._layout = self.recording.layout
+        self._first, self._end = ticks_of(self.recording)
+        self.tick = self._first
+        self._in_force = InForce(self.recording)
+        self._signals = Signal.all(self._layout.timed)
+        self._boxes = {box.name: box for box in self._layout.timed}
+        self._tasks = [task.name for task in self._layout.tasks]
+        self._levels: tuple[int, Mapping[str, dict[str, Any]]] = -1, {}
+        self._crate: CrateLine | None = None
+
+    def __enter__(self) -> Self:
+        self._prepare()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._crate is not None:
+            self._crate.close(0)
+
+    def _prepare(self) -> None:
+        """Start the next crate: it imports while the user reads and types."""
+        if checkpoints(self.recording.folder):
+            config = self.recording.rack_config
+            self._crate = CrateLine()
+            path = (*sys.path, *map(str, config.python_path))
+            self._crate.ask(Preload(classes(config), path, cell_of(config)))
+
+    @property
+    def names(self) -> list[str]:
+        """What can be shown: levels, mailboxes and signals."""
+        return [*self._tasks, *self._boxes, *self._signals]
+
+    def time_s(self, tick: int) -> float:
+        """Return the simulated time of a tick, s."""
+        return round(tick * self._layout.clock_ns * 1e-9, 9)
+
+    def goto(self, time_s: str) -> Glance:
+        """Go to a simulated time, s. Raises `Failure` for one that is not recorded."""
+        return self._go(tick_in(self.recording, time_s))
+
+    def step(self, ticks: int) -> Glance:
+        """Go so many ticks on, or back."""
+        return self._go(tick_in(self.recording, str(self.time_s(self.tick + ticks))))
+
+    def goto_when(self, condition: str, back: bool = False) -> Glance:
+        """Go to the next tick at which readers find that a condition has begun to hold, or to the
+        one before. Raises `Failure` where there is none."""
+        found = self._in_force.begins(Trigger.of(condition, self._layout.timed))
+        before = found[(found >= self._first) & (found < self.tick)][-1:]
+        after = found[(found > self.tick) & (found < self._end)][:1]
+        for tick in before if back else after:
+            return self._go(int(tick))
+        where = "before" if back else "after"
+        raise Failure(f'"{condition}": does not begin to hold {where} {self._now}', 2)
+
+    @property
+    def _now(self) -> str:
+        return f"{self.time_s(self.tick):g} s, tick {self.tick}"
+
+    def _go(self, tick: int) -> Glance:
+        self.tick = tick
+        return Glance({"tick": tick, "time_s": self.time_s(tick)}, [self._now])
+
+    def show(self, name: str) -> Glance:
+        """Return a level's own attributes, the message in force in a mailbox, or a signal in it.
+        Raises `Failure` with the nearest names."""
+        whole = name.partition("[")[0]
+        if name in self._tasks:
+            return self._level(name)
+        if name in self._boxes:
+            return self._message(name)
+        if whole in self._signals:
+            signal = Signal.of(name, self._layout.timed)
+            value = signal.plain(self._row(signal.mailbox)["message"][None])[0]
+            return self._shown(name, value, [f"{name} = {cell(value)} {signal.unit}".rstrip()])
+        near = get_close_matches(whole, self.names, NEAREST) or [*self._tasks, *self._boxes]
+        raise Failure(f"{name}: no such level, mailbox or signal; nearest: {', '.join(near)}", 2)
+
+    def _shown(self, name: str, value: Any, lines: Iterable[str]) -> Glance:
+        where = {"tick": self.tick, "time_s": self.time_s(self.tick)}
+        return Glance({**where, "name": name, "value": value}, lines)
+
+    def _row(self, mailbox: str) -> Any:
+        row = self._in_force.row(mailbox, self.tick)
+        if row is None:
+            raise Failure(f"{mailbox}: no message yet at {self._now}", 2)
+        return row
+
+    def _message(self, mailbox: str) -> Glance:
+        text = MessageText(self._boxes[mailbox], self._layout.clock_ns)
+        document = text.document(self._row(mailbox), self.tick)
+        return self._shown(mailbox, document, text.lines(document))
+
+    def _level(self, task: str) -> Glance:
+        tick, levels = self._levels
+        if tick != self.tick:
+            crate = self._crate
+            # The rack that is given it closes it.
+            self._crate = None
+            moment = RecordedMoment(self.recording, self._in_force, self.tick)
+            try:
+                levels = moment.levels(crate)
+            finally:
+                if crate is not None:
+                    crate.close(0)
+                self._prepare()
+            self._levels = self.tick, levels
+        rows = [[name, cell(value)] for name, value in _flat(levels[task])]
+        return self._shown(
+            task, levels[task], table(("attribute", "value"), rows, terminal_width())
+        )
+
+    def events(self, around_s: float) -> Glance:
+        """Return the events at most so long before and after this tick."""
+        span = around_s * 1e9 / self._layout.clock_ns
+        events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
+        found = [event for event in events if abs(event["tick"] - self.tick) <= span]
+        lines = [f"{self.time_s(one['tick']):g} s  {event_line(Event(**one))}" for one in found]
+        nothing = f"no events within {around_s:g} s of {self._now}"
+        return Glance({"tick": self.tick, "events": found}, lines or [nothing])
+
+    def branch(
+        self,
+        settings: Sequence[str],
+        faults: str | None,
+        out: Path | None,
+        seconds: float | None,
+        display: Display,
+    ) -> Glance:
+        """Let the rack go on from this tick, with other settings or faults, and record it; as long
+        as the run where that was given a time. Raises `Failure`, `ConfigError`."""
+        config = branched(self.recording, settings, faults)
+        ended = self.recording.ended.get("outcome", {})
+        if seconds is None and ended.get("cause") == "time over":
+            seconds = self.time_s(self._end)
+        folder = folder_of(out, config.name)
+        with state_at(self.recording, self.tick) as state:
+            result = run_rack(config, seconds, folder, display, keeping=state.keeping)
+        write_report(folder)
+        differs = first_difference(self.recording, Recording(folder))
+        where = "all that both wrote is equal"
+        if differs is not None:
+            at = f"{self.time_s(differs.tick):g} s, tick {differs.tick}"
+            where = f"differs from {self.recording.folder} first at {at}, in {differs.mailbox}"
+        document = {
+            "folder": str(folder),
+            "tick": self.tick,
+            "outcome": asdict(result.outcome),
+            "first_difference": None if differs is None else asdict(differs),
+        }
+        return Glance(document, [result.text(), where, f"recorded into {folder}"])
+
+
+def _flat(found: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:
+    """Yield attributes with those of objects in them, by dotted names."""
+    for name, value in found.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{outer}{name}.")
+        else:
+            yield f"{outer}{name}", value
