@@ -19,7 +19,7 @@ from rack.backplane.segment import VERSION as SEGMENT_VERSION
 from rack.boards.errors import CheckpointError
 
 MAGIC = b"RACKCKPT"
-VERSION = 1
+VERSION = 2
 FOLDER = "checkpoints"
 """Where they lie in the folder of a run."""
 NAME = "{:09d}.checkpoint"
@@ -52,7 +52,8 @@ class Checkpoint:
 
     def write(self, folder: Path) -> Path:
         """Write it into a folder; return its path. Raises `OSError`."""
-        blobs = [zlib.compress(self.memory, 1), *(part.changed for part in self.parts.values())]
+        found = (self.memory, *(part.changed for part in self.parts.values()))
+        blobs = [zlib.compress(blob, 1) for blob in found]
         head = {
             "segment": SEGMENT_VERSION,
             "tick": self.tick,
@@ -93,14 +94,14 @@ def read(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path}: {why}")
     blobs = []
     for length in head["sizes"]:
-        blobs.append(body[size : size + length])
+        blobs.append(zlib.decompress(body[size : size + length]))
         size += length
     states = zip(head["parts"].items(), blobs[1:], strict=True)
     return Checkpoint(
         tick=head["tick"],
         layout=head["layout"],
         regions=tuple((address, length) for address, length in head["regions"]),
-        memory=zlib.decompress(blobs[0]),
+        memory=blobs[0],
         parts={name: PartState(shape, changed) for (name, shape), changed in states},
     )
 

@@ -1,20 +1,25 @@
 """Taking checkpoints: the clock asks every task for its state between two ticks, when all have
 finished, and puts one file together.
 
-The tasks save theirs at the same time, each on its core. A checkpoint that falls into the outage of
+The tasks save theirs at the same time, each on its core; a thread of the clock compresses and
+writes, while the rack goes on. A checkpoint that falls into the outage of
 a board is taken once the board is back: a process that is not there has no state.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
-import zlib
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from threading import Thread
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.checkpoint.format import (
@@ -48,11 +53,13 @@ def keep_task(segment: Segment, task: Task, keeping: Keeping) -> None:
     _go_on(segment, keeper.parts, task.spec.name, keeping)
 
 
-def keep_clock(segment: Segment, driver: LockstepDriver, keeping: Keeping) -> None:
-    """Have the clock take checkpoints; in a run that continues another, let it go on."""
+def keep_clock(segment: Segment, driver: LockstepDriver, keeping: Keeping) -> Callable[[], None]:
+    """Have the clock take checkpoints; in a run that continues another, let it go on. Return what
+    waits for the last one."""
     keeper = driver.keep = ClockKeeper(segment, driver, keeping)
     keeper.parts = Parts(driver, CLOCK)
     _go_on(segment, keeper.parts, CLOCK, keeping)
+    return keeper.finish
 
 
 def _go_on(segment: Segment, parts: Parts, name: str, keeping: Keeping) -> None:
@@ -64,7 +71,7 @@ def _go_on(segment: Segment, parts: Parts, name: str, keeping: Keeping) -> None:
     if found.shape != parts.shape:
         why = "its class, or what it is made of, has changed shape since"
         raise CheckpointError(f"'{name}' cannot continue from {keeping.origin}: {why}")
-    parts.load(zlib.decompress(found.changed), keeping.packages)
+    parts.load(found.changed, keeping.packages)
     for writer in parts.of_type(Writer):
         writer.sign()
 
@@ -89,7 +96,7 @@ class TaskKeeper(Keeper):
                 self._path.with_suffix(ATTRIBUTES).write_text(
                     json.dumps(Attributes(self.parts).of(self._level))
                 )
-            self._path.write_bytes(shape + zlib.compress(self.parts.save(), 1))
+            self._path.write_bytes(shape + self.parts.save())
             result = 0
         except (CheckpointError, OSError) as error:
             print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
@@ -107,6 +114,7 @@ class ClockKeeper(Keeper):
         self._keeping = keeping
         self._layout = layout_hash(segment.layout)
         self._due: int | None = None
+        self._writing: Thread | None = None
 
     def __call__(self, tick: int) -> None:
         """Take a checkpoint before `tick`, if one is due and every process is there."""
@@ -134,16 +142,34 @@ class ClockKeeper(Keeper):
             return
         places = regions(self._segment, tick)
         try:
-            parts = {CLOCK: PartState(self.parts.shape, zlib.compress(self.parts.save(), 1))}
+            parts = {CLOCK: PartState(self.parts.shape, self.parts.save())}
             for task in driver.tasks:
                 path = self._keeping.folder / f"{task.spec.name}{STATE}"
                 state = path.read_bytes()
                 parts[task.spec.name] = PartState(state[:SHAPE].hex(), state[SHAPE:])
                 path.unlink()
-            memory = copy(self._segment, places)
-            Checkpoint(tick, self._layout, places, memory, parts).write(self._keeping.folder)
         except (CheckpointError, OSError) as error:
             print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
+            return
+        found = Checkpoint(tick, self._layout, places, copy(self._segment, places), parts)
+        self.finish()
+        self._writing = Thread(target=_write, args=(found, self._keeping.folder))
+        self._writing.start()
+
+    def finish(self) -> None:
+        """Wait until the last checkpoint is written."""
+        if self._writing is not None:
+            self._writing.join()
+
+
+def _write(found: Checkpoint, folder: Path) -> None:
+    """Write a checkpoint, in a thread that takes no core from a board."""
+    set_priority(0)
+    os.sched_setaffinity(0, os.sched_getaffinity(os.getppid()))
+    try:
+        found.write(folder)
+    except OSError as error:
+        print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
 
 
 def _next(tick: int, every: int) -> int:

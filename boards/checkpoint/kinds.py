@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from ctypes import Array as CArray
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import _lru_cache_wrapper, partial
 from mmap import mmap
@@ -94,11 +95,18 @@ def _put_bytes(thing: bytearray, found: bytes) -> None:
     thing[:] = found
 
 
-def _elements(thing: np.ndarray) -> np.ndarray | None:
-    """Return the elements of an array as bytes; None for a view: they are its owner's."""
+class Elements(NamedTuple):
+    """The contents of an array: `raw` in its own order, elements of `size` bytes."""
+
+    raw: bytes
+    size: int
+
+
+def _elements(thing: np.ndarray) -> Elements | None:
+    """Return the elements of an array; None for a view: they are its owner's."""
     if thing.base is not None or not thing.flags.writeable:
         return None
-    return _flat(thing).copy()
+    return Elements(thing.tobytes("A"), thing.itemsize)
 
 
 def _flat(thing: np.ndarray) -> np.ndarray:
@@ -111,20 +119,19 @@ def _put_array(thing: np.ndarray, found: tuple[bytes, bytes]) -> None:
     flat[np.frombuffer(places, np.int32)] = np.frombuffer(elements, flat.dtype)
 
 
-def _data(thing: Any) -> bytes:
-    """Return all of a MjData but the model that its state carries along."""
+def _data(thing: Any) -> tuple[bytes, ...]:
+    """Return all of a MjData but the model that its state carries along: what is before and after
+    that."""
     state: bytes = thing.__getstate__()
-    return b"".join(state.split(thing.model.__getstate__(), 1))
+    return tuple(state.split(thing.model.__getstate__(), 1))
 
 
-def _put_data(thing: Any, found: bytes) -> None:
+def _put_data(thing: Any, found: tuple[bytes, ...]) -> None:
     """Put a MjData back where it is, since others know its addresses."""
     import mujoco
 
-    model = thing.model.__getstate__()
-    at = thing.__getstate__().find(model)
     source = mujoco.MjData.__new__(mujoco.MjData)
-    source.__setstate__(b"".join((found[:at], model, found[at:])))
+    source.__setstate__(thing.model.__getstate__().join(found))
     mujoco.mj_copyData(thing, thing.model, source)
 
 
@@ -208,15 +215,23 @@ def _is_one_of(kind: type, types: tuple[type | str, ...]) -> bool:
     )
 
 
+def _frozen(thing: Any) -> Inner:
+    return ((field.name, getattr(thing, field.name)) for field in fields(thing))
+
+
 def _object(kind: type) -> PartKind:
-    """Return the kind of a class in Python: its attributes may change, but for those that its
-    objects find again."""
+    """Return the kind of a class in Python: its attributes may change, but for those of a frozen
+    dataclass, and those that its objects find again."""
+    if is_dataclass(kind) and kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        return PartKind("frozen dataclass", (kind,), _frozen)
     declared = [base.__dict__["__slots__"] for base in kind.__mro__ if "__slots__" in vars(base)]
     if not (kind.__dictoffset__ or declared):
         raise CheckpointError(f"a {kind.__module__}.{kind.__qualname__} has no checkpoint")
     slots = [name for names in declared for name in ([names] if isinstance(names, str) else names)]
-    fields = partial(_fields, tuple(slots), getattr(kind, FOUND_AGAIN, ()))
-    return PartKind("object", (kind,), lambda thing: fields(thing).items(), fields, _put_fields)
+    attributes = partial(_fields, tuple(slots), getattr(kind, FOUND_AGAIN, ()))
+    return PartKind(
+        "object", (kind,), lambda thing: attributes(thing).items(), attributes, _put_fields
+    )
 
 
 def changes(now: Any, before: Any) -> Any:
@@ -227,14 +242,21 @@ def changes(now: Any, before: Any) -> Any:
     """
     match now:
         case dict():
+            # Most objects have not changed, and this says so without a step of Python for each
+            # attribute.
+            if list(now) == list(before) and all(map(is_, now.values(), before.values())):
+                return None
             changed = {name: v for name, v in now.items() if before.get(name, _ABSENT) is not v}
             gone = [name for name in before if name not in now]
             return (changed, gone) if changed or gone else None
-        case np.ndarray():
+        case Elements(raw, size):
+            if raw == before.raw:
+                return None
             # One array may hold both parameters and state.
-            places = np.flatnonzero(now != before).astype(np.int32)
-            found = places.tobytes(), now[places].tobytes()
-            return found if len(places) else None
+            elements = np.frombuffer(raw, f"V{size}")
+            differs = elements != np.frombuffer(before.raw, elements.dtype)
+            places = np.flatnonzero(differs).astype(np.int32)
+            return places.tobytes(), elements[places].tobytes()
         case list():
             same = len(now) == len(before) and all(map(is_, now, before))
             return None if same else now

@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.boards.checkpoint.kinds import ATOMS, changes, part_kind
+from rack.boards.checkpoint.kinds import ATOMS, Elements, changes, part_kind
 from rack.boards.errors import CheckpointError
 
 _T = TypeVar("_T")
@@ -77,6 +77,9 @@ class Parts:
                 self._before[number] = contents
             shape.update(f"{kind.__module__}.{kind.__qualname__} {_form(contents)} ".encode())
         self.shape = shape.hexdigest()
+        # Copied for each pickler: filling a memo from a dictionary takes a millisecond.
+        self._memo = pickle.Pickler(io.BytesIO())
+        self._memo.memo = self._numbers  # as the C code has it
 
     def _note(self, thing: Any, place: str) -> None:
         if not isinstance(thing, ATOMS) and id(thing) not in self._numbers:
@@ -112,7 +115,7 @@ class Parts:
         pickler = pickle.Pickler(file, pickle.HIGHEST_PROTOCOL)
         # The pickler takes the parts for written already, and refers to them by number: no Python
         # is called for each object.
-        pickler.memo = self._numbers  # as the C code has it
+        pickler.memo = self._memo.memo
         pickler.dispatch_table = {np.ndarray: self._array}
         pickler.dump(found)
         return file.getvalue()
@@ -167,8 +170,8 @@ def _form(contents: Any) -> str:
     match contents:
         case dict():
             return " ".join(contents)
-        case np.ndarray():
-            return str(len(contents))
+        case Elements():
+            return str(len(contents.raw))
         case _:
             return ""
 

@@ -303,9 +303,12 @@ def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
         alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
     driver = driver_of_run(segment, wiring, EndOfRun(segment, wiring), alarms)
     driver.controller = SystemController(segment, wiring, driver)
-    if wiring.keeping is not None:
-        import_module(KEEPING).keep_clock(segment, driver, wiring.keeping)
+    if wiring.keeping is None:
+        driver.run()
+        return
+    finish = import_module(KEEPING).keep_clock(segment, driver, wiring.keeping)
     driver.run()
+    finish()
 
 
 def driver_of_run(
