@@ -18,6 +18,8 @@ import numpy as np
 from rack.backplane.errors import MailboxError
 
 REASON_BYTES = 120
+COMMAND_ID = "id"
+"""First field of every command: its serial."""
 NOT_SENT = (
     "its board writes this message in every cycle: declare the port as Output(..., queued=True) to"
     " send it"
@@ -95,7 +97,7 @@ class MessageType:
 
 def command(name: str, version: int, *fields: Field) -> MessageType:
     """Return a command type: `fields` after the command's serial."""
-    serial = Field("id", "u4", "1", "serial of the command; 0: no command")
+    serial = Field(COMMAND_ID, "u4", "1", "serial of the command; 0: no command")
     return MessageType(name, version, (serial, *fields))
 
 

@@ -21,6 +21,9 @@ CANNOT_GO_ON = 4
 CANNOT_KEEP = 5
 """Exit status of a board that has no checkpoint, or cannot continue from the one it is given."""
 
+UNKEPT = "no checkpoints: "
+"""Begins the note of a run that takes none, with the reason after it."""
+
 
 class BoardError(Exception):
     """Root of every error this package raises; its text is one line for the user."""

@@ -2,8 +2,8 @@
 finished, and puts one file together.
 
 The tasks save theirs at the same time, each on its core; a thread of the clock compresses and
-writes, while the rack goes on. A checkpoint that falls into the outage of
-a board is taken once the board is back: a process that is not there has no state.
+writes, while the rack goes on. A checkpoint that falls into the outage of a board is taken once
+the board is back: a process that is not there has no state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rack.boards.checkpoint.kinds import Keeper
 from rack.boards.checkpoint.memory import copy, regions
 from rack.boards.checkpoint.parts import Parts
 from rack.boards.checkpoint.shown import Attributes
-from rack.boards.errors import CheckpointError
+from rack.boards.errors import UNKEPT, CheckpointError
 from rack.boards.run.task import Task
 from rack.boards.wiring import Keeping
 
@@ -47,10 +47,20 @@ REFUSED = -1
 
 def keep_task(segment: Segment, task: Task, keeping: Keeping) -> None:
     """Have a task that has just been built save its state when the clock wants it; in a run that
-    continues another, let it go on from the state there."""
+    continues another, let it go on from the state there.
+
+    A task that cannot says so, and the run goes on without checkpoints.
+    """
     keeper = task.next_cycle.save = TaskKeeper(task, keeping)
-    keeper.parts = Parts(task, task.spec.name)
-    _go_on(segment, keeper.parts, task.spec.name, keeping)
+    try:
+        keeper.parts = Parts(task, task.spec.name)
+    except CheckpointError as error:
+        if keeping.origin is not None:
+            raise
+        print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
+        task.block[Block.SAVE] = REFUSED
+    else:
+        _go_on(segment, keeper.parts, task.spec.name, keeping)
 
 
 def keep_clock(segment: Segment, driver: LockstepDriver, keeping: Keeping) -> Callable[[], None]:
@@ -80,7 +90,7 @@ class TaskKeeper(Keeper):
     """Saves the state of one task, between two of its cycles, for the clock to collect."""
 
     def __init__(self, task: Task, keeping: Keeping) -> None:
-        self.parts: Parts
+        self.parts: Parts | None = None
         self._block = task.block
         self._notify_clock = task.stopwatch.notify_clock
         self._path = keeping.folder / f"{task.spec.name}{STATE}"
@@ -91,17 +101,19 @@ class TaskKeeper(Keeper):
         """Save it."""
         result = REFUSED
         try:
-            shape = bytes.fromhex(self.parts.shape)
-            if self._level is not None:
-                self._path.with_suffix(ATTRIBUTES).write_text(
-                    json.dumps(Attributes(self.parts).of(self._level))
-                )
-            self._path.write_bytes(shape + self.parts.save())
-            result = 0
+            if self.parts is not None:
+                self._save(self.parts)
+                result = 0
         except (CheckpointError, OSError) as error:
             print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
         self._block[Block.SAVE] = result
         self._notify_clock()
+
+    def _save(self, parts: Parts) -> None:
+        if self._level is not None:
+            attributes = json.dumps(Attributes(parts).of(self._level))
+            self._path.with_suffix(ATTRIBUTES).write_text(attributes)
+        self._path.write_bytes(bytes.fromhex(parts.shape) + parts.save())
 
 
 class ClockKeeper(Keeper):
@@ -111,25 +123,34 @@ class ClockKeeper(Keeper):
         self.parts: Parts
         self._segment = segment
         self._driver = driver
-        self._keeping = keeping
+        self._folder = keeping.folder
+        self._every = keeping.every
+        self._at = keeping.at
         self._layout = layout_hash(segment.layout)
         self._due: int | None = None
         self._writing: Thread | None = None
 
     def __call__(self, tick: int) -> None:
         """Take a checkpoint before `tick`, if one is due and every process is there."""
-        keeping = self._keeping
         if self._due is None:
-            self._due = _next(tick, keeping.every) if keeping.at is None else keeping.at
+            self._due = _next(tick, self._every) if self._at is None else self._at
+            if any(task.block[Block.SAVE] == REFUSED for task in self._driver.tasks):
+                self._due = sys.maxsize
         if tick < self._due or any(task.is_lost or task.is_stopped for task in self._driver.tasks):
             return
-        self._due = _next(tick, keeping.every)
+        self._due = _next(tick, self._every)
         self._driver.settle()
         if all(task.is_settled() for task in self._driver.tasks):
             self._take(tick)
 
     def _take(self, tick: int) -> None:
         driver = self._driver
+        try:
+            # Here, since a short run has none.
+            self._folder.mkdir(exist_ok=True)
+        except OSError as error:
+            print(f"no checkpoint: {error}", file=sys.stderr, flush=True)
+            return
         for task in driver.tasks:
             task.block[Block.SAVE] = tick + 1
             task.wake()
@@ -144,7 +165,7 @@ class ClockKeeper(Keeper):
         try:
             parts = {CLOCK: PartState(self.parts.shape, self.parts.save())}
             for task in driver.tasks:
-                path = self._keeping.folder / f"{task.spec.name}{STATE}"
+                path = self._folder / f"{task.spec.name}{STATE}"
                 state = path.read_bytes()
                 parts[task.spec.name] = PartState(state[:SHAPE].hex(), state[SHAPE:])
                 path.unlink()
@@ -153,8 +174,11 @@ class ClockKeeper(Keeper):
             return
         found = Checkpoint(tick, self._layout, places, copy(self._segment, places), parts)
         self.finish()
-        self._writing = Thread(target=_write, args=(found, self._keeping.folder))
+        self._writing = Thread(target=_write, args=(found, self._folder))
         self._writing.start()
+        if tick == self._at:
+            # Whoever asked for it waits for it.
+            self.finish()
 
     def finish(self) -> None:
         """Wait until the last checkpoint is written."""

@@ -518,7 +518,7 @@ class RackConfig(Table):
     supervision: SupervisionConfig = Field(
         SupervisionConfig(), description="restarts of lost boards"
     )
-    record: RecordConfig | None = Field(None, description="flight recorder: what is kept of a run")
+    record: RecordConfig = Field(RecordConfig(), description="what is kept of a run")
     fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
     command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at a tick")
 

@@ -21,7 +21,7 @@ from rack.backplane.errors import EmergencyStopError
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import digest
-from rack.backplane.operator_table import OperatorTable, RequestEntry
+from rack.backplane.operator_table import OperatorTable, Request, RequestEntry
 from rack.backplane.process import how_ended
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
@@ -51,6 +51,7 @@ from rack.boards.crate.requests import (
 from rack.boards.errors import (
     CANNOT_GO_ON,
     CANNOT_KEEP,
+    UNKEPT,
     CheckpointError,
     ConfigError,
     LaunchError,
@@ -87,7 +88,8 @@ class Rack:
     refused if another rack's real-time boards occupy a core that this one requests. A `crate` that
     was started earlier saves time. With `entries`, by bus adapter and port, host boards are not
     started: what a recorded run wrote there enters instead. `keeping`: the checkpoints that it
-    takes in lockstep, and the one that it continues from.
+    takes in lockstep, and the one that it continues from. `requests`: an operator's commands
+    besides the config's.
     """
 
     def __init__(
@@ -98,8 +100,10 @@ class Rack:
         crate: CrateLine | None = None,
         entries: Mapping[str, Entries] | None = None,
         keeping: Keeping | None = None,
+        requests: Sequence[Request] = (),
     ) -> None:
         self.config = config
+        self._requests = requests
         self._entries = entries
         self._keeping = keeping
         self._origin: Checkpoint | None = None
@@ -221,7 +225,7 @@ class Rack:
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        for wanted in self._plan.commands[before.commands :]:
+        for wanted in (*self._plan.commands[before.commands :], *self._requests):
             desk.add(wanted)
 
     def start(self, seconds: float | None = None) -> None:
@@ -333,7 +337,7 @@ class Rack:
 
     def _record_printed(self) -> None:
         for line in self._line.printed():
-            self._journal.add("printed", "", line)
+            self._journal.add("ready" if line.startswith(UNKEPT) else "printed", "", line)
 
     def _record_stop(self) -> None:
         if self._why_stopped and self._stop_by is None:

@@ -13,12 +13,12 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
 from rack.backplane.mailbox.slots import Slots
+from rack.backplane.message import COMMAND_ID
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.wiring import HostWiring
 
-COMMAND_ID = "id"
 WORD = 8
 LONGEST_S = 1e9
 _Port = TypeVar("_Port")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,10 +15,12 @@ import typer
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.classes import find_class
-from rack.boards.config import load, shared_out
+from rack.boards.config import load, resolve, shared_out
 from rack.boards.config.cell import built_cell
 from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
 from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
+from rack.boards.crate.rack import RESTORING
+from rack.boards.errors import UNKEPT
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.levels.timing.forecast import Forecast
@@ -129,10 +132,12 @@ def check(
     stock = inventory(found, judged.layout, lacking)
     forecast = Forecast.of(judged.timing, not lacking)
     arm = _abilities(found)
+    unkept = _unkept(found)
     if as_json:
         timing = forecast.document() | {"repair": fitting.document()}
         arm_document = None if arm is None else asdict(arm)
-        print_json(stock | {"changed": found.changed, "arm": arm_document, "timing": timing})
+        further = {"changed": found.changed, "arm": arm_document, "unkept": unkept or None}
+        print_json(stock | further | {"timing": timing})
     else:
         width = terminal_width()
         head, *rest = inventory_lines(stock, width)
@@ -140,6 +145,7 @@ def check(
             head,
             *found.changed,
             *lacking,
+            *([f"{UNKEPT}{unkept}"] if unkept else []),
             *summary_lines(forecast, fitting, arm, found.joints, width),
         ]
         if verbose:
@@ -185,6 +191,13 @@ def _abilities(config: RackConfig) -> Abilities | None:
     from rack.levels.robot.abilities import abilities
 
     return abilities(built_cell(config))
+
+
+def _unkept(config: RackConfig) -> str:
+    """Return why runs of a rack in lockstep have no checkpoints; empty: they have, or want none."""
+    if not config.record.checkpoint_s:
+        return ""
+    return str(import_module(RESTORING).unkept(resolve(config)))
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:

@@ -12,7 +12,6 @@ import typer
 
 from rack.boards.config.files import assembled, named_classes
 from rack.boards.crate.requests import Preload
-from rack.boards.wiring import Keeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Faults, Json, Settings, View, config_names
@@ -75,15 +74,6 @@ FromRun = Annotated[
         ),
     ),
 ]
-Checkpoint = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S",
-        min=1e-6,
-        max=1e6,
-        help="with --lockstep: keep the whole rack in the run's folder every S simulated seconds",
-    ),
-]
 Origin = Annotated[
     str | None,
     typer.Option(
@@ -91,7 +81,8 @@ Origin = Annotated[
         metavar="RUN@TIME",
         help=(
             "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or --faults a"
-            " branch of it from there"
+            " branch of it from there; one without checkpoints, as in real time, is repeated from"
+            " its beginning"
         ),
     ),
 ]
@@ -110,7 +101,6 @@ def run(
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
     entries: FromRun = None,
-    checkpoint: Checkpoint = None,
     origin: Origin = None,
     out: Out = None,
     no_record: NoRecord = False,
@@ -125,8 +115,9 @@ def run(
     elsewhere one line a second is printed. --json prints the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
 
-    With --from, the rack first goes on unchanged from the checkpoint before to TIME. --seconds
-    counts from the beginning of the run that is continued, as there.
+    In lockstep the folder of a run holds checkpoints, each record.checkpoint_s of simulated time.
+    With --from, the rack first goes on unchanged from the one before to TIME. --seconds counts from
+    the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
@@ -141,7 +132,7 @@ def run(
       rack run nasrem --set clock.speed=2 --view
       rack run nist-state-table --lockstep --step
       rack run ibm --lockstep --entries runs/ibm-20250101-120000
-      rack run nasrem --lockstep --checkpoint 5 --out runs/whole
+      rack run nasrem --lockstep --out runs/whole
       rack run --from runs/whole@10 --faults bad-sensors
     """
     if view and no_record:
@@ -153,9 +144,9 @@ def run(
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
-    if checkpoint is not None or origin is not None:
-        from rack.tools.live.continued import continued, keeping_for, run_of
     if origin is not None:
+        from rack.tools.live.continued import beginning, run_of
+
         config = str(run_of(origin))
     assert config is not None
     tables = assembled(config, overrides, faults)
@@ -172,12 +163,10 @@ def run(
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
-    keeping = None
-    if checkpoint is not None:
-        keeping = keeping_for(found, folder, checkpoint)
+    begins = None
     with ExitStack() as stack:
         if origin is not None:
-            keeping = stack.enter_context(continued(found, origin, keeping or Keeping()))
+            begins = stack.enter_context(beginning(found, origin))
         # From the start of the run to the end of its report; during the launch a signal ends the
         # command at once.
         unfinished = NO_TIME.format(folder) if folder else ""
@@ -194,7 +183,7 @@ def run(
                 crate=crate,
                 step=step,
                 entries=again,
-                keeping=keeping,
+                begins=begins,
             )
         _report(found, folder, result, as_json)
     if not result.worked:

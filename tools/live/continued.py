@@ -1,5 +1,4 @@
-"""Checkpoints as a user asks for them: `rack run --checkpoint S`, `--from RUN@TIME`, and the state
-of a run at any tick.
+"""`rack run --from RUN@TIME`, and the state of a run at any tick.
 
 Between two checkpoints the rack goes on from the earlier one, unchanged, to the tick, and keeps its
 state there. That is what a branch begins from: only there may it differ.
@@ -20,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.history import chains
+from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.boards import Rack
-from rack.boards.checkpoint.format import ATTRIBUTES, FOLDER, NAME, checkpoints
+from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints
 from rack.boards.config.files import assembled
 from rack.boards.config.resolved import validated
 from rack.boards.config.schema import RackConfig
@@ -30,8 +30,15 @@ from rack.boards.crate.line import CrateLine
 from rack.boards.wiring import Keeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.live.launch import Beginning
+from rack.tools.recording.entries import recorded_commands
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
+
+WHY_NOT = (
+    "the code of a level has changed since, it missed cycles in real time, or somebody commanded it"
+    " while it ran"
+)
 
 
 def run_of(origin: str) -> Path:
@@ -45,32 +52,27 @@ def run_of(origin: str) -> Path:
     return path
 
 
-def keeping_for(config: RackConfig, folder: Path | None, every_s: float) -> Keeping:
-    """Return the checkpoints that a run takes. Raises `Failure`."""
-    if folder is None:
-        raise Failure("--checkpoint and --no-record: checkpoints lie in the run's folder", 2)
-    every = max(1, round(every_s * 1e9 / config.clock_ns))
-    return Keeping((folder / FOLDER).resolve(), every)
+@dataclass(frozen=True)
+class RunState:
+    """The state of a run before a tick: what a rack goes on from and, if asked for, the attributes
+    of its levels, by task."""
+
+    begins: Beginning
+    attributes: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @contextmanager
-def continued(config: RackConfig, origin: str, taken: Keeping) -> Iterator[Keeping]:
-    """Yield what a rack with this config, a branch perhaps, continues from at RUN@TIME, for as long
-    as it runs; it takes the checkpoints of `taken`. Raises `Failure`."""
+def beginning(config: RackConfig, origin: str) -> Iterator[Beginning]:
+    """Yield what a rack with this config, a branch perhaps, goes on from at RUN@TIME, for as long
+    as it runs. Raises `Failure`."""
     recording = Recording(run_of(origin).parent)
-    tick = tick_of(origin.rpartition("@")[2], config.clock_ns)
-    with state_at(recording, tick, asked=f"--from {origin}") as state:
-        packages = config.python_path
-        yield replace(state.keeping, packages=packages, folder=taken.folder, every=taken.every)
-
-
-@dataclass(frozen=True)
-class RunState:
-    """The state of a run before a tick: what a rack continues from and, if asked for, the
-    attributes of its levels, by task."""
-
-    keeping: Keeping
-    attributes: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    asked = f"--from {origin}"
+    tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
+    with state_at(recording, tick, asked=asked) as state:
+        checkpoint = state.begins.checkpoint
+        if checkpoint is not None:
+            checkpoint = replace(checkpoint, packages=config.python_path)
+        yield replace(state.begins, checkpoint=checkpoint)
 
 
 @contextmanager
@@ -96,17 +98,16 @@ def state_at(
     with ExitStack() as stack:
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-") as folder:
             path = Path(folder)
-            _go_on(
-                recording, tick, replace(before, folder=path, at=tick, shows=shows), crate, asked
-            )
-            kept = stack.enter_context((path / NAME.format(tick)).open("rb"))
+            kept = replace(before.checkpoint or Keeping(), folder=path, at=tick, shows=shows)
+            _go_on(recording, tick, replace(before, checkpoint=kept), crate, asked)
+            file = stack.enter_context((path / NAME.format(tick)).open("rb"))
             attributes = {
                 found.stem: json.loads(found.read_bytes()) for found in path.glob(f"*{ATTRIBUTES}")
             }
         # The file has no name any more: however this process ends, nothing is left. Boards open it
         # by this process's descriptor.
-        origin = Path(f"/proc/{os.getpid()}/fd/{kept.fileno()}")
-        yield RunState(replace(before, origin=origin, losses=_losses(recording, tick)), attributes)
+        origin = Path(f"/proc/{os.getpid()}/fd/{file.fileno()}")
+        yield RunState(Beginning(_kept_in(recording, origin, tick)), attributes)
 
 
 def tick_of(text: str, clock_ns: int) -> int:
@@ -117,16 +118,16 @@ def tick_of(text: str, clock_ns: int) -> int:
         return -1
 
 
-def tick_in(recording: Recording, text: str) -> int:
-    """Return the tick of a time, s, in a recorded run. Raises `Failure` for one outside, or between
-    two stretches that were kept."""
+def tick_in(recording: Recording, text: str, asked: str = "") -> int:
+    """Return the tick of a time, s, in a recorded run. Raises `Failure`, which begins with what was
+    `asked`, for one outside, or between two stretches that were kept."""
     tick = tick_of(text, recording.layout.clock_ns)
     is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])
     begins, ends = ticks_of(recording)
     if not (begins <= tick < ends and is_kept):
         first, last = (at * recording.layout.clock_ns * 1e-9 for at in (begins, ends - 1))
         kept = f"; {recording.kept_text}" if recording.kept else ""
-        raise Failure(f"{text}: permitted: {first:g} to {last:g} s{kept}", 2)
+        raise Failure(f"{asked}{text}: permitted: {first:g} to {last:g} s{kept}", 2)
     return tick
 
 
@@ -140,33 +141,42 @@ def ticks_of(recording: Recording) -> tuple[int, int]:
 
 def branched(recording: Recording, settings: Sequence[str], faults: str | None) -> RackConfig:
     """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
-    overrides = [*settings, "clock.mode=lockstep"]
+    overrides = ["clock.mode=lockstep", "clock.speed=1.0", *settings]
     return validated(assembled(str(recording.folder / CONFIG), overrides, faults))
 
 
-def _before(recording: Recording, tick: int, asked: str) -> tuple[int, Keeping]:
-    """Return the last checkpoint at `tick` or before, and what continues from it. Raises
-    `Failure`."""
+def _before(recording: Recording, tick: int, asked: str) -> tuple[int, Beginning]:
+    """Return the last checkpoint at `tick` or before, and what goes on from it; without one, tick 0
+    and what operators commanded. Raises `Failure`."""
     kept = checkpoints(recording.folder)
+    if begins := max((at for at in kept if at <= tick), default=0):
+        return begins, Beginning(_kept_in(recording, kept[begins].resolve(), begins))
+    if ticks_of(recording)[0] > max(task.every for task in recording.layout.tasks):
+        # Of a run that goes on from another the beginning is that other's.
+        first = min(kept, default=ticks_of(recording)[1]) * recording.layout.clock_ns * 1e-9
+        raise Failure(f"{asked}: permitted: from its first checkpoint, {first:g} s, on", 2)
+    commands = recorded_commands(recording)
     if not kept:
-        path = recording.folder / CONFIG
-        cure = f"from its beginning: rack run {path} --lockstep; --checkpoint S takes some"
-        raise Failure(f"{asked}: {recording.folder} has no checkpoints; {cure}", 2)
-    _, ends = ticks_of(recording)
-    if not min(kept) <= tick < ends:
-        first, last = (at * recording.layout.clock_ns * 1e-9 for at in (min(kept), ends - 1))
-        why = f"permitted: {first:g} to {last:g} s, from its first checkpoint to its end"
-        raise Failure(f"{asked}: {why}", 2)
-    begins = max(at for at in kept if at <= tick)
+        injected = len(recording.ended.get("faults", ())) - len(recording.rack_config.fault)
+        without = f", without {injected} faults injected meanwhile" if injected > 0 else ""
+        print(
+            f"{asked}: {recording.folder} has no checkpoints: it is repeated in lockstep from its"
+            f" beginning, with {len(commands)} commands of its operators{without}",
+            file=sys.stderr,
+        )
+    return 0, Beginning(requests=commands)
+
+
+def _kept_in(recording: Recording, origin: Path, tick: int) -> Keeping:
+    """Return what goes on from the state of a run at `tick`, in this file."""
     ran = recording.rack_config
-    keeping = Keeping(
-        origin=kept[begins].resolve(),
+    return Keeping(
+        origin=origin,
         packages=ran.python_path,
         faults=len(ran.fault),
         commands=len(ran.command),
-        losses=_losses(recording, begins),
+        losses=_losses(recording, tick),
     )
-    return begins, keeping
 
 
 def _losses(recording: Recording, tick: int) -> tuple[tuple[str, int], ...]:
@@ -178,13 +188,15 @@ def _losses(recording: Recording, tick: int) -> tuple[tuple[str, int], ...]:
 
 
 def _go_on(
-    recording: Recording, tick: int, keeping: Keeping, crate: CrateLine | None, asked: str
+    recording: Recording, tick: int, begins: Beginning, crate: CrateLine | None, asked: str
 ) -> None:
     """Let the rack go on, unchanged, to `tick`, and keep its state. Raises `Failure`."""
-    config = recording.rack_config
+    keeping = begins.checkpoint
+    assert keeping is not None, "it says where to keep the state"
+    ran = branched(recording, (), None)
     # The run's own name may be in use, by a branch.
-    name = f"{config.name[:16]}-at-{tick}-{os.getpid()}"
-    with Rack(config.model_copy(update={"name": name}), crate=crate, keeping=keeping) as rack:
+    config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{tick}-{os.getpid()}"})
+    with Rack(config, crate=crate, keeping=keeping, requests=begins.requests) as rack:
         rack.run(tick * config.clock_ns * 1e-9)
         if not (keeping.folder / NAME.format(tick)).is_file():
             printed = [event.text for event in rack.events if event.kind == "printed"]
@@ -195,11 +207,8 @@ def _go_on(
             )
             raise Failure(f"{asked}: {why}", 2)
         if differing := _differing(recording, rack.segment, tick):
-            why = (
-                "the code of a level has changed since, or somebody commanded the rack while it ran"
-            )
             names = ", ".join(differing)
-            print(f"{asked}: {names} are not as recorded: {why}", file=sys.stderr)
+            print(f"{asked}: {names} are not as recorded: {WHY_NOT}", file=sys.stderr)
 
 
 def _differing(recording: Recording, segment: Segment, tick: int) -> list[str]:

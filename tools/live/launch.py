@@ -10,11 +10,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards import Rack
+from rack.boards.checkpoint.taking import are_wanted, keeping_for, outside
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
+from rack.boards.errors import UNKEPT
 from rack.boards.events import Event, Outcome, braked_text
 from rack.boards.wiring import Entries, Keeping
 from rack.tools.console.answer import Failure
@@ -40,6 +43,15 @@ NO_RECORDER = "the recorder has not begun yet: real time begins without it, lock
 
 News = Callable[[], list[str]]
 """Returns messages for the user since the last call, of the recorder or the viewer."""
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a run goes on from: the checkpoint of another run, or, without one, the other's first
+    tick; and the commands that its operators gave."""
+
+    checkpoint: Keeping | None = None
+    requests: tuple[Request, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -111,21 +123,26 @@ def run_rack(  # noqa: PLR0913  # each is an option of the command
     crate: CrateLine | None = None,
     step: bool = False,
     entries: Mapping[str, Entries] | None = None,
-    keeping: Keeping | None = None,
+    begins: Beginning | None = None,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`
     unless that is None.
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
-    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate`, `entries`
-    and `keeping` are as in `Rack`. Launch the racks that the config names: one that fails ends the
-    run, and a run that does not succeed ends them.
+    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate` and
+    `entries` are as in `Rack`; `begins`: the run that it continues or repeats. A rack in lockstep
+    that is recorded takes checkpoints, if it can. Launch the racks that the config names: one that
+    fails ends the run, and a run that does not succeed ends them.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
     dies does not end the run, but files that cannot be written do: raises `Failure`.
     """
     log = EventLog(display)
     news: list[News] = []
+    begins = begins or Beginning()
+    keeping = begins.checkpoint
+    if folder is not None:
+        keeping = keeping_for(config, folder, keeping)
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to keep.
         with INTERRUPT.at_once():
@@ -134,13 +151,22 @@ def run_rack(  # noqa: PLR0913  # each is an option of the command
             if recorder is not None:
                 stack.callback(recorder.finish)
             rack = stack.enter_context(
-                Rack(config, log.add, share or bool(others), crate, entries, keeping)
+                Rack(
+                    config,
+                    log.add,
+                    share or bool(others),
+                    crate,
+                    entries,
+                    keeping,
+                    begins.requests,
+                )
             )
             rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
+                if are_wanted(config) and (why := outside(config)):
+                    log.add(Event(time.time_ns(), -1, "ready", "", f"{UNKEPT}{why}"))
                 try:
-                    for made in (folder, *([] if keeping is None else [keeping.folder])):
-                        made.mkdir(parents=True, exist_ok=True)
+                    folder.mkdir(parents=True, exist_ok=True)
                     (folder / "config.toml").write_text(config.text())
                     log.open(folder / "events.jsonl")
                 except OSError as error:

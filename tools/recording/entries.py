@@ -1,10 +1,15 @@
-"""What entered a recorded run through its bus adapters, for a replay without host boards."""
+"""What entered a recorded run from outside, so that it can be repeated: through its bus adapters,
+for a replay without host boards, and from its operators."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import MailboxSpec
+from rack.backplane.message import COMMAND_ID
+from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
@@ -46,7 +51,39 @@ def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
     return found
 
 
-def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:
+def recorded_commands(recording: Recording) -> tuple[Request, ...]:
+    """Return what operators commanded in a recorded run besides its config's commands, at the same
+    ticks, in their order.
+
+    Raises `Failure` if the recording lacks some.
+    """
+    plan = resolve(recording.rack_config)
+    layout = plan.layout
+    found: list[tuple[int, int, Request]] = []
+    for box in layout.mailboxes:
+        if box.writer != CLOCK or box.name not in recording.mailboxes:
+            continue
+        _check(box, box, recording, "--from")
+        messages = recording.messages(box)
+        ids = messages[COMMAND_ID].tolist()
+        # The clock numbers commands when it issues them.
+        messages[COMMAND_ID] = 0
+        for tick, number, message in zip(
+            recording.signal(box.name, "tick").tolist(), ids, messages, strict=True
+        ):
+            found.append((tick, number, Request(layout.index(box.name), message.tobytes(), tick)))
+    found.sort(key=lambda command: command[:2])
+    commanded = [request for _, _, request in found]
+    for known in plan.commands:
+        given = (r for r in commanded if replace(r, tick=known.tick) == known)
+        if (one := next(given, None)) is not None:
+            commanded.remove(one)
+    return tuple(commanded)
+
+
+def _check(
+    box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording, asked: str = "--entries"
+) -> None:
     if recorded is None or (recorded.message, recorded.version, recorded.size) != (
         box.message,
         box.version,
@@ -58,12 +95,12 @@ def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording)
             else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
         )
         wanted = f"{box.message} {box.version}, {box.size} bytes"
-        raise Failure(f"--entries {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
+        raise Failure(f"{asked} {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
     if recording.kept:
-        raise Failure(f"--entries {recording.folder}: {recording.kept_text}", 2)
+        raise Failure(f"{asked} {recording.folder}: {recording.kept_text}", 2)
     if lost := recording.lost.get(box.name):
         raise Failure(
-            f"--entries {recording.folder}: {box.name}: its recorder lost {lost} messages", 2
+            f"{asked} {recording.folder}: {box.name}: its recorder lost {lost} messages", 2
         )
 
 

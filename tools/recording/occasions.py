@@ -37,10 +37,9 @@ class Retention(NamedTuple):
     @classmethod
     def of(cls, segment: Segment) -> Self | None:
         """Return it for a rack; None: everything is kept."""
-        table = tomllib.loads(segment.config).get("record")
-        if table is None:
+        config = RecordConfig.model_validate(tomllib.loads(segment.config).get("record", {}))
+        if config.keep is None:
             return None
-        config = RecordConfig.model_validate(table)
         spans_s = (config.keep, config.before, config.after)
         return cls(*(round(span_s * 1e9 / segment.layout.clock_ns) for span_s in spans_s))
 

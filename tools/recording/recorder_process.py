@@ -31,7 +31,7 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
-RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd")
+RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", ".checkpoint")
 """Endings of the files of a recording."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR

@@ -24,7 +24,8 @@ LOOK_S = 0.005
 class RecordedMoment:
     """A run before the tasks released at `tick` begin.
 
-    Whatever goes wrong is a `Failure`. Levels and racks need checkpoints; all else is recorded.
+    Whatever goes wrong is a `Failure`. Levels and racks go on from the checkpoint
+    before; all else is recorded.
     """
 
     def __init__(self, recording: Recording, in_force: InForce, tick: int) -> None:
@@ -79,7 +80,8 @@ class RecordedMoment:
         with as_failure():
             config = branched(self._recording, settings, faults)
             with state_at(self._recording, self.tick) as state:
-                rack = Rack(config, keeping=state.keeping)
+                begins = state.begins
+                rack = Rack(config, keeping=begins.checkpoint, requests=begins.requests)
                 rack.launch()
                 rack.run_in_background(seconds)
                 _await_begun(rack)

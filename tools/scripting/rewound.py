@@ -14,7 +14,6 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
-from rack.boards.checkpoint.format import checkpoints
 from rack.boards.config.resolved import classes
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.rack import cell_of
@@ -70,11 +69,10 @@ class RewoundRun:
 
     def _prepare(self) -> None:
         """Start the next crate: it imports while the user reads and types."""
-        if checkpoints(self.recording.folder):
-            config = self.recording.rack_config
-            self._crate = CrateLine()
-            path = (*sys.path, *map(str, config.python_path))
-            self._crate.ask(Preload(classes(config), path, cell_of(config)))
+        config = self.recording.rack_config
+        self._crate = CrateLine()
+        path = (*sys.path, *map(str, config.python_path))
+        self._crate.ask(Preload(classes(config), path, cell_of(config)))
 
     @property
     def names(self) -> list[str]:
@@ -186,7 +184,7 @@ class RewoundRun:
             seconds = self.time_s(self._end)
         folder = folder_of(out, config.name)
         with state_at(self.recording, self.tick) as state:
-            result = run_rack(config, seconds, folder, display, keeping=state.keeping)
+            result = run_rack(config, seconds, folder, display, begins=state.begins)
         write_report(folder)
         differs = first_difference(self.recording, Recording(folder))
         where = "all that both wrote is equal"

@@ -11,8 +11,10 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.checkpoint.format import ATTRIBUTES, FOLDER, NAME, checkpoints
+from rack.boards.checkpoint.restoring import unkept
+from rack.boards.config import resolve
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import CheckpointError
+from rack.boards.errors import UNKEPT, CheckpointError
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.wiring import Keeping
@@ -168,13 +170,32 @@ def test_restarts_before_a_checkpoint_count_after_it(config: MakeConfig, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_level_that_cannot_be_kept_is_named(config: MakeConfig, tmp_path: Path) -> None:
-    text = REMEMBERING.replace("Rememberer", "Generator")
-    with pytest.raises(CheckpointError) as refused:
-        kept(config(text=text), tmp_path)
-    assert str(refused.value) == (
-        "board 'wave': wave.executor._count: a itertools.count has no checkpoint"
-    )
+def test_a_level_that_cannot_be_kept_is_named_and_runs_as_before(
+    config: MakeConfig, tmp_path: Path
+) -> None:
+    rack = config(text=REMEMBERING.replace("Rememberer", "Generator"))
+    with Rack(rack) as plain:
+        expected = plain.run(SECONDS)
+    outcome, events = kept(rack, tmp_path)
+    assert (outcome.cause, outcome.digest) == ("time over", expected.digest)
+    assert not [*(tmp_path / FOLDER).iterdir()]
+    why = "wave.executor._count: a itertools.count has no checkpoint"
+    (note,) = [event.text for event in events if event.kind == "ready"]
+    assert note == f"{UNKEPT}{why}"
+    # Before a launch its level is all that there is.
+    assert unkept(resolve(rack)) == why.replace("wave.executor", "wave")
+
+
+@pytest.mark.slow
+def test_one_that_cannot_be_kept_cannot_continue(config: MakeConfig, tmp_path: Path) -> None:
+    kept(config(text=REMEMBERING), tmp_path)
+    other = config(text=REMEMBERING.replace("Rememberer", "Generator"))
+    with pytest.raises(CheckpointError, match=r"a itertools\.count has no checkpoint"):
+        continued(other, checkpoints(tmp_path)[140])
+
+
+def test_levels_that_can_be_kept_have_nothing_to_say(config: MakeConfig) -> None:
+    assert unkept(resolve(config())) == unkept(resolve(config(text=REMEMBERING))) == ""
 
 
 @pytest.mark.slow

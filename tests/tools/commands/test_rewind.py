@@ -10,9 +10,7 @@ from typing import Any
 
 import pytest
 
-from rack.boards.checkpoint.format import FOLDER
 from rack.boards.config import load
-from rack.boards.wiring import Keeping
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
@@ -21,7 +19,6 @@ from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
 SECONDS = 2.0
-EVERY = 200
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +28,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = folder / "remembering.toml"
     path.write_text(REMEMBERING)
     run = folder / "run"
-    config = load(path, [f"name=test-rewind-{folder.name}"])
-    run_rack(config, SECONDS, run, Display(), keeping=Keeping(run / FOLDER, EVERY))
+    config = load(path, [f"name=test-rewind-{folder.name}", "record.checkpoint_s=0.5"])
+    run_rack(config, SECONDS, run, Display())
     return run
 
 
