@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.history import chains
-from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints

@@ -68,8 +68,8 @@ def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
     arguments = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
     done = rack("run", *arguments)
     said = (
-        f"--from {one.folder}@{at}: {one.folder} has no checkpoints: it is repeated in lockstep from"
-        " its beginning, with 2 commands of its operators"
+        f"--from {one.folder}@{at}: {one.folder} has no checkpoints: it is repeated in lockstep"
+        " from its beginning, with 2 commands of its operators"
     )
     assert done.stderr.splitlines() == [said]
     assert json.loads(done.stdout)["recording"] == "complete"
