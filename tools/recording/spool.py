@@ -1,7 +1,7 @@
 """The files of a recording, and the spool that makes them safe: a parquet file is readable only
 once its footer, written last, is there.
 
-Every ring's rows also go to `recorder.spool` as they are, compressed, one frame a ring about four
+Every ring's rows also go to `recorder.spool` as they are, compressed, one frame a ring about ten
 times a second. A restarted recorder continues from the spool; `mend` makes the parquet files from
 the spool of a recorder that is gone. The spool is removed when the files are complete. A truncated
 last frame is dropped. The rings hold two seconds, so a recorder that is back within that time loses
@@ -38,7 +38,9 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.recorder_process import SPOOL
 
 MAGIC = b"RACKSPL2"
-FLUSH_S = 0.25
+FLUSH_S = 0.1
+"""SIGKILL of all processes loses what boards wrote in this time, between two drains, and in one or
+two passes of the recorder, which last longer on a busy machine."""
 _HEAD = struct.Struct("<8sII")
 """Magic, size and CRC of the layout and launch that follow as JSON."""
 _FRAME = struct.Struct("<IIIII")

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from rack.backplane.segment import Segment
     from rack.tools.recording.recorder.recorder import Sink
 
-NICENESS = 10
-"""On a shared core, boards go first, even those without real-time priority."""
+NICENESS = 5
+"""On a shared core, boards go first, even those without real-time priority. No more than
+that: next to three busy programs a core, niceness 10 leaves a thirtieth of it; a recorder needs a
+tenth."""
 
 
 def main() -> None:

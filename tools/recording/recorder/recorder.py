@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import select
+import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -27,6 +29,8 @@ LOCKSTEP_S = 0.005
 """How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs
 faster than time."""
 
+HAND_OVER_S = 0.1
+"""Time of a pass for a sink that is behind: what boards write meanwhile is not in the spool yet."""
 HURRIED_S = 0.5
 """Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends
 within 2 s."""
@@ -47,7 +51,7 @@ class Sink(Protocol):
 
 class SafeSink:
     """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the
-    recorder continues.
+    recorder continues. What it takes is handed over in `advance`, once the spool has it.
 
     Opened `in_background`, by a thread, it lets the recorder begin earlier: what it imports may
     take as long as a launch. The rows of that time wait.
@@ -61,7 +65,8 @@ class SafeSink:
         # Kept: the viewer's library waits, maybe for ever, where a stream is dropped whose file
         # could not be written.
         self._failed: Sink | None = None
-        self._waiting: list[Callable[[Sink], None]] = []
+        self._waiting: deque[Callable[[Sink], None]] = deque()
+        self._late = 0  # calls that were left waiting
         # A daemon: a process in a hurry does not wait for it.
         self._opening = Thread(
             target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True
@@ -72,16 +77,21 @@ class SafeSink:
         self._patience_s: float | None = None
 
     def add(self, ring: str, rows: np.ndarray) -> None:
-        """Pass rows on."""
-        self._pass(lambda sink: sink.add(ring, rows))
+        """Keep rows to be passed on."""
+        self._waiting.append(lambda sink: sink.add(ring, rows))
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Pass the tick on."""
-        self._pass(lambda sink: sink.advance(tick, lost))
+        """Pass on what waits, and the tick. A sink that was opened late is behind, and catches up
+        over several passes."""
+        counted = dict(lost)
+        self._waiting.append(lambda sink: sink.advance(tick, counted))
+        if not self._opening.is_alive():
+            self._hand_over(time.monotonic() + HAND_OVER_S)
+        self._late = len(self._waiting)
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Finish the sink, once it is open."""
-        self._pass(lambda sink: sink.close(tick, lost))
+        self._waiting.append(lambda sink: sink.close(tick, lost))
         self._opening.join(self._patience_s)
         if self._opening.is_alive():
             self._tell(
@@ -89,23 +99,18 @@ class SafeSink:
                 " were loaded; 'rack replay' makes it"
             )
         else:
+            self._late = 0
             self._hand_over()
 
     def hurry(self) -> None:
         """Do without a sink that will not be open soon."""
         self._patience_s = HURRIED_S
 
-    def _pass(self, call: Callable[[Sink], None]) -> None:
-        self._waiting.append(call)
-        if not self._opening.is_alive():
-            self._hand_over()
-
-    def _hand_over(self) -> None:
-        """Make the calls that waited for the sink; there are none to make of one that has
-        failed."""
-        waiting = self._waiting
-        self._waiting = []
-        for call in waiting:
+    def _hand_over(self, until: float = 0.0) -> None:
+        """Make the calls that wait for the sink, as many as have come and more `until` then; there
+        are none to make of one that has failed."""
+        while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
+            call = self._waiting.popleft()
             if (sink := self._sink) is not None:
                 self._guarded(partial(call, sink))
 
