@@ -35,7 +35,7 @@ from rack.tools.viewer.reading import read
 from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import free_port
 from tests.tools.command_line import rack
-from tests.tools.recording.test_recorder_failures import Held
+from tests.tools.recording.struck_recorders import Held
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 

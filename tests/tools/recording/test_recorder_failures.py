@@ -1,18 +1,12 @@
-"""Recordings that fail: the run continues, what was written stays readable, and the user gets a
-message."""
+"""Recorders that are killed, stopped or late: the run continues, what was written stays readable,
+and the user gets a message."""
 
 from __future__ import annotations
 
-import os
 import re
-import resource
 import signal
 import subprocess
-import threading
-import time
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,19 +14,16 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from rack.backplane.segment import Launch, Segment, racks
+from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
-from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load, wire
-from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
 from rack.tools.live.launch import NO_RECORDER, run_rack
-from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording import recorder_process
 from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder.recorder import Recorder, SafeSink
+from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import mend
@@ -42,19 +33,20 @@ from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.analysis.tables import text as analysis_text
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import executable
-from tests.processes import children_of
 from tests.shared_runs import small_run
-from tests.warm import programs
+from tests.tools.recording.struck_recorders import (
+    FIRST_BLOCK,
+    LONG_S,
+    AtTick,
+    Held,
+    counts,
+    notes_of,
+    realtime,
+)
 
 pytestmark = pytest.mark.thorough
 
 WATCHDOG_S = 30.0
-FIRST_BLOCK = 400
-"""Ticks after which there is something on disk."""
-LONG_S = 12.0
-"""Simulated time that the recorder does not outrun."""
-FULL_S = 5.0
-"""Bound of the end of a run whose disk is full."""
 
 
 @pytest.fixture
@@ -63,230 +55,12 @@ def config(small: Path, rack_name: str) -> RackConfig:
     return load(small, [f"name={rack_name}"])
 
 
-class Failing:
-    """A sink that fails at the second block."""
-
-    def __init__(self) -> None:
-        self.blocks = 0
-
-    def add(self, ring: str, rows: np.ndarray) -> None:
-        """Take anything."""
-
-    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Fail once there was one block."""
-        self.blocks += 1
-        if self.blocks > 1:
-            raise RuntimeError("the disk\nis full")
-
-    def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Never come here."""
-        raise AssertionError("a sink that failed is not asked again")
-
-
-def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
-    notes: list[str] = []
-    sink = Failing()
-    safe = SafeSink(lambda: sink, notes.append)
-    for tick in range(5):
-        safe.add("servo", np.zeros(1))
-        safe.advance(tick, {})
-    safe.close(5, {})
-    assert notes == ["run.rrd ends here: the disk is full"]
-    assert sink.blocks == 2
-
-
-class Taking:
-    """A sink that takes everything, and keeps the calls."""
-
-    def __init__(self) -> None:
-        self.calls: list[object] = []
-
-    def add(self, ring: str, rows: np.ndarray) -> None:
-        """Keep the rows."""
-        self.calls.append((ring, rows.tolist()))
-
-    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Keep the tick."""
-        self.calls.append(tick)
-
-    def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Keep the end."""
-        self.calls.append("end")
-
-
-def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
-    may_open, sink = threading.Event(), Taking()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return sink
-
-    safe = SafeSink(opened, pytest.fail, in_background=True)
-    for tick in range(3):
-        safe.add("servo", np.array([tick]))
-        safe.advance(tick, {})
-    assert sink.calls == []
-    may_open.set()
-    safe.close(3, {})
-    assert sink.calls == [("servo", [0]), 0, ("servo", [1]), 1, ("servo", [2]), 2, "end"]
-
-
-def test_a_recorder_in_a_hurry_does_without_a_sink_that_is_not_open(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("rack.tools.recording.recorder.recorder.HURRIED_S", 0.05)
-    may_open, sink, notes = threading.Event(), Taking(), list[str]()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return sink
-
-    safe = SafeSink(opened, notes.append, in_background=True)
-    safe.add("servo", np.zeros(1))
-    safe.hurry()
-    safe.close(1, {})
-    may_open.set()
-    assert sink.calls == []
-    assert len(notes) == 1
-    assert notes[0].startswith("run.rrd is missing: ")
-
-
-def test_a_sink_that_cannot_be_opened_is_reported_once() -> None:
-    notes: list[str] = []
-
-    def opened() -> Taking:
-        raise ImportError("no viewer here")
-
-    safe = SafeSink(opened, notes.append)
-    safe.add("servo", np.zeros(1))
-    safe.close(1, {})
-    assert notes == ["run.rrd ends here: no viewer here"]
-
-
 def test_a_rack_without_an_arm_is_recorded_too(tmp_path_factory: pytest.TempPathFactory) -> None:
     recording = Recording(small_run(tmp_path_factory))
     for field, mailbox in (("count", "lower.status"), ("goal", "upper.command")):
         rows = read(recording.folder / "run.rrd", f"/signals/{mailbox}/{field}")
         assert np.array_equal(rows.values.ravel(), recording.signal(mailbox, field))
         assert np.array_equal(rows.ticks, recording.signal(mailbox, "tick"))
-
-
-@pytest.mark.slow
-def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / "run.rrd").symlink_to("/dev/full")
-    result = run_rack(config, 5.0, folder, Display())
-    recording = Recording(folder)
-    assert result.worked
-    assert result.recording == "complete"
-    assert len(recording.cycles["lower"]) == 2000
-    lines = [event["text"] for event in recording.events if event["kind"] == "recorder"]
-    assert len(lines) == 1
-    assert lines[0].startswith("run.rrd ends here: ")
-
-
-class Keeping(Display):
-    """Keeps the texts of events."""
-
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-
-    def show_event(self, event: Event) -> None:
-        """Keep the text."""
-        self.texts.append(event.text)
-
-
-@pytest.mark.slow
-def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
-    folder, display = tmp_path / "run", Keeping()
-    folder.mkdir()
-    (folder / "events.jsonl").symlink_to("/dev/full")
-    assert run_rack(config, 0.5, folder, display).worked
-    assert display.texts.count("events.jsonl ends here: No space left on device") == 1
-
-
-class AtTick(Display):
-    """Strikes the recorder of the run, by default with a signal, `times` times, when the run has
-    got to some tick."""
-
-    period_s = 0.05
-
-    def __init__(
-        self,
-        number: signal.Signals,
-        tick: int = FIRST_BLOCK,
-        view: Path | None = None,
-        times: int = 1,
-    ) -> None:
-        self._number, self._tick, self._view, self._times = number, tick, view, times
-        self._view_began = 0
-        self.struck: list[int] = []
-
-    def _has_view(self) -> bool:
-        """Say whether the viewer's file, if that matters, has grown since it was begun."""
-        if self._view is None:
-            return True
-        size = self._view.stat().st_size if self._view.is_file() else 0
-        self._view_began = self._view_began or size
-        return size > self._view_began > 0
-
-    def show(self, snapshot: Snapshot) -> None:
-        """Look at the tick, and at the viewer's file."""
-        if snapshot.tick > self._tick and len(self.struck) < self._times and self._has_view():
-            for pid in programs("rack.tools.recording.recorder"):
-                if pid not in self.struck:
-                    self.struck.append(pid)
-                    self.strike(pid)
-
-    def strike(self, pid: int) -> None:
-        """Send the signal."""
-        os.kill(pid, self._number)
-
-
-class Held(AtTick):
-    """Strikes while a rack in lockstep, launched with `step`, is held at the tick: however late the
-    looks of a busy machine, the run is not over. Lets it go on once it has struck."""
-
-    def __init__(self, rack: str, number: signal.Signals, tick: int = FIRST_BLOCK, times: int = 1):
-        super().__init__(number, -1, times=times)
-        self._rack, self._hold_at = rack, tick + 1
-
-    def show(self, snapshot: Snapshot) -> None:
-        """Let it run to the tick; strike there."""
-        with closing(Segment.attach(self._rack)) as segment:
-            if segment.words[System.HELD] == self._hold_at:
-                super().show(snapshot)
-            is_done = len(self.struck) == self._times
-            segment.words[System.HOLD_AT] = 0 if is_done else self._hold_at
-
-
-class FillingDisk(AtTick):
-    """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is
-    full."""
-
-    def __init__(self) -> None:
-        super().__init__(signal.SIGKILL)
-        self.full_at = 0.0
-
-    def strike(self, pid: int) -> None:
-        """Fill the disk."""
-        resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, 4096))
-        self.full_at = time.monotonic()
-
-
-def notes_of(recording: Recording) -> list[str]:
-    return [event["text"] for event in recording.events if event["kind"] == "recorder"]
-
-
-def counts(recording: Recording) -> dict[str, int]:
-    """Return the rows of every task and every mailbox."""
-    rows = {task: len(cycles) for task, cycles in recording.cycles.items()}
-    return rows | {name: len(recording.signal(name, "serial")) for name in recording.mailboxes}
-
-
-def realtime(config: RackConfig) -> RackConfig:
-    return config.model_copy(update={"clock": config.clock.model_copy(update={"mode": "realtime"})})
 
 
 @pytest.mark.slow
@@ -432,46 +206,6 @@ def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(
     )
     assert result.faults[0].count > 1
     assert result.recording == "complete"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
-    config: RackConfig, tmp_path: Path, mode: str
-) -> None:
-    display = FillingDisk()
-    # Python's own helpers of earlier tests stay until the end.
-    before = set(children_of(os.getpid()))
-    wanted = config if mode == "lockstep" else realtime(config)
-    with pytest.raises(Failure) as caught:
-        run_rack(wanted, 5 * LONG_S, tmp_path / "run", display)
-    assert time.monotonic() - display.full_at < FULL_S
-    assert len(display.struck) == 1
-    assert caught.value.status == 1
-    assert re.fullmatch(
-        f"{tmp_path}/run: File too large: the recording ends at tick [0-9]+", str(caught.value)
-    )
-    assert config.name not in racks()
-    assert set(children_of(os.getpid())) <= before
-
-
-@pytest.mark.slow
-def test_a_disk_that_is_full_from_the_start_ends_the_run(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / SPOOL).symlink_to("/dev/full")
-    with pytest.raises(Failure, match="run: No space left on device: the recording ends at tick 0"):
-        run_rack(config, 5 * LONG_S, tmp_path / "run", Display())
-
-
-@pytest.mark.slow
-def test_a_folder_that_cannot_be_written_is_named(config: RackConfig, tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / CONFIG).symlink_to("/dev/full")
-    with pytest.raises(Failure, match="/run: No space left on device"):
-        run_rack(config, 1.0, tmp_path / "run", Display())
-    assert config.name not in racks()
 
 
 @pytest.mark.slow

@@ -1,0 +1,118 @@
+"""Displays that strike the recorder of a run, and what tests read of its recording."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from contextlib import closing
+from pathlib import Path
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config import RackConfig
+from rack.boards.events import Event
+from rack.tools.live.display import Display
+from rack.tools.live.snapshot import Snapshot
+from rack.tools.recording.recording import Recording
+from tests.warm import programs
+
+FIRST_BLOCK = 400
+"""Ticks after which there is something on disk."""
+LONG_S = 12.0
+"""Simulated time that the recorder does not outrun."""
+
+
+class Keeping(Display):
+    """Keeps the texts of events."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def show_event(self, event: Event) -> None:
+        """Keep the text."""
+        self.texts.append(event.text)
+
+
+class AtTick(Display):
+    """Strikes the recorder of the run, by default with a signal, `times` times, when the run has
+    got to some tick."""
+
+    period_s = 0.05
+
+    def __init__(
+        self,
+        number: signal.Signals,
+        tick: int = FIRST_BLOCK,
+        view: Path | None = None,
+        times: int = 1,
+    ) -> None:
+        self._number, self._tick, self._view, self._times = number, tick, view, times
+        self._view_began = 0
+        self.struck: list[int] = []
+
+    def _has_view(self) -> bool:
+        """Say whether the viewer's file, if that matters, has grown since it was begun."""
+        if self._view is None:
+            return True
+        size = self._view.stat().st_size if self._view.is_file() else 0
+        self._view_began = self._view_began or size
+        return size > self._view_began > 0
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Look at the tick, and at the viewer's file."""
+        if snapshot.tick > self._tick and len(self.struck) < self._times and self._has_view():
+            for pid in programs("rack.tools.recording.recorder"):
+                if pid not in self.struck:
+                    self.struck.append(pid)
+                    self.strike(pid)
+
+    def strike(self, pid: int) -> None:
+        """Send the signal."""
+        os.kill(pid, self._number)
+
+
+class Held(AtTick):
+    """Strikes while a rack in lockstep, launched with `step`, is held at the tick: however late the
+    looks of a busy machine, the run is not over. Lets it go on once it has struck."""
+
+    def __init__(self, rack: str, number: signal.Signals, tick: int = FIRST_BLOCK, times: int = 1):
+        super().__init__(number, -1, times=times)
+        self._rack, self._hold_at = rack, tick + 1
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Let it run to the tick; strike there."""
+        with closing(Segment.attach(self._rack)) as segment:
+            if segment.words[System.HELD] == self._hold_at:
+                super().show(snapshot)
+            is_done = len(self.struck) == self._times
+            segment.words[System.HOLD_AT] = 0 if is_done else self._hold_at
+
+
+class FillingDisk(AtTick):
+    """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is
+    full."""
+
+    def __init__(self) -> None:
+        super().__init__(signal.SIGKILL)
+        self.full_at = 0.0
+
+    def strike(self, pid: int) -> None:
+        """Fill the disk."""
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (4096, 4096))
+        self.full_at = time.monotonic()
+
+
+def notes_of(recording: Recording) -> list[str]:
+    return [event["text"] for event in recording.events if event["kind"] == "recorder"]
+
+
+def counts(recording: Recording) -> dict[str, int]:
+    """Return the rows of every task and every mailbox."""
+    rows = {task: len(cycles) for task, cycles in recording.cycles.items()}
+    return rows | {name: len(recording.signal(name, "serial")) for name in recording.mailboxes}
+
+
+def realtime(config: RackConfig) -> RackConfig:
+    return config.model_copy(update={"clock": config.clock.model_copy(update={"mode": "realtime"})})

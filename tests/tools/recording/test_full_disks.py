@@ -1,0 +1,102 @@
+"""A disk that is full, or a folder that cannot be written: the user gets a message, and no run
+hangs."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.segment import racks
+from rack.boards.config import RackConfig, load
+from rack.tools.console.answer import Failure
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.recording import Recording
+from tests.processes import children_of
+from tests.tools.recording.struck_recorders import (
+    LONG_S,
+    FillingDisk,
+    Keeping,
+    realtime,
+)
+
+pytestmark = pytest.mark.thorough
+
+FULL_S = 5.0
+"""Bound of the end of a run whose disk is full."""
+
+
+@pytest.fixture
+def config(small: Path, rack_name: str) -> RackConfig:
+    """A rack of two levels that count, without an arm."""
+    return load(small, [f"name={rack_name}"])
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "run.rrd").symlink_to("/dev/full")
+    result = run_rack(config, 5.0, folder, Display())
+    recording = Recording(folder)
+    assert result.worked
+    assert result.recording == "complete"
+    assert len(recording.cycles["lower"]) == 2000
+    lines = [event["text"] for event in recording.events if event["kind"] == "recorder"]
+    assert len(lines) == 1
+    assert lines[0].startswith("run.rrd ends here: ")
+
+
+@pytest.mark.slow
+def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
+    folder, display = tmp_path / "run", Keeping()
+    folder.mkdir()
+    (folder / "events.jsonl").symlink_to("/dev/full")
+    assert run_rack(config, 0.5, folder, display).worked
+    assert display.texts.count("events.jsonl ends here: No space left on device") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
+    config: RackConfig, tmp_path: Path, mode: str
+) -> None:
+    display = FillingDisk()
+    # Python's own helpers of earlier tests stay until the end.
+    before = set(children_of(os.getpid()))
+    wanted = config if mode == "lockstep" else realtime(config)
+    with pytest.raises(Failure) as caught:
+        run_rack(wanted, 5 * LONG_S, tmp_path / "run", display)
+    assert time.monotonic() - display.full_at < FULL_S
+    assert len(display.struck) == 1
+    assert caught.value.status == 1
+    assert re.fullmatch(
+        f"{tmp_path}/run: File too large: the recording ends at tick [0-9]+", str(caught.value)
+    )
+    assert config.name not in racks()
+    assert set(children_of(os.getpid())) <= before
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_from_the_start_ends_the_run(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / SPOOL).symlink_to("/dev/full")
+    with pytest.raises(Failure, match="run: No space left on device: the recording ends at tick 0"):
+        run_rack(config, 5 * LONG_S, tmp_path / "run", Display())
+
+
+@pytest.mark.slow
+def test_a_folder_that_cannot_be_written_is_named(config: RackConfig, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / CONFIG).symlink_to("/dev/full")
+    with pytest.raises(Failure, match="/run: No space left on device"):
+        run_rack(config, 1.0, tmp_path / "run", Display())
+    assert config.name not in racks()
