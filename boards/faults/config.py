@@ -12,18 +12,18 @@ from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.levels.tables import LAST_TICK, Finite, Table
 
 CONDITION = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
-DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s|min)\s*")
-UNIT_S = {"ms": 1e-3, "s": 1.0, "min": 60.0}
+_DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s|min)\s*")
+_UNIT_S = {"ms": 1e-3, "s": 1.0, "min": 60.0}
 
 
 def as_seconds(value: Any) -> Any:
     """Return a duration in s. Raises `ValueError`."""
     if not isinstance(value, str):
         return value
-    found = DURATION.fullmatch(value)
+    found = _DURATION.fullmatch(value)
     if found is None:
         raise ValueError('should be a time, as in "0.5s", "20ms" or 0.5')
-    return float(found[1]) * UNIT_S[found[2]]
+    return float(found[1]) * _UNIT_S[found[2]]
 
 
 def _number(value: Any) -> Any:

@@ -6,6 +6,7 @@ import csv
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ import typer
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.faults.config import DURATION
+from rack.boards.faults.config import as_seconds
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
@@ -108,12 +109,9 @@ def watch(
 
 
 def _seconds(option: str, text: str) -> float:
-    found = DURATION.fullmatch(text)
     seconds = -1.0
-    if found is not None:
-        seconds = float(found[1])
-        if found[2] == "ms":
-            seconds *= 1e-3
+    with suppress(ValueError):
+        seconds = as_seconds(text)
     if not 0.0 <= seconds <= MOST_S:
         why = f"not a time; permitted: as in 0.5s or 20ms, at most {MOST_S:g}s"
         raise Failure(f"{option} {text}: {why}", 2)

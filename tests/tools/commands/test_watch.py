@@ -15,6 +15,7 @@ import pytest
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
+from rack.tools.commands import watch
 from rack.tools.commands.step import Stepper
 from tests.boards.table_racks import counting
 from tests.processes import RACK, in_thread, wait_until
@@ -145,3 +146,11 @@ def go_on(name: str, until: str, ticks: int = 8000) -> None:
         stepper.go(tick + step + 8)
         time.sleep(0.002)
     Segment.attach(name).words[System.STOP_REQUEST] = 1
+
+
+def test_a_time_is_one_of_all_units() -> None:
+    assert [watch._seconds("--every", text) for text in ("20ms", "0.5s", "2 min")] == [
+        0.02,
+        0.5,
+        120.0,
+    ]
