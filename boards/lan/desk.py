@@ -8,7 +8,8 @@ has a channel of its own, and comes first.
 
 Commands go into the operator table, as those of an operator at the rack. A request waits there as
 long as its client asks on: `CLIENT_S` after its last question, or at the end of this process, it is
-withdrawn.
+withdrawn. Under a lease the desk is its client after it was issued, too, as long: then it is in
+force no more, and its level holds.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from rack.backplane.mailbox.host_ring import ProperContent
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message, fill_counts
 from rack.backplane.operator_table import (
+    Client,
     OperatorTable,
     Request,
     RequestClaim,
@@ -232,7 +234,9 @@ class Desk:
             case "reset":
                 return Code.AT_THE_RACK, b""
             case "give":
-                return self._give(asked, tick)
+                return self._give(asked, tick, Client.WAITS)
+            case "lease":
+                return self._give(asked, tick, Client.LEASES)
             case "withdraw":
                 return self._withdraw(asked)
         return self._read(asked.question.payload)
@@ -278,7 +282,7 @@ class Desk:
             return Code.OUTSIDE, b""
         return Code.GRANTED, b"".join([memory[at : at + size] for at, size in stretches])
 
-    def _give(self, asked: Asked, tick: int) -> tuple[Code, bytes]:
+    def _give(self, asked: Asked, tick: int, client: Client) -> tuple[Code, bytes]:
         number = asked.asker, asked.head.launch, asked.head.number
         if (ticket := dict(self._given).get(number)) is not None:
             return Code.GRANTED, ticket.packed()
@@ -290,7 +294,7 @@ class Desk:
         if len(self._waiting) == MOST_CLIENTS:
             return Code.FULL, b""
         try:
-            claim = self._table.try_claim(request)
+            claim = self._table.try_claim(request, client)
         except OperatorTableError:
             return Code.FULL, b""
         if claim is None:
@@ -325,11 +329,13 @@ class Desk:
         return time.monotonic_ns() + round(CLIENT_S * 1e9)
 
     def _dismiss(self) -> None:
-        """Let go of requests that have been issued, and withdraw those of clients that are gone."""
+        """Let go of requests that have been issued and are not leased, and of those of clients that
+        are gone."""
         now = time.monotonic_ns()
         kept = []
         for waiting in self._waiting:
-            if waiting.waits and now < waiting.until_ns:
+            is_leased = self._table.hear(waiting.claim.entry, waiting.claim.ticket)
+            if (waiting.waits or is_leased) and now < waiting.until_ns:
                 kept.append(waiting)
                 continue
             self._table.withdraw(waiting.claim.entry, waiting.claim.ticket)

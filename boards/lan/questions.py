@@ -22,11 +22,12 @@ from rack.backplane.operator_table import Request
 from rack.boards.lan.config import Right
 from rack.boards.lan.keys import ASKED
 
-What = Literal["stop", "reset", "give", "withdraw", "read"]
+What = Literal["stop", "reset", "give", "lease", "withdraw", "read"]
 NEEDED: Mapping[What, Right] = {
     "stop": "stop",
     "reset": "stop",
     "give": "command",
+    "lease": "command",
     "withdraw": "command",
     "read": "watch",
 }
@@ -118,7 +119,7 @@ def unpacked_stretches(packed: bytes, end: int) -> list[Stretch] | None:
 
 
 def packed_request(request: Request) -> bytes:
-    """Return the question that gives an operator's request."""
+    """Return the question that gives an operator's request, also under a lease."""
     return _REQUEST.pack(request.mailbox, request.tick) + request.message
 
 

@@ -160,7 +160,7 @@ class OperatorDesk:
             if box.writer == CLOCK
         }
         statuses = {at: f"{self._boxes[at].name.partition('.')[0]}.status" for at in self._writers}
-        there = {box.name for box in self._boxes}
+        there = {box.name for box in self._boxes if "order" in {field.name for field in box.fields}}
         self._statuses = {
             at: open_observer(segment, name) for at, name in statuses.items() if name in there
         }
@@ -213,7 +213,7 @@ class OperatorDesk:
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
         """Have a level hold whose operator has gone while the command is in force."""
         mailbox = entry[RequestWord.MAILBOX]
-        if self._is_replaced(entry):
+        if self._is_over(entry):
             self._table.release(entry)
         if entry[RequestWord.CLIENT] == Client.LEASES:
             heard = max(entry[RequestWord.GIVEN_TICK], entry[RequestWord.HEARD])
@@ -229,19 +229,22 @@ class OperatorDesk:
             self._alarms.ring(tick, Alarm.OPERATOR_GONE, entry.index, writer.message.id)
         self.leased.remove(entry)
 
-    def _is_replaced(self, entry: RequestEntry) -> bool:
-        """Return whether the level has accepted a newer command that replaces this one."""
+    def _is_over(self, entry: RequestEntry) -> bool:
+        """Return whether the level has refused the command, or accepted a newer one in its
+        place."""
         mailbox = entry[RequestWord.MAILBOX]
+        serial = entry[RequestWord.SERIAL]
         newest = self._newest.get(mailbox, 0)
-        if newest <= entry[RequestWord.SERIAL]:
-            return False
         if mailbox not in self._statuses:
-            return True
+            return newest > serial
         status = self._statuses[mailbox].peek()
         if not status.is_there:
             return False
+        order = status.value.order
+        if order == serial:
+            return bool(status.value.answer == Answer.REFUSED)
         accepted = status.value.answer in (Answer.TAKEN, Answer.DONE)
-        return bool(status.value.order == newest and accepted)
+        return bool(newest > serial and order == newest and accepted)
 
 
 class EndOfRun:

@@ -103,8 +103,9 @@ def command(
     `hold`, `setpoint`, `goto` and `do` stay in force until `resume`, and the mode of the level is
     "operator", otherwise "automatic": see 'rack status'. They survive a restart of the level's
     board. With --lease they are in force while this command lasts: Ctrl-C, a closed terminal or
-    SIGKILL make the level hold. An emergency stop takes precedence. On a rack that is held a
-    command waits for the next step: it is given then, and this returns at once.
+    SIGKILL make the level hold; from afar also a lost connection, within 2 s. --wait only watches:
+    where it ends before, the command goes on. An emergency stop takes precedence. On a rack that is
+    held a command waits for the next step: it is given then, and this returns at once.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.
@@ -130,9 +131,8 @@ def command(
     from rack.tools.live.watched import watched
 
     check_timeout(timeout, wait)
-    if lease and (wait or "/" in rack):
-        other = "--wait" if wait else rack
-        raise Failure(f"--lease, {other}: a lease stays anyway, on the rack's own machine alone", 2)
+    if lease and wait:
+        raise Failure("--lease, --wait: a lease stays anyway", 2)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising(), watched(rack, Asker.of(name, certificates)) as one:
         desk = LiveDesk(one)

@@ -22,7 +22,7 @@ def top(rack: OnlyRack = None, certificates: Certificates = "", name: AskAs = OP
     On a terminal it fills the screen, if textual is there (pip install 'nasrem-rack[live]'), and
     keys command the rack; a rack of another machine, HOST/RACK, has the table of `rack status`,
     which changes in place. Elsewhere one line a second is printed. Watching costs the rack no
-    deadline, and ending it does not end the run.
+    deadline. Where it ends the run goes on, and the commands that it has given stay in force.
 
     \b
     1 2 3 4  boards, mailboxes, events, lateness

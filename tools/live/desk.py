@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -155,21 +156,17 @@ class LiveDesk:
             entry = OperatorTable(segment).add(wanted)
             text = describe(message_of(entry, segment.layout))
             return Reply(0, command.level, text, -1, "waiting", waits=held)
-        if (answering := _answering(segment, command.level)) is not None:
-            self._rack.follow(answering.name)
-            self._rack.follow(f"{command.level}.operator")
         # However the wait ends, leaving the claim withdraws a request that has not been given.
-        with self._rack.claim(wanted) as entry:
-            ticket = entry[RequestWord.TICKET]
-            text = describe(message_of(entry, segment.layout))
-            reply = self._await_giving(entry, ticket, command.level, text)
+        with self._claimed(command.level, wanted, Client.WAITS) as entry:
+            reply = self._await_giving(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
     def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> Reply:
         """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
         the run is over: if this process ends or falls silent before, its level holds.
 
-        Raises as `give` does, and for a command that leaves none in force.
+        Raises as `give` does, for a command that leaves none in force, and when the rack is out of
+        reach.
         """
         command, wanted = self._request(given)
         segment = self._segment
@@ -181,18 +178,25 @@ class LiveDesk:
         if held := waits(segment):
             raise Failure(f"--lease: the rack is held: {held}")
         table = OperatorTable(segment)
-        with table.claim(wanted, Client.LEASES) as entry:
+        with self._claimed(command.level, wanted, Client.LEASES) as entry:
             ticket = entry[RequestWord.TICKET]
-            text = describe(message_of(entry, segment.layout))
-            reply = self._await_giving(entry, ticket, command.level, text)
-            reply = self._await_reply(reply, False, None)
+            reply = self._await_reply(self._await_giving(entry, command.level), False, None)
             if reply.worked:
                 tell(reply)
-                while table.hear(entry, ticket) and not segment.run_is_over:
-                    self._rack.refresh()
-            else:
-                table.release(entry)
+            while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
+                if not self._rack.refresh():
+                    why = f"'{command.level}' holds within 2 s, if it still runs"
+                    raise Failure(f"rack '{segment.rack}' is out of reach: {why}")
         return reply
+
+    def _claimed(
+        self, level: str, wanted: Request, client: Client
+    ) -> AbstractContextManager[RequestEntry]:
+        """Claim a request, from a rack that lets no answer of the level be missing."""
+        if (answering := _answering(self._segment, level)) is not None:
+            self._rack.follow(answering.name)
+            self._rack.follow(f"{level}.operator")
+        return self._rack.claim(wanted, client)
 
     def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
         """Return a command and what asks the clock for it. Raises as `give` does."""
@@ -220,7 +224,9 @@ class LiveDesk:
         given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
         return self.give(given, wait=False)
 
-    def _await_giving(self, entry: RequestEntry, ticket: int, level: str, text: str) -> Reply:
+    def _await_giving(self, entry: RequestEntry, level: str) -> Reply:
+        ticket = entry[RequestWord.TICKET]
+        text = describe(message_of(entry, self._segment.layout))
         about = f"'{level}', {text}"
         patience = _Patience(
             self._rack, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}"

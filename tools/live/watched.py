@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 from rack.backplane.segment import Segment
 
 if TYPE_CHECKING:
-    from rack.backplane.operator_table import Request, RequestEntry
+    from rack.backplane.operator_table import Client, Request, RequestEntry
     from rack.tools.console.address import Asker
 
 LOOK_S = 0.001
@@ -42,9 +42,9 @@ class WatchedRack(Protocol):
     def follow(self, mailbox: str) -> None:
         """Let no message of a mailbox be missing from now on, as far as its slots reach back."""
 
-    def claim(self, request: Request) -> AbstractContextManager[RequestEntry]:
-        """Add a request, and withdraw it at the end of the `with` block unless it has been
-        issued."""
+    def claim(self, request: Request, client: Client) -> AbstractContextManager[RequestEntry]:
+        """Add a request as its client. At the end of the `with` block end its lease, or withdraw it
+        unless it has been issued."""
 
 
 class LocalRack:
@@ -72,11 +72,11 @@ class LocalRack:
     def follow(self, mailbox: str) -> None:
         """Do nothing: all messages are here."""
 
-    def claim(self, request: Request) -> AbstractContextManager[RequestEntry]:
+    def claim(self, request: Request, client: Client) -> AbstractContextManager[RequestEntry]:
         """Add a request to the operator table."""
         from rack.backplane.operator_table import OperatorTable
 
-        return OperatorTable(self.segment).claim(request)
+        return OperatorTable(self.segment).claim(request, client)
 
 
 def watched(rack: str, asker: Asker | None = None) -> WatchedRack:

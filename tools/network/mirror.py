@@ -120,7 +120,7 @@ class Mirror(Segment):
             *(Stretch(address, 8 * len(Box)) for address in self.map.mailboxes.values()),
             *(Stretch(address, 8) for address in self.map.alarms.values()),
         ]
-        self._requests = OperatorTable(self).entries
+        self._operator = OperatorTable(self)
 
     def follow(self, mailbox: str) -> None:
         """Fetch every message of a mailbox from now on, as far as its slots reach back."""
@@ -150,8 +150,10 @@ class Mirror(Segment):
         injected = min(heads[8 * System.INJECTED], FAULT_ENTRIES)
         yield from self._cut(self.map.faults, injected * FAULT_ENTRY_SIZE)
         requested = heads[8 * System.REQUESTED]
-        # An entry is changed until it is issued; issued at once, it never waited here.
-        is_open = any(entry.stage == RequestStage.WAITING for entry in self._requests)
+        # An entry is changed until it is issued, or its lease released; issued at once, it never
+        # waited here.
+        waits = any(entry.stage == RequestStage.WAITING for entry in self._operator.entries)
+        is_open = waits or self._operator.leased()
         if is_open or requested != self.words[System.REQUESTED]:
             used = min(requested, OPERATOR_ENTRIES) * operator_entry_size(self.layout)
             yield from self._cut(self.map.operator, used)

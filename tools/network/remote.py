@@ -9,13 +9,20 @@ from io import BytesIO
 from typing import Self
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
-from rack.backplane.operator_table import Request, RequestEntry, RequestStage, RequestWord
+from rack.backplane.operator_table import (
+    Client,
+    Request,
+    RequestEntry,
+    RequestStage,
+    RequestWord,
+)
 from rack.boards.lan.questions import (
     MOST_CONTENT,
     MOST_STRETCHES,
     DeskAnswer,
     Stretch,
     Ticket,
+    What,
     packed_request,
     packed_stretches,
 )
@@ -85,13 +92,14 @@ class RemoteRack:
         return found, answer
 
     @contextmanager
-    def claim(self, request: Request) -> Iterator[RequestEntry]:
-        """Give a request to the rack, and withdraw it at the end of the `with` block unless it has
-        been issued."""
+    def claim(self, request: Request, client: Client) -> Iterator[RequestEntry]:
+        """Give a request to the rack. At the end of the `with` block end its lease, or withdraw it
+        unless it has been issued."""
         permit = tomllib.loads(self.segment.config)["adapter"]["lan"].get("permit", {})
         if "command" not in permit.get(self._asker.name, ()):
             raise Failure(f"rack '{self.address.rack}' {not_permitted(self._asker, 'command')}")
-        (answer,) = self._racks.ask(self._launch, "give", [packed_request(request)])
+        what: What = "lease" if client is Client.LEASES else "give"
+        (answer,) = self._racks.ask(self._launch, what, [packed_request(request)])
         ticket = Ticket.unpacked(answer.content)
         if ticket is None or ticket.entry >= OPERATOR_ENTRIES:
             raise Failure(f"rack '{self.address}': its answer to the command is malformed")
@@ -101,8 +109,9 @@ class RemoteRack:
             yield entry
         finally:
             is_known = entry[RequestWord.TICKET] == ticket.number
-            if not is_known or entry.stage == RequestStage.WAITING:
-                # If the rack is out of reach, it withdraws the request by itself.
+            is_given = is_known and entry.stage != RequestStage.WAITING
+            if client is Client.LEASES or not is_given:
+                # If the rack is out of reach, it does so by itself.
                 with suppress(Failure):
                     list(self._racks.ask(self._launch, "withdraw", [ticket.packed()]))
 

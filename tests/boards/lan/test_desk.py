@@ -333,6 +333,46 @@ def test_the_command_of_a_client_that_is_gone_is_withdrawn(
     assert table.waiting() == []
 
 
+def test_a_lease_ends_when_its_client_is_not_heard_or_withdraws_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1_000_000_000
+    monkeypatch.setattr(desks.time, "monotonic_ns", lambda: now)
+    table = OperatorTable(bench.segment)
+    for is_withdrawn in (True, False):
+        answer = bench.asked("lease", packed_request(bench.command()))
+        ticket = Ticket.unpacked(answer.content)
+        assert ticket is not None
+        entry = table.entries[ticket.entry]
+        entry.words[RequestWord.STAGE] = RequestStage.GIVEN
+        for _ in range(3):
+            now += 1_500_000_000
+            bench.asked("read", HEAD)
+            bench.segment.words[System.TICK] += 1
+            bench.cycle()
+            assert table.client_lives(entry)
+            assert entry[RequestWord.HEARD] == bench.segment.words[System.TICK]
+        if is_withdrawn:
+            bench.asked("withdraw", ticket.packed())
+        else:
+            now += 2_500_000_000
+            bench.cycle()
+        assert table.leased() == [entry]
+        assert not table.client_lives(entry)
+        table.release(entry)
+
+
+def test_the_desk_lets_go_of_a_lease_that_was_released(bench: Bench) -> None:
+    ticket = Ticket.unpacked(bench.asked("lease", packed_request(bench.command())).content)
+    assert ticket is not None
+    table = OperatorTable(bench.segment)
+    entry = table.entries[ticket.entry]
+    entry.words[RequestWord.STAGE] = RequestStage.GIVEN
+    table.release(entry)
+    bench.cycle()
+    assert not table.client_lives(entry)
+
+
 def test_commands_that_make_no_sense_are_refused(bench: Bench) -> None:
     good = bench.command()
     assert bench.asked("give", packed_request(bench.command(tick=8))).code is Code.PAST

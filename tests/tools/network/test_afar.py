@@ -23,6 +23,7 @@ from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.network.certificates import make_credentials
+from rack.tools.scripting.attached import AttachedRack
 from rack.tools.viewer.window import free_port
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S, RACK, wait_until
@@ -363,6 +364,43 @@ def test_a_client_that_is_interrupted_leaves_nothing_behind(far: Far) -> None:
         # At once, or, if it did not know its ticket yet, when it has not been heard of for a while.
         wait_until(lambda: not table.waiting())
     segment.close()
+
+
+@pytest.mark.slow
+@REALTIME
+@pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP, signal.SIGINT])
+def test_a_level_holds_whose_operator_afar_has_gone_within_a_lease(
+    far: Far, gone: signal.Signals
+) -> None:
+    with (
+        AttachedRack(far.name) as live,
+        client("command", far.address, "upper", "hold", "--lease") as command,
+    ):
+        assert command.stdout is not None
+        assert command.stdout.readline().startswith("command ")
+        command.send_signal(gone)
+        event = live.wait_for("operator_gone", BOUND_S)
+        assert (event.board, event.text[:27]) == ("upper", "hold: its operator is gone:")
+    assert rack("command", far.name, "upper", "resume").returncode == 0
+
+
+@pytest.mark.slow
+@REALTIME
+def test_a_lease_from_afar_ends_with_a_newer_command_and_when_it_is_refused(far: Far) -> None:
+    (refused,) = afar(f"command {far.address} upper goto home --lease")
+    assert (refused.status, "the way home is closed" in refused.out) == (1, True)
+    with client("command", far.address, "upper", "hold", "--lease") as command:
+        assert command.stdout is not None
+        assert command.stdout.readline().startswith("command ")
+        assert rack("command", far.name, "upper", "resume").returncode == 0
+        assert command.wait(BOUND_S) == 0
+    segment = Segment.attach(far.name)
+    assert not OperatorTable(segment).leased()
+    segment.close()
+    (status,) = afar(f"status {far.address} --json")
+    assert {row["task"]: row["mode"] for row in json.loads(status.out)["tasks"]}["upper"] == (
+        "automatic"
+    )
 
 
 @pytest.mark.slow
