@@ -151,10 +151,13 @@ class ClockDriver(ABC):
         stop = words[_STOP_TICK]
         if words[_STOP_REQUEST] and (not stop or stop > tick):
             stop = words[_STOP_TICK] = max(tick, 1)
-        # Asked in any case: a run that continues from here may end by it.
+        if stop and tick >= stop:
+            return True
+        # Asked even where the stop is known: a run that continues this one may end by it.
         found = self._ended(tick)
         if not stop and found is not None:
-            stop = words[_STOP_TICK] = max(found, 1)
+            # A run that continues another may begin after its end.
+            stop = words[_STOP_TICK] = max(found, tick, 1)
         return bool(stop) and tick >= stop
 
     @property

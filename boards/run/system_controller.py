@@ -287,10 +287,8 @@ class EndOfRun:
                 self._heard = boundary
             is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
             if is_over or boundary - self._heard >= self._silent:
-                self._task_ends = boundary + self._linger
-        if self._stop_tick is not None or self._task_ends is None:
-            return self._stop_tick
-        return max(self._task_ends, tick)
+                self._task_ends = max(boundary + self._linger, tick)
+        return self._task_ends if self._stop_tick is None else self._stop_tick
 
 
 def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
