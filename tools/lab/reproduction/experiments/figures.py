@@ -64,7 +64,10 @@ class FigureRack:
         if self.stores:
             level = f"board.{LEVEL}"
             task = f'{level}.{self.stores}="{storing.__name__}:Storing{self.stores.capitalize()}"'
-            return task, f"{level}.budget.{PARTS[self.stores]}={STORING_MS}"
+            budget = f"{level}.budget.{PARTS[self.stores]}={STORING_MS}"
+            # A planner that always has work would take what the kernel keeps from real-time
+            # priorities, 5 % of each second, for which it stops the executor, too.
+            return task, budget, f"{level}.planner_priority=0"
         if self.protocol:
             return (f'protocol.mailbox={{ "{LEVEL}.plan" = "{self.protocol}" }}',)
         return () if self.process_ms is None else settings_of(self.config, self.process_ms)
