@@ -426,6 +426,7 @@ HEALTHY = (
     Breaking("equation-3.2", "", {"nasrem": LOCKSTEP}, 7.0, judge=by_equation("nasrem")),
     Breaking("bounded-waits", "", {"nasrem": LOCKSTEP}, 3.5, ONE_LOSS),
     Breaking("loosely-coupled", "", {"brown": LOCKSTEP, "brown/servo": LOCKSTEP}, 10.0),
+    Breaking("chimera", "", {"chimera": LOCKSTEP}, 40.0),
 )
 """Racks that keep a claim, where a run is short and needs no real time; test_chapters.py and
 test_figures.py have the others, by data."""

@@ -22,6 +22,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     inputs,
     need_real_time,
 )
+from rack.tools.live.host_side import entries_of
 from rack.tools.live.launch import RunResult
 from rack.tools.recording.history import counted, misses
 from rack.tools.recording.recording import Recording
@@ -33,6 +34,7 @@ tasks of NASREM and of the state tables."""
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
+ATTEMPTS = 3
 LAUNCH_S = 3.0
 LATER_MS = 100
 """What the machine above sends comes so much later in the second run, and is due so much later."""
@@ -72,12 +74,17 @@ def _run(name: str, workshop: Workshop) -> TaskRun:
 
 def _found(result: RunResult, *recordings: Recording) -> TaskRun:
     boxes = {box: one.signal(box, "serial") for one in recordings for box in one.mailboxes}
+    messages = {box: len(np.unique(serials)) for box, serials in boxes.items()}
     first = recordings[0]
+    for status, entry, source in entries_of(first.layout, first.config):
+        if source not in messages and status in first.mailboxes:
+            # What a host board writes is counted where it enters.
+            messages[source] = int(first.signal(status, f"{entry}.passed")[-1])
     return TaskRun(
         ended=result.outcome.cause,
         lasted_s=result.outcome.ticks * first.layout.clock_ns * 1e-9,
         missed=_missed(*recordings),
-        messages={box: len(np.unique(serials)) for box, serials in boxes.items()},
+        messages=messages,
     )
 
 
@@ -87,9 +94,26 @@ def _missed(*recordings: Recording) -> float:
 
 
 def _run_two(later_ms: int, workshop: Workshop) -> NetworkRun:
-    """Run Brown's racks with a network that takes so much longer."""
+    """Run Brown's racks with a network that takes so much longer; up to three times, until all is
+    recorded: two recorders share two cores with eight boards."""
     need_real_time()
-    label = f"task-{BROWN}-{later_ms}"
+    lost: list[str] = []
+    for attempt in range(1, ATTEMPTS + 1):
+        result, general, servo = _two_recorded(later_ms, workshop, attempt)
+        lost = [one.layout.rack for one in (general, servo) if one.lost]
+        if not lost:
+            return NetworkRun(
+                **vars(_found(result, general, servo)),
+                servo_missed=_missed(servo),
+                response_ms=_response_ms(general, servo),
+            )
+    raise Failure(f"not all of {' and '.join(lost)} is recorded, in {ATTEMPTS} runs")
+
+
+def _two_recorded(
+    later_ms: int, workshop: Workshop, attempt: int
+) -> tuple[RunResult, Recording, Recording]:
+    label = f"task-{BROWN}-{later_ms}-{attempt}"
     path = workshop.folder / f"{label}-servo.toml"
     path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
     with chdir(workshop.folder):
@@ -99,14 +123,7 @@ def _run_two(later_ms: int, workshop: Workshop) -> NetworkRun:
     assert other.folder is not None, "it is recorded, as the other is"
     folder = workshop.folder / RUNS / f"{label}-servo"
     shutil.rmtree(folder, ignore_errors=True)
-    servo = Recording((workshop.folder / other.folder).rename(folder))
-    if lost := [one.layout.rack for one in (general, servo) if one.lost]:
-        raise Failure(f"not all of {' and '.join(lost)} is recorded")
-    return NetworkRun(
-        **vars(_found(result, general, servo)),
-        servo_missed=_missed(servo),
-        response_ms=_response_ms(general, servo),
-    )
+    return result, general, Recording((workshop.folder / other.folder).rename(folder))
 
 
 def _servo(workshop: Workshop, later_ms: int) -> RackConfig:
