@@ -88,7 +88,7 @@ COMMANDS = (
     (
         "rewind",
         "rack.tools.commands.rewind:rewind",
-        "Go back to any tick of a recorded run, look around, and branch off.",
+        "Go back to any tick of a recorded run, and branch off.",
     ),
     (
         "report",
