@@ -15,8 +15,8 @@ from rack.backplane.process import die_with_parent, name_process, set_priority
 
 PRIORITY = 79
 """Below that of the servo level, which must not wait for drives; above all others'."""
-POLL_S = 1e-3
-"""Woken by every frame, seven drives would take a core and a half."""
+LOOKS = 2
+"""At the bus, in a tick. Woken by every frame, seven drives would take a core and a half."""
 DRIFT_S = 1e-7
 """By how much the rack's clock may come later in a tick, as a drive's own clock sees it."""
 WINDOW_S = 5e-3
@@ -141,4 +141,4 @@ def run_drive(node: int, mechanics: Mechanics, times_s: tuple[float, float], par
         while cable.disturbance is not Disturbance.RESET:
             cable.receive(drive.take)
             drive.watch(monotonic(), cable.disturbance)
-            sleep(POLL_S)
+            sleep(times_s[0] / LOOKS)
