@@ -563,3 +563,4 @@ def test_killed_drive_board_and_launcher_leave_an_arm_that_is_braked(
         launcher.kill()
         launcher.wait()
     wait_until(lambda: not drives_of(channel))
+    assert rack("clean").returncode == 0

@@ -4,15 +4,19 @@ joined by a network."""
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
-from contextlib import chdir
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import numpy as np
 
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments.experiment import (
@@ -34,6 +38,9 @@ tasks of NASREM and of the state tables."""
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
+PATIENCE = 2.0
+"""A task that takes so many times as long is ended: on a machine too slow for it some board is
+always away, and it may never be done."""
 ATTEMPTS = 3
 LAUNCH_S = 3.0
 LATER_MS = 100
@@ -69,7 +76,26 @@ class NetworkRun(TaskRun):
 
 def _run(name: str, workshop: Workshop) -> TaskRun:
     need_real_time()
-    return _found(*workshop.run(f"task-{name}", workshop.config(name)))
+    with _patience(workshop, TASKS_S[name]):
+        return _found(*workshop.run(f"task-{name}", workshop.config(name)))
+
+
+@contextmanager
+def _patience(workshop: Workshop, lasts_s: float) -> Iterator[None]:
+    """End a rack whose task, which lasts so long, is not done in time."""
+    timer = Timer(LAUNCH_S + PATIENCE * lasts_s, _end, (workshop.rack,))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
+
+
+def _end(rack: str) -> None:
+    # It may have ended by itself, or not begun.
+    with suppress(SegmentError), closing(Segment.attach(rack)) as segment:
+        segment.words[System.STOP_REQUEST] = 1
 
 
 def _found(result: RunResult, *recordings: Recording) -> TaskRun:
