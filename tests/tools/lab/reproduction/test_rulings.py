@@ -19,7 +19,8 @@ from pydantic import TypeAdapter
 from rack.boards.config import load
 from rack.tools.lab.benches import switch
 from rack.tools.lab.benches.systems.figures import prediction
-from rack.tools.lab.reproduction.experiments import figures, measured, nasrem, sharing
+from rack.tools.lab.reproduction.experiments import figures, measured, nasrem, sharing, tasks
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
 from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
@@ -439,6 +440,16 @@ def test_a_claim_holds_in_a_rack_that_keeps_it(row: Breaking, tmp_path: Path) ->
     verdict = row.judge(workshop, STATEMENTS[row.claim])
     assert unmet(verdict.demands) == ""
     assert verdict.ruling is Ruling.HOLDS
+
+
+@pytest.mark.alone
+def test_a_task_that_takes_too_long_is_ended_and_not_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "PATIENCE", 0.5)
+    found = tasks.TASKS["hic"].make(Workshop(tmp_path, share=True))
+    assert found.ended == "stopped"
+    assert 0.0 < found.lasted_s < tasks.TASKS_S["hic"]
 
 
 def test_every_ruling_of_the_page_has_a_rack_that_breaks_it() -> None:
