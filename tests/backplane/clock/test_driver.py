@@ -23,6 +23,8 @@ from tests.processes import BOUND_S, in_thread
 
 PERIOD_NS = 1_000_000
 HISTORY = 8
+STOP = 100
+"""Enough ticks that a machine that is away for a while misses some, not all."""
 
 
 def start(segment: Segment, lead_ns: int = 3 * PERIOD_NS) -> None:
@@ -59,11 +61,10 @@ def test_a_run_stops_at_its_tick_and_wakes_everybody(make_bus: MakeBus) -> None:
     segment = make_bus()
     start(segment)
     posts = [wake_semaphore(segment.rack, name) for name in ("writer", "reader")]
-    # Enough ticks that a machine that is away for a while misses some, not all.
-    ticks = given_out(segment, 100)
-    assert segment.words[System.TICK] < 100 <= ticks[-1][0]
+    ticks = given_out(segment, STOP)
+    assert segment.words[System.TICK] < STOP <= ticks[-1][0]
     assert len(ticks) > 1
-    assert (segment.words[System.STATE], segment.words[System.STOP_TICK]) == (Run.STOPPED, 100)
+    assert (segment.words[System.STATE], segment.words[System.STOP_TICK]) == (Run.STOPPED, STOP)
     released = len(ticks) - 1
     assert [post.value for post in posts] == [released + 1] * 2
 
@@ -106,7 +107,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
 ) -> None:
     segment = make_bus(task("poller", wake="poll"))
     start(segment)
-    driver = RealtimeDriver(segment, lambda tick: 20 if tick >= 20 else None)
+    driver = RealtimeDriver(segment, lambda tick: STOP if tick >= STOP else None)
     work: list[tuple[str, int, bool]] = []
 
     class Noting:
@@ -131,7 +132,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
 def test_a_task_that_polls_is_released_without_posts(make_bus: MakeBus) -> None:
     segment = make_bus(task("poller", wake="poll"))
     start(segment)
-    assert len(given_out(segment, 30)) > 1
+    assert len(given_out(segment, STOP)) > 1
     # The one post is the end's.
     assert wake_semaphore(segment.rack, "poller").value == 1
 
