@@ -131,6 +131,11 @@ class ClockDriver(ABC):
         """
         return self.words[_TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
+    @property
+    def first_end(self) -> int:
+        """The first tick before which the run may end."""
+        return 0
+
     @abstractmethod
     def settle(self) -> None:
         """In lockstep, wait until each task has finished the work of its release, plans too.
@@ -157,8 +162,7 @@ class ClockDriver(ABC):
         # Asked even where the stop is known: a run that continues this one may end by it.
         found = self._ended(tick)
         if not stop and found is not None:
-            # A run that continues another may begin after its end.
-            stop = words[_STOP_TICK] = max(found, tick, 1)
+            stop = words[_STOP_TICK] = max(found, self.first_end, 1)
         return bool(stop) and tick >= stop
 
     @property

@@ -62,6 +62,11 @@ class LockstepDriver(ClockDriver):
         self._next = self.first_tick
         self._last = self._next - 1
 
+    @property
+    def first_end(self) -> int:
+        """The next tick: a run that continues another may begin after its end."""
+        return self._next
+
     def run(self) -> None:
         """Make ticks until the run is over or the launcher is gone."""
         self.words[System.STATE] = Run.RUNNING
