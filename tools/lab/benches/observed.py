@@ -46,6 +46,11 @@ class Recorded(NamedTuple):
     recording: Recording
 
 
+UNVIEWED = ("record.keep=600", "record.checkpoint_s=0")
+"""Settings of a rack whose recording nobody looks at: a flight recorder makes no viewer's file,
+which takes a recorder of 1 kHz as long as the rest."""
+
+
 def record(
     config: RackConfig,
     seconds: float | None,

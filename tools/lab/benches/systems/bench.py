@@ -18,7 +18,7 @@ from rack.boards.config.layout import obtained_core
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, overdue
-from rack.tools.lab.benches.observed import Runs, missed_share, record
+from rack.tools.lab.benches.observed import UNVIEWED, Runs, missed_share, record
 from rack.tools.lab.benches.systems.figures import RealTimeFigures, SystemFigures, prediction
 from rack.tools.lab.benches.systems.hold import held, hold_for
 from rack.tools.lab.benches.systems.kills import kill_each, kills_s
@@ -80,7 +80,8 @@ class _System:
         self._is_compared = is_compared
         own = f"systems-{os.getpid()}"
         self._lockstep = load(name, [f"name={own}", "clock.mode=lockstep", "clock.speed=1.0"])
-        self._config = load(name, [f"name={own}", "clock.mode=realtime", "clock.speed=1.0"])
+        in_real_time = (f"name={own}", "clock.mode=realtime", "clock.speed=1.0")
+        self._config = load(name, [*in_real_time, *UNVIEWED])
         self._layout = wire(self._config)
         self._timing = rack_timing(self._config, self._layout)
         self._hold = hold_for(self._config, runs.seconds)

@@ -27,7 +27,7 @@ from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.observed import Deed, observe, record
+from rack.tools.lab.benches.observed import UNVIEWED, Deed, observe, record
 from rack.tools.lab.benches.systems.hold import hold_paths
 
 ALONE = "one-machine"
@@ -140,7 +140,8 @@ class PosesBench:
     """The three runs of one rack's motion."""
 
     def __init__(self, path: Path, rack: str, share: bool) -> None:
-        self._config = load(path, [f"name={rack}", "clock.mode=lockstep", "clock.speed=1.0"])
+        own = (f"name={rack}", "clock.mode=lockstep", "clock.speed=1.0")
+        self._config = load(path, [*own, *UNVIEWED])
         self._layout: Layout = wire(self._config)
         self._share = share
         self._arm = next(box.name for box in self._layout.mailboxes if box.message in DRIVING)

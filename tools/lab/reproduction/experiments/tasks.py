@@ -19,6 +19,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.observed import UNVIEWED
 from rack.tools.lab.reproduction.experiments.experiment import (
     RUNS,
     Experiment,
@@ -42,9 +43,6 @@ PATIENCE = 2.0
 """A task that takes so many times as long is ended: on a machine too slow for it some board is
 always away, and it may never be done."""
 ATTEMPTS = 3
-KEPT = "record.keep=600"
-"""All of it: a flight recorder makes no viewer's file meanwhile, which takes a recorder of 1 kHz as
-long as the rest."""
 LAUNCH_S = 3.0
 LATER_MS = 100
 """What the machine above sends comes so much later in the second run, and is due so much later."""
@@ -80,7 +78,7 @@ class NetworkRun(TaskRun):
 def _run(name: str, workshop: Workshop) -> TaskRun:
     need_real_time()
     with _patience(workshop, TASKS_S[name]):
-        return _found(*workshop.run(f"task-{name}", workshop.config(name, [KEPT])))
+        return _found(*workshop.run(f"task-{name}", workshop.config(name, UNVIEWED)))
 
 
 @contextmanager
@@ -186,7 +184,7 @@ def _renamed(workshop: Workshop, name: str, more: Sequence[str]) -> RackConfig:
         f'adapter.lan.import.{port}.from="{own[entry.rack]}/{entry.mailbox}"'
         for port, entry in given.adapter.lan.imports.items()
     ]
-    return load(workshop.source(name), [*imports, *more, KEPT, f"name={own[given.name]}"])
+    return load(workshop.source(name), [*imports, *more, *UNVIEWED, f"name={own[given.name]}"])
 
 
 def _response_ms(general: Recording, servo: Recording) -> float | None:
