@@ -20,7 +20,8 @@ from rack.boards.config.schema import (
 )
 from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.interrupts import InboxTiming
-from rack.levels.timing.rack import BoardTiming, CyclicSchedule, RackTiming
+from rack.levels.timing.level import BoardTiming
+from rack.levels.timing.rack import CyclicSchedule, RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
 NS_PER_MS = 1e6

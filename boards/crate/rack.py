@@ -22,7 +22,6 @@ from rack.backplane.fault_table import FaultTable
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import digest
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry
-from rack.backplane.process import how_ended
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
@@ -34,6 +33,7 @@ from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.hosts import HostBoards
 from rack.boards.crate.line import CrateLine
+from rack.boards.crate.lost_boards import LostBoards
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.patience import Patience, RackAwaited, await_opened
 from rack.boards.crate.recovery import Recovery, Supervision
@@ -49,8 +49,6 @@ from rack.boards.crate.requests import (
     Preload,
 )
 from rack.boards.errors import (
-    CANNOT_GO_ON,
-    CANNOT_KEEP,
     UNKEPT,
     CheckpointError,
     ConfigError,
@@ -113,11 +111,8 @@ class Rack:
         self._journal = Journal(on_event)
         self._crate = crate
         self._pids: dict[str, int] = {}
-        self._faults: list[str] = []
+        self._losses = LostBoards(self._journal, self._record_printed)
         self._is_armed = False
-        self._cannot_keep = False
-        self._is_beyond_help = False
-        self._cause: Cause | None = None
         self._why_stopped = ""
         self._stop_by: float | None = None
         self._supervisor: Thread | None = None
@@ -206,11 +201,11 @@ class Rack:
         patience = Patience(self._journal, LAUNCH_S)
         while absent := [t.name for t in self._plan.layout.tasks if self._state(t.name) not in UP]:
             self._listen(patience.left_s)
-            if self._faults:
+            if self._losses.faults:
                 printed = self._line.printed()
-                if self._cannot_keep:
+                if self._losses.cannot_keep:
                     raise CheckpointError(printed[0])
-                raise LaunchError("\n".join(printed) or self._faults[0])
+                raise LaunchError("\n".join(printed) or self._losses.faults[0])
             if patience.is_over:
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {LAUNCH_S:g} s")
             patience.report(f"boards {', '.join(absent)} are starting")
@@ -241,6 +236,7 @@ class Rack:
         self._hosts = HostBoards(
             self.segment, self._plan.hosts, supervision, self._line, self._journal
         )
+        self._losses.begin(self._recovery, self._hosts)
         self._alarms = AlarmWatch(self.segment, self.config)
         self._heartbeat = Heartbeat(self.segment)
         self._awaited = RackAwaited(self.segment, self._journal)
@@ -322,7 +318,7 @@ class Rack:
             if not self._is_armed:
                 self._reset_latch()
             is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
-            if self.segment.words[System.STATE] == Run.STOPPED or self._is_beyond_help or is_late:
+            if self._is_stopped or self._losses.is_beyond_help or is_late:
                 self._end()
             if time.monotonic() >= deadline:
                 break
@@ -331,7 +327,6 @@ class Rack:
     def stop(self, why: str = "stopped by its program") -> None:
         """End the run at the next tick. May be called at any time, even from a signal handler."""
         self._why_stopped = self._why_stopped or why
-        self._cause = self._cause or "stopped"
         self.segment.words[System.STOP_REQUEST] = 1
         os.eventfd_write(self._line.attention, 1)
 
@@ -380,14 +375,11 @@ class Rack:
             case Ended(name, _, status) as end:
                 self._pids.pop(name, None)
                 is_board = name == CLOCK or name in self.segment.map.blocks
-                over = self.outcome is not None or self.segment.words[System.STATE] == Run.STOPPED
-                if is_board and not (over and status == 0):
-                    self._lose(end)
+                is_over = self._is_stopped or self.outcome is not None
+                if is_board and not (is_over and status == 0):
+                    self._losses.lose(end, self._is_stopped)
             case None:
-                self._is_beyond_help = True
-                text = "the crate ended, and all boards with it"
-                self._journal.add("died", "crate", text, "died")
-                self._give_up("crate", text)
+                self._losses.lose_crate()
 
     def _act_on(self, rung: RungAlarm) -> None:
         """Record the event of an alarm, and kill a process that hangs."""
@@ -398,44 +390,6 @@ class Rack:
             # Only the clock that was reported: its successor may be running by now.
             self._recovery.end_hanging(CLOCK)
 
-    def _lose(self, end: Ended) -> None:
-        """Record the end of a board, and restart it or give it up."""
-        if hasattr(self, "_hosts") and end.name in self._hosts:
-            if not self._hosts.lose(end, how_ended(end.status)):
-                self._faults.append(
-                    f"host board '{end.name}' ended: {how_ended(end.status)}; no restarts left"
-                )
-            return
-        text = f"board '{end.name}' ended: {how_ended(end.status)}"
-        self._cannot_keep |= end.status == CANNOT_KEEP
-        self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
-        if not hasattr(self, "_recovery") or self.segment.words[System.STATE] == Run.STOPPED:
-            self._give_up(end.name, text)
-            return
-        is_final = end.status in (CANNOT_GO_ON, CANNOT_KEEP)
-        if is_final:
-            # It has printed the reason.
-            self._record_printed()
-            text = next(
-                (
-                    e.text
-                    for e in reversed(self.events)
-                    if e.text.startswith(f"board '{end.name}': ")
-                ),
-                text,
-            )
-        restart = self._recovery.lose(end.name, end.tick, is_final)
-        if restart is None:
-            self._is_beyond_help = end.name == CLOCK
-            self._give_up(end.name, text if is_final else f"{text}; no restarts left")
-        else:
-            self._journal.add("reaction", end.name, str(restart), "restart")
-
-    def _give_up(self, board: str, text: str) -> None:
-        self._faults.append(text)
-        self._cause = "board lost"
-        self._journal.add("reaction", board, f"gave up on '{board}'", "given_up")
-
     def _end(self) -> None:
         """Record the end of the run (cause, ticks, digest) and let the boards end."""
         for rung in self._alarms.drain():
@@ -443,18 +397,18 @@ class Rack:
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
         state, reason = self._ending.final_state()
-        # A stop may also come from another process, by a word in the segment.
-        cause = self._cause or ("stopped" if words[System.STOP_REQUEST] else self._ending.cause())
+        cause = self._cause()
+        faults = self._losses.faults
         tick_ms = self.config.clock_ns * 1e-6
         found = brakings(self.events, stop, tick_ms)
         if cause in ("task done", "time over"):
-            self._faults += self._ending.latched()
+            faults += self._ending.latched()
         if cause == "time over":
-            self._faults += self._ending.held(self.events, found, stop * tick_ms)
+            faults += self._ending.held(self.events, found, stop * tick_ms)
         objects = self._ending.ends(self._plan.goals)
         if cause == "task done":
             # Written so that NaN is too far.
-            self._faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
+            faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self._end_boards()
         self.outcome = Outcome(
             cause=cause,
@@ -462,11 +416,19 @@ class Rack:
             state=state,
             reason=reason,
             digest=digest(self.segment, stop),
-            faults=tuple(self._faults),
+            faults=tuple(faults),
             brakings=found,
             objects=objects,
         )
         self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
+
+    def _cause(self) -> Cause:
+        if self._losses.given_up:
+            return "board lost"
+        # A stop may also come from another process, by this word.
+        if self.segment.words[System.STOP_REQUEST]:
+            return "stopped"
+        return self._ending.cause()
 
     def close(self) -> None:
         """End everything: no process and no segment of this rack is left."""
@@ -481,7 +443,7 @@ class Rack:
         try:
             if hasattr(self, "segment"):
                 self._end_boards()
-            if self._cause == "board lost" or self._has_lost():
+            if self._losses.given_up or self._has_lost():
                 crate.ask(PowerOff())
             # A crate without boards may still be importing: do not wait for it.
             crate.close(LEAVE_S if self._pids else 0)
@@ -496,6 +458,10 @@ class Rack:
         return hasattr(self, "segment") and any(
             self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks
         )
+
+    @property
+    def _is_stopped(self) -> bool:
+        return self.segment.words[System.STATE] == Run.STOPPED
 
     def _end_boards(self) -> None:
         """Declare the run over, to the clock and the boards."""

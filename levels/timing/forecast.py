@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from rack.levels.timing.frames import CoreFrames, core_frames
-from rack.levels.timing.rack import CyclicSchedule, LevelTiming, RackTiming
+from rack.levels.timing.level import LevelTiming
+from rack.levels.timing.rack import CyclicSchedule, RackTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction, predict
 from rack.levels.timing.verdicts import EquationVerdict, verdicts

@@ -13,9 +13,11 @@ from math import inf, isfinite
 from typing import Any
 
 from rack.levels.timing import equations
+from rack.levels.timing.chains import ParallelChains
 from rack.levels.timing.equations import Relation
 from rack.levels.timing.frames import core_frames
-from rack.levels.timing.rack import LevelTiming, ParallelChains, RackTiming
+from rack.levels.timing.level import LevelTiming
+from rack.levels.timing.rack import RackTiming
 
 SYSTEM = "system"
 """The subject of the system's response."""

@@ -20,7 +20,8 @@ from rack.tools.console.parameters import (
 )
 
 if TYPE_CHECKING:
-    from rack.tools.live.desk import LiveDesk, Reply
+    from rack.tools.live.desk import LiveDesk
+    from rack.tools.live.replies import Reply
 
 DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
 """Commands that leave none in force."""

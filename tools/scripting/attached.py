@@ -22,8 +22,9 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Failure, as_failure
 from rack.tools.faults.live import LiveRack
 from rack.tools.live import pausing
-from rack.tools.live.desk import LiveDesk, Reply
+from rack.tools.live.desk import LiveDesk
 from rack.tools.live.folder import folder_of
+from rack.tools.live.replies import Reply
 from rack.tools.live.signals import SignalTap
 from rack.tools.live.snapshot import RackMonitor, Snapshot
 from rack.tools.live.watched import LocalRack

@@ -15,8 +15,9 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.boards.config import rack_timing
+from rack.levels.timing.chains import ParallelChains
 from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
-from rack.levels.timing.rack import ParallelChains, RackTiming
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import mailboxes_along
 from rack.levels.timing.trace_times import counts, distribution
 from rack.levels.timing.verdicts import response_subject

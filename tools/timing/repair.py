@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 
 from rack.backplane.layout import Protocol
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
-from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.level import LevelTiming
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
 

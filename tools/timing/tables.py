@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
+from rack.levels.timing.chains import spanned
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.frames import CoreFrames
-from rack.levels.timing.rack import LevelTiming, spanned
+from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
 from rack.levels.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
-
 from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.rack import BoardTiming, RackTiming, spanned
+from rack.levels.timing.level import BoardTiming
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 from rack.levels.timing.verdicts import verdicts
 
@@ -133,27 +132,6 @@ def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() 
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
     found = rack(*boards, goal_ns=60 * 2.0 * MS).longest_cycles
     assert found == {"top": 20, "middle": 20, "low": 20}
-
-
-@pytest.mark.parametrize(
-    ("names", "text"),
-    [
-        (("joint1", "joint2", "joint3"), "joint1 ... joint3"),
-        (("joint9", "joint10", "joint11"), "joint9 ... joint11"),
-        (("j1.planner", "j2.planner", "j3.planner"), "j1.planner ... j3.planner"),
-        (("joint1", "joint2"), "joint1, joint2"),
-        (("joint1", "joint2", "joint4"), "joint1, joint2, joint4"),
-        (("joint2", "joint1", "joint3"), "joint2, joint1, joint3"),
-        (("a1", "b2", "c3"), "a1, b2, c3"),
-        (("joint1", "joint2", "joint3", "arm"), "joint1 ... joint3, arm"),
-        (("servo",), "servo"),
-        ((), ""),
-    ],
-)
-def test_numbered_names_are_shortened_only_if_none_is_left_out(
-    names: tuple[str, ...], text: str
-) -> None:
-    assert spanned(names) == text
 
 
 def test_a_goal_for_the_response_is_divided_among_the_levels() -> None:

@@ -13,7 +13,7 @@ import pytest
 from rack.boards.config import budgets, load
 from rack.boards.config.files import names
 from rack.levels.timing.forecast import Forecast
-from rack.tools.commands.check import inventory, inventory_lines
+from rack.tools.timing.inventory import inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.tables import forecast_lines
 from tests.shared_runs import small_run

@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.operator_table import OperatorTable
-from rack.backplane.segment import Segment, racks, unlink
-from rack.backplane.words import Block, System
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import System
 from rack.boards import Rack
-from rack.boards.config import load, resolve
+from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.live import desk
-from rack.tools.live.desk import LiveDesk, Replies, goal_of
+from rack.tools.live.desk import LiveDesk, goal_of
+from rack.tools.live.replies import Replies
 from rack.tools.live.watched import LocalRack
 from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
@@ -375,27 +376,6 @@ def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
     process.communicate(timeout=BOUND_S)
     assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
     assert table.waiting() == []
-
-
-def test_a_level_is_waited_for_by_its_cycles_and_not_for_ever(
-    tmp_path: Path, rack_name: str
-) -> None:
-    (tmp_path / "told.toml").write_text(COMMANDED)
-    layout = resolve(load(tmp_path / "told.toml", [f"name={rack_name}"])).layout
-    segment = Segment.create(layout, "")
-    try:
-        block = segment.block("lower")
-        last = desk.LastCycle(segment, layout.mailbox("lower.status"))
-        # It skipped ticks, but did few cycles.
-        block[Block.CYCLES] = desk.REPLY_CYCLES
-        assert last.passed(100) == ""
-        block[Block.CYCLES] += 1
-        assert last.passed(101) == f"has not answered in {desk.REPLY_CYCLES} of its cycles"
-        stopped = desk.LastCycle(segment, layout.mailbox("lower.status"))
-        assert stopped.passed(101) == stopped.passed(501) == ""
-        assert stopped.passed(502) == "has not answered, and done no cycle since tick 101"
-    finally:
-        unlink(rack_name)
 
 
 @pytest.mark.slow

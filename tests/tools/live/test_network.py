@@ -16,12 +16,12 @@ from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.resolved import loads, wire
 from rack.levels.peer import Presence
-from rack.tools.commands.check import inventory, inventory_lines
 from rack.tools.live.display import RackView
 from rack.tools.live.network import ExportRow, ImportRow, Network, PeerRow, exchanged
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.timing.analysis.report import network
 from rack.tools.timing.analysis.report_markdown import _network
+from rack.tools.timing.inventory import inventory, inventory_lines
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text(

@@ -8,11 +8,11 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load, wire
-from rack.tools.commands.check import inventory, inventory_lines
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.live.queues import Queues
 from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.inventory import inventory, inventory_lines
 from tests.boards.test_queues import QUEUES
 
 FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")

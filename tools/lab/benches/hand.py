@@ -13,7 +13,7 @@ import numpy as np
 
 from rack.boards.config import load
 from rack.levels.systems.hand.messages import GraspKind
-from rack.levels.timing.rack import spanned
+from rack.levels.timing.chains import spanned
 from rack.levels.timing.trace_times import counts
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.exchange_times import ExchangeTimes, exchange_times

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from rack.levels.timing.equations import plan_cycles_tight, residual_deviation_ns
-from rack.levels.timing.rack import LevelTiming, RackTiming
+from rack.levels.timing.level import LevelTiming
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import counts, distribution, gaps_ns, lateness_ns, response_ns
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts

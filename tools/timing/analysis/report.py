@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.message import State
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
-from rack.levels.messages import SCENE, TASK_STATUS
 from rack.levels.peer import Presence, peer_port
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
@@ -43,26 +41,12 @@ from rack.tools.recording.history import (
 from rack.tools.recording.recorder_process import sizes
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
+from rack.tools.timing.analysis import arm_outcome
+from rack.tools.timing.analysis.arm_outcome import rounded
 from rack.tools.timing.analysis.report_markdown import markdown
 from rack.tools.timing.measured_response import system_response
 
 Report = dict[str, Any]
-DRIVING = ("servo_status", "arm_status")
-HAND_STATUS = "hand_status"
-WRENCH = "wrench"
-FORCE_STATUS = "force_status"
-"""Messages by name, as recordings hold them: to report on them takes no level that only other racks
-have."""
-FALLING_M_S = 0.05
-"""Speed from which an object falls: a grip that slips, or fingers that lower it, are slower."""
-BOUNCE = 2
-"""Samples between the parts of one fall."""
-SETTLE = 20
-"""Samples after a fall in which the object comes to rest: at first it sinks into what it landed on,
-or bounces."""
-LEAST_M = 0.005
-"""Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part
-along."""
 
 
 def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
@@ -107,11 +91,11 @@ def report_of(recording: Recording) -> Report:
         "system_response": system_response(recording),
         "entries": _entries(recording),
         "network": network(recording),
-        "task": _task_outcome(recording),
-        "objects": list(_objects(recording, config)),
-        "motion": _motion(recording),
-        "hand": _hand(recording, config),
-        "force": _force(recording),
+        "task": arm_outcome.task_outcome(recording),
+        "objects": list(arm_outcome.objects(recording, config)),
+        "motion": arm_outcome.motion(recording),
+        "hand": arm_outcome.hand(recording, config),
+        "force": arm_outcome.force(recording),
         "queues": queues(recording),
         "interrupts": interrupts(recording),
         "recording": ended.get("recording", "without the end of the run"),
@@ -235,14 +219,14 @@ def task_times(
     by_the_clock: Report = {
         "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
         "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),
-        "largest_gap_ms": _rounded(gaps.max() * 1e-6) if len(gaps) else None,
+        "largest_gap_ms": rounded(gaps.max() * 1e-6) if len(gaps) else None,
         "alpha_ms": None,
         "deviation_ms": None,
     }
     if len(cycles):
         times = execution_ns(cycles).tolist(), communication_ns(cycles).tolist()
-        by_the_clock["alpha_ms"] = _rounded(residual_bound_ns(slice_ns, *times) * 1e-6)
-        by_the_clock["deviation_ms"] = _rounded(residual_deviation_ns(*times) * 1e-6)
+        by_the_clock["alpha_ms"] = rounded(residual_bound_ns(slice_ns, *times) * 1e-6)
+        by_the_clock["deviation_ms"] = rounded(residual_deviation_ns(*times) * 1e-6)
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * 1e-6,
@@ -268,135 +252,6 @@ def _entries(recording: Recording) -> list[Report]:
             ages_ms = distribution(ages[ages >= 0] * tick_ms)
             found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
     return found
-
-
-def _task_outcome(recording: Recording) -> Report | None:
-    """Return the last status of the level that reports on the whole task."""
-    mailbox = _mailbox_of(recording, TASK_STATUS.name)
-    if mailbox is None:
-        return None
-
-    def last(field: str) -> Any:
-        return recording.signal(mailbox, field)[-1]
-
-    counts = {
-        name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")
-    }
-    return {
-        "state": State(int(last("state"))).name.lower(),
-        "reason": str(last("reason")),
-        **counts,
-    }
-
-
-def _objects(recording: Recording, config: RackConfig) -> Iterator[Report]:
-    """Yield where each object that has a goal ended, and its falls."""
-    for end in recording.ended.get("outcome", {}).get("objects", ()):
-        row = config.scene.objects.index(end["object"])
-        yield {**end, "drops": list(_drops(recording, row))}
-
-
-def _drops(recording: Recording, row: int) -> Iterator[Report]:
-    """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
-    tool."""
-    mailbox = _mailbox_of(recording, SCENE.name)
-    if mailbox is None:
-        return
-    ticks = recording.signal(mailbox, "tick")
-    place = recording.signal(mailbox, "position")[:, row]
-    # What moves and turns with the tool keeps its distance from it.
-    away = np.linalg.norm(place - recording.signal(mailbox, "tool_position"), axis=1)
-    height = place[:, 2]
-    least = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
-    falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(away))) > least)
-    first = falling[np.diff(falling, prepend=-BOUNCE - 1) > BOUNCE]
-    last = falling[np.diff(falling, append=len(ticks) + BOUNCE) > BOUNCE] + 1
-    for begin, end in zip(first, last, strict=True):
-        if (fallen := height[begin] - height[end:][:SETTLE][-1]) > LEAST_M:
-            yield {"tick": int(ticks[begin]), "mm": _rounded(fallen * 1e3)}
-
-
-def _motion(recording: Recording) -> Report | None:
-    """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set
-    points, or None."""
-    mailbox = _mailbox_of(recording, *DRIVING)
-    if mailbox is None:
-        return None
-    error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
-    return {
-        "tracking_rms_mrad": _rms(error),
-        "tracking_peak_mrad": _rounded(np.abs(error).max()),
-        **_counts(recording, mailbox),
-    }
-
-
-def _counts(recording: Recording, mailbox: str) -> Report:
-    """Return what a board that drives an arm or a hand has counted."""
-    names = {name: name for name in ("touches", "violations", "pushed")} | {
-        "clipped_cycles": "clipped"
-    }
-    return {key: int(recording.signal(mailbox, name)[-1]) for key, name in names.items()}
-
-
-def _rms(error: np.ndarray) -> float:
-    return _rounded(np.sqrt(np.mean(error**2)))
-
-
-def _rounded(value: float) -> float:
-    return round(float(value), 6)
-
-
-def _hand(recording: Recording, config: RackConfig) -> Report | None:
-    """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or
-    None."""
-    mailbox = _mailbox_of(recording, HAND_STATUS)
-    if mailbox is None or config.robot is None or config.robot.hand is None:
-        return None
-    tension = recording.signal(mailbox, "tension")
-    force = recording.signal(mailbox, "force")
-    error = tension - recording.signal(mailbox, "wanted")
-    most = np.linalg.norm(force, axis=2).max(axis=0)
-    fingers = [finger.name for finger in config.robot.hand.finger]
-    return {
-        "tension_rms_n": _rms(error),
-        "tension_peak_n": _rounded(np.abs(error).max()),
-        "least_tension_n": _rounded(tension.min()),
-        "largest_tension_n": _rounded(tension.max()),
-        "largest_force_n": {
-            finger: _rounded(value) for finger, value in zip(fingers, most, strict=True)
-        },
-        "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
-        **_counts(recording, mailbox),
-    }
-
-
-def _force(recording: Recording) -> Report | None:
-    """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N,
-    or None."""
-    wrench = _mailbox_of(recording, WRENCH)
-    status = _mailbox_of(recording, FORCE_STATUS)
-    if wrench is None:
-        return None
-    halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)
-    force, torque = np.linalg.norm(halves, axis=2).max(axis=0)
-    error = np.zeros(0)
-    if status is not None:
-        # The tool exerts the opposite of what it feels.
-        off = recording.signal(status, "wanted") + recording.signal(status, "wrench")
-        error = off[:, :3][recording.signal(status, "selected")[:, :3] == 1]
-    return {
-        "largest_force_n": _rounded(force),
-        "largest_torque_nm": _rounded(torque),
-        "exceeded_cycles": int(recording.signal(wrench, "exceeded")[-1]),
-        "force_rms_n": _rms(error) if len(error) else None,
-    }
-
-
-def _mailbox_of(recording: Recording, *messages: str) -> str | None:
-    """Return the first mailbox with messages of one of these types; None when it is empty, or there
-    is none."""
-    name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
-    return name if name in recording.mailboxes else None
 
 
 def network(recording: Recording) -> Report | None:

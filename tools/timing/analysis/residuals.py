@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from rack.levels.timing.rack import LevelTiming
+from rack.levels.timing.level import LevelTiming
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.recording.cycles import Cycles
 from rack.tools.timing.analysis.analysis import Analysis

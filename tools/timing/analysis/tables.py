@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
-from rack.levels.timing.rack import LevelTiming
+from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.tables import decimal, figure, ms, table
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rack.boards.config import RackConfig
 from rack.boards.config.timing import tick_ns
-from rack.levels.timing.rack import spanned
+from rack.levels.timing.chains import spanned
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.timing.charts.letters import label_row
 

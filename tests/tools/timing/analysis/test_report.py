@@ -21,7 +21,7 @@ from rack.levels.timing.equations import response_ticks
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis import report as report_module
+from rack.tools.timing.analysis import arm_outcome
 from rack.tools.timing.analysis.report import report_of, task_times, write_report
 from rack.tools.timing.analysis.report_markdown import markdown, show
 from rack.tools.timing.measured_response import system_response
@@ -34,9 +34,9 @@ PARTS = ("min", "p50", "p99", "p99_9", "max")
 
 
 def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for() -> None:
-    assert report_module.DRIVING == DRIVING
+    assert arm_outcome.DRIVING == DRIVING
     for kind in (FORCE_STATUS, WRENCH, HAND_STATUS):
-        assert getattr(report_module, kind.name.upper()) == kind.name
+        assert getattr(arm_outcome, kind.name.upper()) == kind.name
 
 
 class Watchful(Display):

@@ -1,0 +1,163 @@
+"""What becomes of a command to a level of a running rack, read from the statuses of the level."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
+from rack.levels.operator import DRIVES, SETTINGS, Answer
+
+REPLY_CYCLES = 4
+"""Cycles that a level does within which it replies: one to read, one to become visible, one for an
+answer to another operator, and one that was under way."""
+NO_CYCLE_S = 1.0
+"""Simulated time without a cycle of a level after which it is not waited for."""
+
+Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
+
+    The fate "waiting" is that of a command to a rack that is held; it has no serial yet, and
+    `waits` says until when. The fate stays "given" where the level's status does not answer
+    operators. `objection` is why it was refused.
+    """
+
+    serial: int
+    level: str
+    text: str
+    given: int
+    fate: Fate = "given"
+    taken_up: int = -1
+    done: int = -1
+    objection: str = ""
+    waits: str = ""
+
+    @property
+    def worked(self) -> bool:
+        """Whether it was not refused."""
+        return self.fate != "refused"
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether it is in force, as far as is known."""
+        return self.fate in ("taken", "done")
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {**asdict(self), "worked": self.worked}
+
+    @property
+    def line(self) -> str:
+        """All of it as one line."""
+        if self.fate == "waiting":
+            return f"command to '{self.level}', {self.text}: {self.waits}"
+        ends = {
+            "given": "; the status of this level does not answer operators",
+            "taken": f", taken up at tick {self.taken_up}",
+            "done": f", taken up at tick {self.taken_up}, done at tick {self.done}",
+            "refused": f", refused at tick {self.taken_up}: {self.objection}",
+            "superseded": ", superseded by a newer command",
+        }
+        return (
+            f"command {self.serial} to '{self.level}', {self.text}: given at tick"
+            f" {self.given}{ends[self.fate]}"
+        )
+
+
+def answering(segment: Segment, level: str) -> MailboxSpec | None:
+    """Return the status mailbox of a level; None where its status does not answer operators."""
+    boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
+    return next(
+        (box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}),
+        None,
+    )
+
+
+class Replies:
+    """Follows a level's statuses, message by message, for their reply to one command.
+
+    A newer command replaces it once the level has accepted that one, unless it is a setting, or one
+    to the drives while this one is not.
+    """
+
+    def __init__(self, segment: Segment, status: MailboxSpec, reply: Reply) -> None:
+        self._ring = MailboxRing(segment, status.name)
+        self._given = MailboxRing(segment, f"{reply.level}.operator")
+        self._kinds: dict[int, int] = {}
+        """What each command given to the level is, by serial."""
+        self.reply = reply  # as of the last look
+
+    def look(self) -> Reply:
+        """Read the statuses written since the last call."""
+        rows = self._ring.drain().rows
+        # After the statuses: what they answer was given before.
+        given = self._given.drain().rows["message"]
+        self._kinds.update(zip(given["id"].tolist(), given["what"].tolist(), strict=True))
+        orders = rows["message"]["order"]
+        answers = rows["message"]["answer"]
+        mine = orders == self.reply.serial
+        if self.reply.taken_up < 0 and mine.any():
+            self._take_up(rows[int(np.argmax(mine))])
+        done = mine & (answers == Answer.DONE)
+        if self.reply.fate == "taken" and done.any():
+            self.reply = replace(
+                self.reply, fate="done", done=int(rows["tick"][int(np.argmax(done))])
+            )
+        if self.reply.fate == "taken" and (late := mine & (answers == Answer.REFUSED)).any():
+            self._refuse(rows[int(np.argmax(late))])
+        newer = (orders > self.reply.serial) & np.isin(answers, (Answer.TAKEN, Answer.DONE))
+        if self.reply.fate in ("given", "taken") and any(
+            self._replaces(serial) for serial in set(orders[newer].tolist())
+        ):
+            self.reply = replace(self.reply, fate="superseded")
+        return self.reply
+
+    def _replaces(self, serial: int) -> bool:
+        """Return whether a newer command, accepted, takes this one's place."""
+        kind = self._kinds.get(serial)
+        if kind in SETTINGS:
+            return False
+        return kind not in DRIVES or self._kinds.get(self.reply.serial) in DRIVES
+
+    def _take_up(self, row: np.void) -> None:
+        self.reply = replace(self.reply, fate="taken", taken_up=int(row["tick"]))
+        if row["message"]["answer"] == Answer.REFUSED:
+            self._refuse(row)
+
+    def _refuse(self, row: np.void) -> None:
+        objection = row["message"]["objection"].decode("ascii", "replace")
+        self.reply = replace(self.reply, fate="refused", objection=objection)
+
+
+class LastCycle:
+    """Knows when a level should have answered: by the cycles that it did, not by ticks, of which a
+    level on a busy machine skips some."""
+
+    def __init__(self, segment: Segment, status: MailboxSpec) -> None:
+        self._block = segment.block(status.writer)
+        self._bound = self._block[Block.CYCLES] + REPLY_CYCLES
+        self._cycles = -1
+        self._since = 0
+        shortest = round(NO_CYCLE_S * 1e9 / segment.layout.clock_ns)
+        self._silent = max(REPLY_CYCLES * status.every, shortest)
+
+    def passed(self, tick: int) -> str:
+        """Return why no answer will come, as of `tick`; empty: it may still come."""
+        cycles = self._block[Block.CYCLES]
+        if cycles != self._cycles:
+            self._cycles = cycles
+            self._since = tick
+        if cycles > self._bound:
+            return f"has not answered in {REPLY_CYCLES} of its cycles"
+        if tick - self._since > self._silent:
+            return f"has not answered, and done no cycle since tick {self._since}"
+        return ""

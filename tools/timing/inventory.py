@@ -1,0 +1,272 @@
+"""Inventory of a config: tasks, mailboxes with their bus addresses, host side, network, and what an
+arm does without torques."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rack.backplane.address_map import AddressMap
+from rack.backplane.layout import Layout
+from rack.boards.classes import find_class
+from rack.boards.config.cell import built_cell
+from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
+from rack.levels.level import Executor
+from rack.levels.tables import read_params
+from rack.levels.timing.chains import spanned
+from rack.tools.console.tables import table
+
+PATIENCE = (
+    "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
+    " {permitted_ms} ms). Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors"
+    " at full torque put in {energy_j} J"
+)
+MONITORS = (
+    "monitors: '{board}' takes samples for good that are off by {position_mrad} mrad,"
+    " {velocity_mrad_s} mrad/s; or, at full speed, {jitter_ms} ms early or late"
+)
+
+
+def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:
+    """Return the inventory of a config as plain data; addresses and sizes in bytes.
+
+    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox
+    `delay_ms` the same; `depth` is the number of a mailbox's slots, `size` the bytes of one
+    message, `capacity` the most unread ones in a queue (0: no queue).
+    """
+    places = AddressMap(layout)
+    tick_ms = layout.clock_ns * 1e-6
+    tasks = [
+        {
+            "slot": task.slot,
+            "task": task.name,
+            "core": task.core,
+            "priority": task.priority,
+            "rate_hz": 1e9 / (task.every * layout.clock_ns),
+            "every_ticks": task.every,
+            "phase_ticks": task.phase,
+            "slice_ms": task.every * task.within_cycles * tick_ms,
+            "trace_address": places.traces[task.name],
+        }
+        for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
+    ]
+    mailboxes = [
+        {
+            "address": places.mailboxes[mailbox.name],
+            "mailbox": mailbox.name,
+            "message": f"{mailbox.message} {mailbox.version}",
+            "size": mailbox.size,
+            "depth": mailbox.depth,
+            "protocol": mailbox.protocol,
+            "capacity": mailbox.capacity,
+            "writer": mailbox.writer,
+            "readers": mailbox.readers,
+            "delay_ms": mailbox.delay * tick_ms,
+        }
+        for mailbox in layout.mailboxes
+    ]
+    return {
+        "rack": config.name,
+        "mode": config.clock.mode,
+        "clock_ms": tick_ms,
+        "clock_core": config.clock.core,
+        "clock_priority": config.clock.priority,
+        "segment_bytes": places.size,
+        "windows": {window.board: window.address for window in places.windows},
+        "tasks": tasks,
+        "hosts": [_host(name, host, layout) for name, host in config.host.items()],
+        "network": _network(config),
+        "patience": list(_patience(config, layout)),
+        "monitors": list(_monitors(config)),
+        "mailboxes": mailboxes,
+        "notes": notes,
+    }
+
+
+def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
+    """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile,
+    joint by joint."""
+    for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
+        cell = built_cell(config)
+        every = config.every(board)
+        tick_ms = layout.clock_ns * 1e-6
+        ticks = cell.patience.ticks(every, tick_ms * 1e-3)
+        angle_mrad = ticks * tick_ms * cell.bounds.velocity
+        yield {
+            "board": board,
+            "ms": ticks * tick_ms,
+            "cycles": ticks // every,
+            "permitted_ms": round(cell.patience.seconds * 1e3, 3),
+            "angle_mrad": angle_mrad.round(1).tolist(),
+            "energy_j": round(float((angle_mrad * cell.bounds.torque).sum()) * 1e-3, 3),
+        }
+
+
+def _monitors(config: RackConfig) -> Iterator[dict[str, Any]]:
+    """Yield what the sensors of an arm may be off by before it is braked, joint by joint."""
+    robot = config.robot
+    if robot is None:
+        return
+    # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
+    from rack.levels.arm import find_arm
+    from rack.levels.robot.cell import sensed_by
+    from rack.levels.servo.control import ArmParams
+    from rack.levels.servo.sensor_monitor import tolerance
+
+    for board, given in config.board.items():
+        kind = find_class(given.executor, Executor).params
+        if kind is None or not issubclass(kind, ArmParams):
+            continue
+        sensors = find_arm(read_params(kind, given.params).arm).sensors
+        cell = built_cell(config)
+        stands = tolerance(sensed_by(cell, robot, sensors))
+        yield {
+            "board": board,
+            "position_mrad": (1e3 * stands.position).round(3).tolist(),
+            "velocity_mrad_s": (1e3 * stands.velocity).round(3).tolist(),
+            "jitter_ms": round(1e3 * stands.jitter_s, 3),
+        }
+
+
+def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
+    return {
+        "board": name,
+        "program": host.program,
+        "external": host.external,
+        "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
+        "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
+    }
+
+
+def _network(config: RackConfig) -> dict[str, Any] | None:
+    """Return with whom a rack exchanges what; None: with nobody."""
+    table = config.adapter.lan
+    if table is None:
+        return None
+    entries = [
+        *(
+            {"entry": f"{LAN}.{port}", "way": "out", "mailbox": e.source, "rate_hz": e.rate_hz}
+            for port, e in table.exports.items()
+        ),
+        *(
+            {
+                "entry": f"{LAN}.{port}",
+                "way": "in",
+                "mailbox": e.source,
+                "rate_hz": e.rate_hz,
+                "max_age_ms": e.max_age_ms,
+            }
+            for port, e in table.imports.items()
+        ),
+    ]
+    keys = ("listen", "connect", "lease_ms", "on_peer_loss")
+    return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
+
+
+def _network_lines(network: dict[str, Any] | None, width: int | None) -> Iterator[str]:
+    """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
+    if network is None:
+        return
+    peers = ", ".join(network["peers"]) or "no rack in particular"
+    ends = [f"{key} {', '.join(network[key])}" for key in ("listen", "connect") if network[key]]
+    rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
+    yield from ("", f"network: {'; '.join([*ends, f'works with {peers}', rule])}")
+    rows = [
+        [
+            e["entry"],
+            e["way"],
+            e["mailbox"],
+            f"{e['rate_hz']:g}",
+            f"{e['max_age_ms']:g}" if "max_age_ms" in e else "",
+        ]
+        for e in network["entries"]
+    ]
+    yield from table(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows, width)
+
+
+def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
+    """Yield the boards of the host side: they have no rate, and the timing model leaves them
+    out."""
+    if hosts:
+        rows = [
+            [
+                h["board"],
+                "rack prompt" if h["external"] else h["program"],
+                ", ".join(h["writes"]),
+                ", ".join(h["reads"]),
+            ]
+            for h in hosts
+        ]
+        yield ""
+        yield from table(["host side", "program", "writes", "reads"], rows, width, ("program",))
+
+
+def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
+    """Yield an inventory as text for people, the tables fitted to `width`."""
+    boards = len({task["slot"] for task in found["tasks"]})
+    crate = f"{boards} board{'s' * (boards > 1)} and the clock"
+    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
+    yield from found["notes"]
+    phase = {"phase": "phase_ticks"} if any(task["phase_ticks"] for task in found["tasks"]) else {}
+    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-"))]
+    rows = [
+        [
+            *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
+            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), *(str(t[key]) for key in phase.values())),
+            *(f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+        ]
+        for t in found["tasks"]
+    ]
+    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", *phase, "slice, ms", "trace at"]
+    yield ""
+    yield from table(
+        head, [[*clock, *[""] * (len(head) - len(clock))], *rows], width, ("trace at", "slice, ms")
+    )
+    rows = [
+        [
+            *(
+                _hex(m["address"]),
+                m["mailbox"],
+                m["message"],
+                str(m["size"]),
+                str(m["depth"]),
+                _protocol(m),
+            ),
+            *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
+        ]
+        for m in found["mailboxes"]
+    ]
+    yield from _host_lines(found["hosts"], width)
+    yield from _network_lines(found["network"], width)
+    head = [
+        "bus address",
+        "mailbox",
+        "message",
+        "bytes",
+        "slots",
+        "protocol",
+        "delay, ms",
+        "written by > read by",
+    ]
+    yield ""
+    yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield ""
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
+    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def arm_lines(found: dict[str, Any]) -> Iterator[str]:
+    """Yield what an arm does while no torque comes, and what its monitors take for good."""
+    yield from (PATIENCE.format(**one) for one in found["patience"])
+    yield from (MONITORS.format(**one) for one in found["monitors"])
+
+
+def _protocol(mailbox: dict[str, Any]) -> str:
+    """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
+    if mailbox["capacity"]:
+        return f"{mailbox['protocol']} of {mailbox['capacity']}"
+    return str(mailbox["protocol"])
+
+
+def _hex(address: int) -> str:
+    return f"0x{address:06x}"
