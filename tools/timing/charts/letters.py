@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from itertools import groupby
+from itertools import count, groupby
 
 from rack.levels.timing.schedule import Chart, Job, Span
 from rack.tools.console.tables import ms
@@ -36,15 +36,21 @@ def lines(panel: Panel, column_ns: int) -> Iterator[str]:
     if panel.frames:
         starts = [
             ((start - chart.start_ns) // column_ns, f"|{number}")
-            for number, start in panel.frames.items()
+            for number, start in numbered_frames(panel, column_ns)
         ]
         yield f"{'frame':{margin}}{label_row(starts)}"
+    unseen = []
     for lane in panel.lanes:
-        yield f"{lane.title:{margin}}{_row(chart, lane, column_ns)}"
+        row = _row(chart, lane, column_ns)
+        yield f"{lane.title:{margin}}{row}"
+        if not row.strip(IDLE + OTHER) and any(span.task in lane.tasks for span in chart.spans):
+            unseen.append(lane.name)
         marks = _marks(panel, lane, column_ns)
         if marks:
             yield " " * margin + marks
     yield from (" " * margin + line for line in _axis(panel, column_ns))
+    if unseen:
+        yield f"too short for a column: {', '.join(unseen)}; show less time, or see the picture"
     yield from _patterns(panel)
     yield from _late(panel)
 
@@ -113,6 +119,16 @@ def label_row(labels: Iterable[tuple[int, str]]) -> str:
     for column, label in labels:
         row = row.ljust(column) + label
     return row
+
+
+def numbered_frames(panel: Panel, character_ns: int, prefix: str = "|") -> list[tuple[int, int]]:
+    """Return numbers and starts, ns, of the minor frames to be labelled: far enough apart for
+    `prefix` and number."""
+    frames = panel.frames
+    widest_ns = max(len(f"{prefix}{number}") for number in frames) * character_ns
+    steps = (digit * 10**power for power in count() for digit in (1, 2, 5))
+    step = next(step for step in steps if step * panel.frame_ns >= widest_ns)
+    return [(number, start) for number, start in frames.items() if number % step == 0]
 
 
 def label_times(panel: Panel, column_ns: int) -> range:

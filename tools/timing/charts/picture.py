@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from rack.levels.timing.tasks import Unit
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import ms
-from rack.tools.timing.charts.letters import COLUMNS, label_times
+from rack.tools.timing.charts.letters import COLUMNS, label_times, numbered_frames
 from rack.tools.timing.charts.panel import NS_PER_MS, Panel
 from rack.tools.timing.charts.patterns import IDLE
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
     from rack.levels.timing.schedule import Chart, Job
@@ -45,9 +48,18 @@ FLOOR = "#F3F3F3"
 FRAME = "#999999"
 WIDTH_IN = 10.0
 LANE_IN = 0.55
+LEGEND_COLUMNS = 7
 BAR = 0.66
-LETTER = 0.012
-"""Part of the window from which on a span has room for its letter."""
+LETTER_PT = 9.0
+SMALLEST_PT = 5.0
+"""Sizes of letters: a short span has a smaller one, a shorter one none."""
+LETTER = 1 / 520
+"""Part of the window that a point of a letter's size takes: a W is as wide as high, and has room on
+both sides."""
+CYCLE = 0.024
+"""Part of the window from which on a cycle's start is marked."""
+FRAME_CHARACTER = 1 / 120
+"""Part of the window that a character of a frame's label takes."""
 
 
 def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
@@ -59,18 +71,21 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     with picture(paths, WIDTH_IN, height, layout="constrained") as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=lanes)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
-            _draw(axes, panel)
+            draw(axes, panel)
         rows[-1, 0].set_xlabel("time, ms")
         used = [
             unit
             for unit in Unit
             if any(span.unit is unit for panel in panels for span in panel.chart.spans)
         ]
-        handles = [Patch(facecolor=COLOURS[unit], label=NAMES[unit]) for unit in used]
+        handles: list[Artist] = [Patch(facecolor=COLOURS[unit], label=NAMES[unit]) for unit in used]
+        handles.append(Patch(facecolor="none", label=f"{IDLE}  idle core"))
+        if any(panel.late(lane) for panel in panels for lane in panel.lanes):
+            handles.append(Line2D([], [], marker="v", color=LATE, label="missed deadline"))
         figure.legend(
             handles=handles,
             loc="outside lower center",
-            ncols=len(handles),
+            ncols=ceil(len(handles) / ceil(len(handles) / LEGEND_COLUMNS)),
             fontsize=8,
             frameon=False,
         )
@@ -78,7 +93,7 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     return paths
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
+def draw(axes: Axes, panel: Panel) -> None:
     """Draw one panel: the first lane on top."""
     chart = panel.chart
     count = len(panel.lanes)
@@ -87,7 +102,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
     if panel.frames:
         starts = [start / NS_PER_MS for start in panel.frames.values()]
         axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
-        for number, start in panel.frames.items():
+        character_ns = round(FRAME_CHARACTER * (chart.end_ns - chart.start_ns))
+        for number, start in numbered_frames(panel, character_ns, "frame "):
             axes.annotate(
                 f"frame {number}",
                 (start / NS_PER_MS, count - 0.5),
@@ -122,12 +138,16 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
             if s.unit is unit
         ]
         axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
+    window_ns = chart.end_ns - chart.start_ns
     letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in own]
     letters += [(IDLE, idle) for idle in panel.idle(lane)]
     for letter, (begin, stop) in letters:
-        if stop - begin >= LETTER * (chart.end_ns - chart.start_ns):
-            axes.text((begin + stop) / 2 / NS_PER_MS, at, letter, ha="center", va="center")
-    if lane.cycle_ns >= 2 * LETTER * (chart.end_ns - chart.start_ns):
+        size = min((stop - begin) / window_ns / LETTER, LETTER_PT)
+        # Small dashes would be a dotted line.
+        if size >= (LETTER_PT if letter == IDLE else SMALLEST_PT):
+            middle = (begin + stop) / 2 / NS_PER_MS
+            axes.text(middle, at, letter, ha="center", va="center", fontsize=size)
+    if lane.cycle_ns >= CYCLE * window_ns:
         starts = range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
         marks = [time / NS_PER_MS for time in starts]
         axes.vlines(marks, low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)

@@ -1,0 +1,83 @@
+"""The chart as a picture: what is written in it fits; as letters it says what it leaves out."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+from rack.boards.config import load, wire
+from rack.levels.timing.tasks import Unit
+from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.timing.charts.panel import NS_PER_MS, Panel
+from rack.tools.timing.charts.picture import WIDTH_IN, draw
+from rack.tools.timing.charts.scheduled import Schedule
+
+
+def panel_of(rack: str, start_ms: float, end_ms: float) -> Panel:
+    config = load(rack)
+    schedule = Schedule(config, wire(config), {})
+    return schedule.panel(round(start_ms * NS_PER_MS), round(end_ms * NS_PER_MS))
+
+
+def drawn(panel: Panel) -> tuple[list[Text], Figure]:
+    """Return the texts in the picture of a panel, laid out as it is saved."""
+    figure = Figure(figsize=(WIDTH_IN, 5.0), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    draw(axes, panel)
+    canvas.draw()
+    return list(axes.texts), figure
+
+
+def spans_ms(panel: Panel, letter: str) -> list[tuple[float, float]]:
+    return [
+        (span.start_ns / NS_PER_MS, span.end_ns / NS_PER_MS)
+        for span in panel.chart.spans
+        if span.unit.value == letter
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end_ms", [2.0, 8.0, 50.0])
+def test_a_letter_is_no_wider_than_its_span(end_ms: float) -> None:
+    panel = panel_of("nasrem", 0.0, end_ms)
+    texts, figure = drawn(panel)
+    to_data = figure.axes[0].transData.inverted()
+    letters = [text for text in texts if text.get_text() in {unit.value for unit in Unit}]
+    assert letters
+    for text in letters:
+        extent: Bbox = text.get_window_extent()
+        left, right = (to_data.transform((x, 0.0))[0] for x in (extent.x0, extent.x1))
+        middle = (left + right) / 2
+        own = spans_ms(panel, text.get_text())
+        assert any(start <= left and right <= end for start, end in own if start < middle < end)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rack", "end_ms"), [("cyclic", 20.0), ("cyclic", 200.0), ("hic", 60.0)])
+def test_the_numbers_of_frames_do_not_run_together(rack: str, end_ms: float) -> None:
+    texts, _ = drawn(panel_of(rack, 0.0, end_ms))
+    extents = [text.get_window_extent() for text in texts if text.get_text().startswith("frame")]
+    assert len(extents) > 1
+    assert all(one.x1 < other.x0 for one, other in pairwise(extents))
+
+
+def test_the_numbers_of_frames_stand_above_their_columns() -> None:
+    panel = panel_of("cyclic", 0.0, 200.0)
+    column_ns = column_for(200 * NS_PER_MS, None)
+    frames = next(line for line in lines(panel, column_ns) if line.startswith("frame"))
+    margin = frames.index("|")
+    for number in (0, 2, 48):
+        assert frames[margin + 2 * number :].startswith(f"|{number}")
+
+
+def test_a_chart_in_letters_names_what_is_too_short_for_its_columns() -> None:
+    coarse = list(lines(panel_of("nasrem", 1000.0, 1200.0), 2 * NS_PER_MS))
+    assert "too short for a column: clock, world; show less time, or see the picture" in coarse
+    fine = list(lines(panel_of("nasrem", 1000.0, 1008.0), NS_PER_MS // 10))
+    assert not [line for line in fine if line.startswith("too short")]
