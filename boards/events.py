@@ -33,6 +33,8 @@ OfRun = Literal[
 ]
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
+CONTINUES = "continues"
+"""Code of the event that says before which tick a run begins that goes on from another."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ from rack.boards.errors import (
     LaunchError,
     Mistake,
 )
-from rack.boards.events import Cause, Ending, Event, Journal, Outcome, brakings
+from rack.boards.events import CONTINUES, Cause, Ending, Event, Journal, Outcome, brakings
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import Entries, Keeping
 
@@ -246,7 +246,8 @@ class Rack:
             # The latch is as it was, and what was raised before is in the other run's events.
             self._is_armed = True
             self._alarms.drain()
-            self._journal.add("launch", "", f"continues before tick {self._origin.tick}")
+            tick = self._origin.tick
+            self._journal.add("launch", "", f"continues before tick {tick}", CONTINUES, tick=tick)
         self._line.ask(PowerOn(CLOCK, clock))
         self._hosts.start()
         self._journal.add("start", CLOCK, self.config.clock.mode)

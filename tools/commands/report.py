@@ -8,35 +8,64 @@ from typing import Annotated
 
 import typer
 
+from rack.tools.console.answer import Failure
 from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.timing.analysis.stored import print_report, show_report
 
 Against = Annotated[
     Path | None,
-    typer.Option(metavar="RUN", help="another run: find the first tick at which the two diverge"),
+    typer.Option(metavar="RUN", help="another run: where the two diverge, and why"),
+]
+Of = Annotated[
+    str,
+    typer.Option(
+        metavar="MAILBOX",
+        help="with --against: from where this mailbox first differs, back to the cause",
+    ),
+]
+NoRepeat = Annotated[
+    bool,
+    typer.Option(
+        "--no-repeat", help="with --against: tell by the recordings alone, run neither rack again"
+    ),
 ]
 
 
-def report(run: RunFolder, against: Against = None, as_json: Json = False) -> None:
+def report(
+    run: RunFolder,
+    against: Against = None,
+    of: Of = "",
+    no_repeat: NoRepeat = False,
+    as_json: Json = False,
+) -> None:
     """Report on a run, from its recording.
 
     It writes report.json and report.md, unless those of the run are newer than its recording and
     this program. On a terminal the tables show as many columns as fit; report.md has all.
 
+    With --against it names the first message that differs, its fields, and whether its writer had
+    read the same in both runs. If not, it goes back along what differed, to the cycle whose inputs
+    were equal. There it names what is different: a fault, a loss, a command, a miss, a setting. If
+    that leaves the level's state and code, runs in lockstep are repeated to that cycle: which
+    attributes of the level differed before it, and whether its code repeats what it wrote.
+
     Exit status: 0 the report was printed; 1 with --against: the runs diverge before any miss; 2 RUN
-    is not a run.
+    is not a run, or the two are of different racks.
 
     \b
     Examples:
       rack report runs/nasrem-20250101-120000
       rack report runs/a --against runs/b
+      rack report runs/a --against runs/b --of task.status
     """
     if against is None:
+        if of or no_repeat:
+            raise Failure("--of and --no-repeat: permitted with --against", 2)
         show_report(run, as_json)
         return
-    from rack.tools.timing.analysis.report import write_report
+    from rack.tools.timing.analysis.report import OtherRun, write_report
 
-    data, text = write_report(run, against)
+    data, text = write_report(run, OtherRun(against, of, not no_repeat))
     print_report(data, text, as_json)
     if not data["against"]["explained"]:
         sys.exit(1)

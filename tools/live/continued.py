@@ -30,6 +30,7 @@ from rack.boards.wiring import Keeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.launch import Beginning
+from rack.tools.recording.divergence import ticks_of
 from rack.tools.recording.entries import recorded_commands
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
@@ -90,7 +91,7 @@ def state_at(
     noted on stderr. Raises `Failure`, which begins with what was `asked`.
     """
     asked = asked or f"{recording.folder}@{tick * recording.layout.clock_ns * 1e-9:g}"
-    begins, before = _before(recording, tick, asked)
+    begins, before = begun_before(recording, tick, asked)
     if begins == tick and not shows:
         yield RunState(before)
         return
@@ -98,11 +99,12 @@ def state_at(
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-") as folder:
             path = Path(folder)
             kept = replace(before.checkpoint or Keeping(), folder=path, at=tick, shows=shows)
-            _go_on(recording, tick, replace(before, checkpoint=kept), crate, asked)
+            with gone_on(recording, replace(before, checkpoint=kept), tick, asked, crate) as rack:
+                if differing := unlike_in(recording, rack.segment, tick):
+                    names = ", ".join(differing)
+                    print(f"{asked}: {names} are not as recorded: {WHY_NOT}", file=sys.stderr)
             file = stack.enter_context((path / NAME.format(tick)).open("rb"))
-            attributes = {
-                found.stem: json.loads(found.read_bytes()) for found in path.glob(f"*{ATTRIBUTES}")
-            }
+            attributes = attributes_in(path)
         # The file has no name any more: however this process ends, nothing is left. Boards open it
         # by this process's descriptor.
         origin = Path(f"/proc/{os.getpid()}/fd/{file.fileno()}")
@@ -130,21 +132,13 @@ def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     return tick
 
 
-def ticks_of(recording: Recording) -> tuple[int, int]:
-    """Return the ticks of a recorded run, [first, end)."""
-    found = [rows["tick"] for rows in recording.cycles.values()]
-    end: int = recording.ended.get("outcome", {}).get("ticks", 0)
-    end = end or max((int(ticks[-1]) + 1 for ticks in found), default=0)
-    return min((int(ticks[0]) for ticks in found), default=0), end
-
-
 def branched(recording: Recording, settings: Sequence[str], faults: str | None) -> RackConfig:
     """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
     overrides = ["clock.mode=lockstep", "clock.speed=1.0", *settings]
     return validated(assembled(str(recording.folder / CONFIG), overrides, faults))
 
 
-def _before(recording: Recording, tick: int, asked: str) -> tuple[int, Beginning]:
+def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Beginning]:
     """Return the last checkpoint at `tick` or before, and what goes on from it; without one, tick 0
     and what operators commanded. Raises `Failure`."""
     kept = checkpoints(recording.folder)
@@ -186,18 +180,23 @@ def _losses(recording: Recording, tick: int) -> tuple[tuple[str, int], ...]:
     )
 
 
-def _go_on(
-    recording: Recording, tick: int, begins: Beginning, crate: CrateLine | None, asked: str
-) -> None:
-    """Let the rack go on, unchanged, to `tick`, and keep its state. Raises `Failure`."""
+@contextmanager
+def gone_on(
+    recording: Recording,
+    begins: Beginning,
+    until: int,
+    asked: str,
+    crate: CrateLine | None = None,
+) -> Iterator[Rack]:
+    """Let the rack of a run go on, unchanged, to tick `until`; yield it as it is then. Raises
+    `Failure` if its state was to be kept on the way, and is not."""
     keeping = begins.checkpoint
-    assert keeping is not None, "it says where to keep the state"
     ran = branched(recording, (), None)
     # The run's own name may be in use, by a branch.
-    config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{tick}-{os.getpid()}"})
+    config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{until}-{os.getpid()}"})
     with Rack(config, crate=crate, keeping=keeping, requests=begins.requests) as rack:
-        rack.run(tick * config.clock_ns * 1e-9)
-        if not (keeping.folder / NAME.format(tick)).is_file():
+        rack.run(until * config.clock_ns * 1e-9)
+        if keeping is not None and not _is_kept(keeping):
             printed = [event.text for event in rack.events if event.kind == "printed"]
             why = (
                 printed[-1]
@@ -205,12 +204,19 @@ def _go_on(
                 else "a board is lost then; ask for a time at which it is back"
             )
             raise Failure(f"{asked}: {why}", 2)
-        if differing := _differing(recording, rack.segment, tick):
-            names = ", ".join(differing)
-            print(f"{asked}: {names} are not as recorded: {WHY_NOT}", file=sys.stderr)
+        yield rack
 
 
-def _differing(recording: Recording, segment: Segment, tick: int) -> list[str]:
+def _is_kept(keeping: Keeping) -> bool:
+    return keeping.at is None or (keeping.folder / NAME.format(keeping.at)).is_file()
+
+
+def attributes_in(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the attributes of levels next to a checkpoint, by task."""
+    return {found.stem: json.loads(found.read_bytes()) for found in folder.glob(f"*{ATTRIBUTES}")}
+
+
+def unlike_in(recording: Recording, segment: Segment, tick: int) -> list[str]:
     """Return the mailboxes whose messages until `tick` are not those of the recording."""
     found = []
     for name, (serial, chain) in chains(segment, tick).items():

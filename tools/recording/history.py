@@ -1,10 +1,8 @@
-"""What happened in a run: misses, what the machine did to its cores, holds, and the tick at which
-two runs diverge."""
+"""What happened in a run: misses, what the machine did to its cores, and holds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +12,6 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.message import State
 from rack.levels.operator import Operation
 from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
-from rack.tools.console.answer import Failure
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -175,54 +172,3 @@ def _stretches(what: np.ndarray) -> list[tuple[int, int]]:
     its last."""
     borders = [0, *(np.flatnonzero(np.diff(what)) + 1).tolist(), len(what)]
     return [(first, end) for first, end in pairwise(borders) if first < end and what[first]]
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Where two runs diverge: the release tick of the first message that differs, and its
-    mailbox."""
-
-    tick: int
-    mailbox: str
-
-
-def first_difference(one: Recording, other: Recording) -> Difference | None:
-    """Return where two runs diverge, up to the end of the shorter one; None when all that both
-    wrote is equal.
-
-    Raises `Failure` when the two have no mailbox in common, or either lacks rows.
-    """
-    for recording in (one, other):
-        if recording.kept:
-            raise Failure(
-                f"{recording.folder}: {recording.kept_text}; the two runs cannot be compared"
-            )
-        lost = sum(recording.lost.values())
-        if lost:
-            raise Failure(
-                f"{recording.folder}: its recorder lost {lost} rows; the two runs cannot be"
-                " compared"
-            )
-    shared = [name for name in one.mailboxes if name in other.mailboxes]
-    if not shared:
-        raise Failure(f"{one.folder} and {other.folder} have no mailbox in common")
-    found = [
-        difference for name in shared if (difference := _difference(one, other, name)) is not None
-    ]
-    return min(found, key=lambda difference: difference.tick, default=None)
-
-
-def _difference(one: Recording, other: Recording, mailbox: str) -> Difference | None:
-    both = (one, other)
-    serials = [recording.signal(mailbox, "serial") for recording in both]
-    # One that continues another run begins later.
-    begins = [int(np.searchsorted(each, max(s[0] for s in serials))) for each in serials]
-    # The chain of a message covers serial, tick and content of all before it.
-    chains = [run.signal(mailbox, "chain")[at:] for run, at in zip(both, begins, strict=True)]
-    length = min(len(chain) for chain in chains)
-    differs = np.flatnonzero(chains[0][:length] != chains[1][:length])
-    if not len(differs):
-        return None
-    first = max(differs[0] - 1, 0)
-    ticks = [run.signal(mailbox, "tick")[at + first] for run, at in zip(both, begins, strict=True)]
-    return Difference(int(min(ticks)), mailbox)

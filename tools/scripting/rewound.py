@@ -21,13 +21,13 @@ from rack.boards.crate.requests import Preload
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table, terminal_width
-from rack.tools.live.continued import branched, state_at, tick_in, ticks_of
+from rack.tools.live.continued import branched, state_at, tick_in
 from rack.tools.live.display import Display, event_line
 from rack.tools.live.folder import folder_of
 from rack.tools.live.launch import run_rack
 from rack.tools.live.message_text import MessageText
 from rack.tools.live.signals import cell
-from rack.tools.recording.history import first_difference
+from rack.tools.recording.divergence import first_difference, ticks_of
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import NEAREST, Signal, Trigger

@@ -18,7 +18,8 @@ from rack.boards.config.commands import asked, request
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
 from rack.tools.live.snapshot import Snapshot
-from rack.tools.recording.history import first_difference, misses
+from rack.tools.recording.divergence import first_difference
+from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.tools.command_line import rack

@@ -21,7 +21,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.live.snapshot import Snapshot
-from rack.tools.recording.history import first_difference
+from rack.tools.recording.divergence import first_difference
 from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,6 @@ from rack.tools.live.queues import queues
 from rack.tools.recording.history import (
     counted,
     fired_rows,
-    first_difference,
     frequency,
     holds,
     misses,
@@ -47,18 +47,30 @@ from rack.tools.timing.analysis.report_markdown import markdown
 from rack.tools.timing.measured_response import system_response
 
 Report = dict[str, Any]
+COMPARISON = "rack.tools.timing.analysis.against"
+"""What compares two runs, by name: it brings what repeats them, which no report on one needs."""
 
 
-def write_report(folder: Path, against: Path | None = None) -> tuple[Report, str]:
+@dataclass(frozen=True)
+class OtherRun:
+    """The run in a folder that one is compared with: from where the mailbox `of` first differs, or
+    any; and whether both may be repeated."""
+
+    folder: Path
+    of: str = ""
+    repeats: bool = True
+
+
+def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Report, str]:
     """Write the report of the run in `folder` into it, and return it as data and as text.
 
-    With the folder of another run, `against`, it says where the two diverge.
+    With another run, `against`, it says where the two diverge, and why.
     """
     recording = Recording(folder)
     report = report_of(recording)
     report |= sizes(folder, report["simulated_s"])
     if against is not None:
-        report["against"] = _compared(recording, Recording(against), report["misses"])
+        report["against"] = import_module(COMPARISON).compared(recording, against)
     text = markdown(report)
     (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     (folder / "report.md").write_text(text)
@@ -148,17 +160,6 @@ def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
         "clock_skipped": ended.get("clock_skipped", 0),
         "missed": sum(task["missed"] for task in counters),
         "skipped": sum(task["skipped"] for task in counters),
-    }
-
-
-def _compared(recording: Recording, other: Recording, found: list[Report]) -> Report:
-    difference = first_difference(recording, other)
-    missed = min((miss["tick"] for miss in [*found, *misses(other)]), default=None)
-    return {
-        "folder": str(other.folder),
-        "first_difference": asdict(difference) if difference is not None else None,
-        "first_miss_tick": missed,
-        "explained": difference is None or (missed is not None and missed <= difference.tick),
     }
 
 

@@ -196,6 +196,7 @@ def _against(against: Report | None) -> Iterator[str]:
         f"- diverges from {against['folder']} at tick {difference['tick']}, first in"
         f" {difference['mailbox']}; {why}"
     )
+    yield from (f"  - {line}" for line in against["why"])
 
 
 def _faults(report: Report) -> Iterator[str | TextTable]:

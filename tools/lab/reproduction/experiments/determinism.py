@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from rack.tools.lab.benches.observed import Recorded
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop, inputs
-from rack.tools.recording.history import Difference, first_difference, misses
+from rack.tools.recording.divergence import Difference, first_difference
+from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
 
 NAME = "nasrem"

@@ -1,0 +1,248 @@
+"""Two runs compared: the message that differs, whether its inputs did, and the cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.config import load
+from rack.tools.live.continued import branched, state_at
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.against import compared
+from rack.tools.timing.analysis.report import OtherRun
+from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.tools.command_line import rack
+
+pytestmark = pytest.mark.slow
+SECONDS = 1.0
+CHECKPOINTS = "record.checkpoint_s=0.25"
+OWN_LEVEL = """
+from time import monotonic_ns
+from rack.backplane.message import Field, MessageType
+from rack.levels.level import Executor, Input
+
+SUM = MessageType("sum", 1, (Field("value", "f8", "1", "sum", (2,)),))
+
+
+class Summing(Executor):
+    outputs = {"sum": SUM}
+
+    def __init__(self, context):
+        super().__init__(context)
+        self._sum = 0.0
+
+    def process(self, read, write, tick):
+        self._sum += 1.0
+        write.sum.value[1] = self._sum if tick < 250 else AFTER
+
+
+class Passing(Executor):
+    inputs = {"sum": Input(SUM, "below.sum")}
+    outputs = {"sum": SUM}
+
+    def process(self, read, write, tick):
+        write.sum.value[:] = read.sum.value.value
+"""
+SUMMING = """
+format = 2
+name = "summing"
+python_path = ["{folder}"]
+
+[clock]
+period_ms = 2.5
+mode = "lockstep"
+
+[board.adding]
+slot = 2
+rate_hz = 400
+executor = "{module}:Summing"
+
+[board.passing]
+slot = 3
+rate_hz = 50
+below = "adding"
+executor = "{module}:Passing"
+"""
+Run = Callable[..., Recording]
+
+
+@pytest.fixture
+def ran(rack_name: str, tmp_path: Path) -> Run:
+    """Run a rack for a second, and record it."""
+
+    def run(name: str, text: str, *settings: str, faults: str = "") -> Recording:
+        file = tmp_path / f"{name}.toml"
+        file.write_text(text)
+        script = tmp_path / f"{name}-faults.toml"
+        script.write_text(faults)
+        given = str(script) if faults else None
+        config = load(file, [f"name={rack_name}", CHECKPOINTS, *settings], given)
+        run_rack(config, SECONDS, tmp_path / name, Display())
+        return Recording(tmp_path / name)
+
+    return run
+
+
+def why(one: Recording, other: Recording, *, of: str = "", repeats: bool = True) -> dict[str, Any]:
+    """Return what the report says of two runs."""
+    return compared(one, OtherRun(other.folder, of, repeats))
+
+
+def test_equal_runs_have_no_chain(ran: Run) -> None:
+    found = why(ran("one", REMEMBERING), ran("two", REMEMBERING))
+    assert (found["first_difference"], found["chain"], found["repetition"]) == (None, [], None)
+    assert found["explained"]
+
+
+def test_a_parameter_is_named_with_the_attributes_that_it_changed(ran: Run) -> None:
+    one = ran("one", REMEMBERING)
+    two = ran("two", REMEMBERING, "board.wave.params.factor=2")
+    found = why(two, one)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (0, "wave.status", "wave")
+    assert (cycle["read"], cycle["unequal"]) == ((), "")
+    (clue,) = cycle["clues"]
+    assert clue["kind"] == "config"
+    assert clue["values"] == {"name": "board.wave.params.factor", "here": 2, "there": None}
+    repetition = found["repetition"]
+    assert (repetition["because"], repetition["runs"], repetition["strays"]) == ("state", (), {})
+    assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
+
+
+def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
+    ran: Run, rack_name: str, tmp_path: Path
+) -> None:
+    one = ran("one", REMEMBERING)
+    config = branched(one, ["board.wave.params.factor=2"], None)
+    with state_at(one, 150) as state:
+        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=state.begins)
+    found = why(Recording(tmp_path / "two"), one)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["mailbox"]) == (150, "wave.status")
+    repetition = found["repetition"]
+    assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
+    assert (repetition["because"], repetition["strays"]) == ("state", {})
+    # What it remembers is the first run's: only the parameter has changed it.
+    assert {one["name"] for one in repetition["attributes"]} == {"_factor", "_half"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "field", "kinds"),
+    [
+        ('kind = "kill"\nboard = "wave"\ntick = 130', "tick", {"fault", "died", "skipped"}),
+        ('kind = "mute"\nboard = "wave"\ntick = 130\ncycles = 4', "tick", {"fault"}),
+        ('kind = "corrupt"\nboard = "wave"\ntick = 130\ncycles = 4', "tick", {"fault"}),
+        ('kind = "drop"\nboard = "wave"\ntick = 130\nprobability = 1.0', "tick", {"fault"}),
+        ('kind = "delay"\nboard = "wave"\ntick = 130\ncycles = 4', "visible_at", {"fault"}),
+    ],
+)
+def test_a_fault_is_the_cause_and_nothing_is_repeated(
+    ran: Run, fault: str, field: str, kinds: set[str]
+) -> None:
+    one = ran("one", REMEMBERING)
+    two = ran("two", REMEMBERING, faults=f"[[fault]]\n{fault}\n")
+    found = why(one, two)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["mailbox"]) == (130, "wave.status")
+    assert cycle["fields"][0]["name"] == field
+    assert {clue["kind"] for clue in cycle["clues"]} == kinds
+    assert {clue["run"] for clue in cycle["clues"]} == {str(two.folder)}
+    assert (found["repetition"], found["not_repeated"]) == (None, "")
+    # From the watching level, which takes note of a loss, back to the board that was killed.
+    if "died" in kinds:
+        away = why(one, two, of="watch.status")["chain"]
+        assert [cycle["mailbox"] for cycle in away] == ["watch.status", "wave.status"]
+        assert away[0]["unequal"] == "wave.status"
+
+
+def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> None:
+    level = tmp_path / "summing_levels.py"
+    text = SUMMING.format(folder=tmp_path, module=level.stem)
+    level.write_text(OWN_LEVEL.replace("AFTER", "self._sum"))
+    one = ran("one", text)
+    level.write_text(OWN_LEVEL.replace("AFTER", "self._sum + 1.0"))
+    two = ran("two", text)
+    found = why(one, two)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["writer"]) == (250, "adding")
+    assert cycle["fields"] == ({"name": "adding.sum.value[1]", "here": 251.0, "there": 252.0},)
+    assert cycle["clues"] == ()
+    repetition = found["repetition"]
+    assert (repetition["because"], repetition["runs"]) == ("code", (str(one.folder),))
+    assert repetition["attributes"] == ()
+    # The other level only passes on what it has read.
+    chain = why(one, two, of="passing.sum", repeats=False)["chain"]
+    assert [(one["mailbox"], one["unequal"]) for one in chain] == [
+        ("passing.sum", "adding.sum"),
+        ("adding.sum", ""),
+    ]
+
+
+def test_a_level_that_depends_on_a_clock_is_found(ran: Run, tmp_path: Path) -> None:
+    level = tmp_path / "clock_levels.py"
+    level.write_text(OWN_LEVEL.replace("AFTER", "float(monotonic_ns())"))
+    text = SUMMING.format(folder=tmp_path, module=level.stem)
+    one, two = ran("one", text), ran("two", text)
+    found = why(one, two)
+    repetition = found["repetition"]
+    assert repetition["because"] == "chance"
+    assert set(repetition["runs"]) == {str(one.folder), str(two.folder)}
+    assert any("such as a clock" in line for line in found["why"])
+
+
+def test_an_operators_command_is_the_cause(ran: Run) -> None:
+    one = ran("one", COMMANDED)
+    two = ran("two", COMMANDED, commands("level = 'upper', what = 'hold', tick = 80"))
+    (cycle,) = why(one, two)["chain"]
+    assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (80, "upper.operator", "clock")
+    assert [(clue["kind"], clue["run"]) for clue in cycle["clues"]] == [
+        ("command", str(two.folder))
+    ]
+    chain = why(one, two, of="lower.status")["chain"]
+    assert [cycle["mailbox"] for cycle in chain] == [
+        "lower.status",
+        "upper.command",
+        "upper.operator",
+    ]
+
+
+@pytest.mark.alone
+def test_a_run_in_real_time_is_not_repeated(ran: Run) -> None:
+    one = ran("one", REMEMBERING)
+    two = ran("two", REMEMBERING, "board.wave.params.factor=2", "clock.mode=realtime")
+    found = why(one, two)
+    assert found["repetition"] is None
+    # A cycle that was missed would be a cause of its own.
+    is_late = any(clue["kind"] in ("late", "skipped") for clue in found["chain"][-1]["clues"])
+    assert found["not_repeated"] == ("" if is_late else f"{two.folder} ran in real time")
+    assert why(one, one, repeats=False)["not_repeated"] == ""
+
+
+def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
+    ran: Run, tmp_path: Path
+) -> None:
+    one = ran("one", REMEMBERING)
+    two = ran("two", REMEMBERING, "board.wave.params.factor=2")
+    done = rack("report", two.folder, "--against", one.folder, "--no-repeat")
+    assert done.returncode == 1
+    assert "  - not repeated: --no-repeat" in done.stdout.splitlines()
+    assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
+    other = ran("other", COMMANDED)
+    for arguments, said in (
+        (
+            (one.folder, "--against", other.folder),
+            "are of different racks: only the first has 'wave'",
+        ),
+        ((one.folder, "--against", tmp_path), "not a run"),
+        ((one.folder, "--against", two.folder, "--of", "wave.statu"), "nearest: wave.status"),
+        ((one.folder, "--of", "wave.status"), "permitted with --against"),
+    ):
+        refused = rack("report", *arguments)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+        assert said in refused.stderr

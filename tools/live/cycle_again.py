@@ -1,0 +1,161 @@
+"""A cycle of two recorded runs, repeated in both: was the level's state equal before it, and does
+its code do again what it did?
+
+The inputs of that cycle were equal in both, see `rack.tools.recording.causes`. A run that does not
+repeat its own message now has a level whose code has changed since or, if it does not even repeat
+itself, one that depends on something besides messages, ticks and parameters. If both repeat theirs,
+what differs is the state of the level or its parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.mailbox.history import chains
+from rack.boards import Rack
+from rack.boards.checkpoint.format import checkpoints
+from rack.boards.wiring import Keeping
+from rack.tools.console.answer import Failure, as_failure
+from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.live.continued import (
+    attributes_in,
+    begun_before,
+    gone_on,
+    state_at,
+    unlike_in,
+)
+from rack.tools.live.launch import Beginning
+from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, dotted
+from rack.tools.recording.divergence import continued_at
+from rack.tools.recording.recording import Recording
+
+Because = Literal["state", "code", "chance"]
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """What the repetition of a cycle in two runs has shown.
+
+    `attributes` of the level differed before it. `because`: "state", or parameters, if each run
+    repeats its own message; "code" if that of the level has changed since one of them; "chance" if
+    it does not repeat itself. `runs` are those that do not repeat theirs. `strays`: mailboxes of
+    others that are not as recorded, by run, so that nothing of this is sure.
+    """
+
+    attributes: tuple[InBoth, ...]
+    because: Because
+    runs: tuple[str, ...]
+    strays: Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class CycleAgain:
+    """A repeated cycle: the attributes of its level before it, serial and chain of what it wrote,
+    and the mailboxes that are not as recorded."""
+
+    attributes: Mapping[str, Any]
+    wrote: tuple[int, int]
+    unlike: tuple[str, ...]
+
+
+def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
+    """Repeat a cycle in both runs. Raises `Failure` if that is impossible, with the reason."""
+    if cycle.writer == CLOCK:
+        raise Failure("the clock wrote that message")
+    for run in found.runs:
+        if run.rack_config.clock.mode != "lockstep":
+            raise Failure(f"{run.folder} ran in real time")
+    repeater = _Repeater(found, cycle)
+    with INTERRUPT.raising(), as_failure():
+        again = {run: repeater.again(run) for run in found.runs}
+        others = [run for run in found.runs if cycle.mailbox in again[run].unlike]
+        is_chance = not all(repeater.does_repeat(run, again[run]) for run in others)
+    because: Because = "code" if others else "state"
+    return Repetition(
+        attributes=tuple(_unlike(*(again[run].attributes for run in found.runs))),
+        because="chance" if is_chance else because,
+        runs=tuple(str(run.folder) for run in others),
+        strays={
+            str(run.folder): strays for run in found.runs if (strays := repeater.strays(again[run]))
+        },
+    )
+
+
+class _Repeater:
+    """Repeats one cycle, in any of two runs, until what it writes is visible."""
+
+    def __init__(self, found: Divergence, cycle: UnlikeCycle) -> None:
+        self._parents = dict(zip(found.runs, reversed(found.runs), strict=True))
+        self._layout = found.runs[0].layout
+        self._cycle = cycle
+        self._until = found.unlike[cycle.mailbox].visible_at + 1
+
+    def again(self, run: Recording) -> CycleAgain:
+        """Repeat it in a run."""
+        tick = self._cycle.tick
+        with ExitStack() as stack:
+            begins = stack.enter_context(self._beginning(run))
+            path = Path(stack.enter_context(TemporaryDirectory(prefix="rack-")))
+            kept = replace(begins.checkpoint or Keeping(), folder=path, at=tick, shows=True)
+            begins = replace(begins, checkpoint=kept)
+            rack = stack.enter_context(gone_on(run, begins, self._until, self._asked(run)))
+            return CycleAgain(
+                attributes=attributes_in(path)[self._cycle.writer],
+                wrote=self._wrote(rack),
+                unlike=tuple(unlike_in(run, rack.segment, self._until)),
+            )
+
+    def does_repeat(self, run: Recording, again: CycleAgain) -> bool:
+        """Say whether it comes out the same once more. This time nothing is kept before it, which
+        takes long enough for a level that looks at a clock."""
+        with (
+            self._beginning(run) as begins,
+            gone_on(run, begins, self._until, self._asked(run)) as rack,
+        ):
+            return self._wrote(rack) == again.wrote
+
+    def _wrote(self, rack: Rack) -> tuple[int, int]:
+        return chains(rack.segment, self._until)[self._cycle.mailbox]
+
+    def _asked(self, run: Recording) -> str:
+        return f"{run.folder} at tick {self._cycle.tick}"
+
+    @contextmanager
+    def _beginning(self, run: Recording) -> Iterator[Beginning]:
+        """Yield what a run goes on from to the cycle: a branch without a checkpoint until then from
+        the other run, at the tick at which it branched off."""
+        tick = self._cycle.tick
+        branched_at = continued_at(run)
+        if branched_at is None or _has_checkpoint(run, tick):
+            yield begun_before(run, tick, self._asked(run))[1]
+            return
+        parent = self._parents[run]
+        if continued_at(parent) is not None and not _has_checkpoint(parent, branched_at):
+            why = f"has no checkpoint before tick {tick}, and is no branch of {parent.folder}"
+            raise Failure(f"{run.folder} {why}")
+        with state_at(parent, branched_at) as state:
+            keeping = state.begins.checkpoint
+            assert keeping is not None, "a state that is kept"
+            yield Beginning(replace(keeping, packages=run.rack_config.python_path))
+
+    def strays(self, again: CycleAgain) -> tuple[str, ...]:
+        """Return the mailboxes of other tasks that are not as recorded."""
+        writer = self._cycle.writer
+        return tuple(name for name in again.unlike if self._layout.mailbox(name).writer != writer)
+
+
+def _has_checkpoint(run: Recording, until: int) -> bool:
+    return any(at <= until for at in checkpoints(run.folder))
+
+
+def _unlike(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[InBoth]:
+    own, other = dict(dotted(here)), dict(dotted(there))
+    for name in dict.fromkeys((*own, *other)):
+        if own.get(name) != other.get(name):
+            yield InBoth(name, own.get(name), other.get(name))
