@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -15,7 +15,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import reading_progress
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import on_one_time_line
+from rack.tools.recording.time_line import RackPlace, on_one_time_line, side_by_side
 from rack.tools.viewer.parts import FILE, parts_of
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
@@ -32,9 +32,17 @@ Out = Annotated[
         metavar="FILE.rrd", help="make the viewer's file from what is recorded, and open nothing"
     ),
 ]
+Against = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="RUN",
+        help="another run of the same rack, as the one that RUN branches off: both, tick by tick",
+    ),
+]
+Places = Callable[[Sequence[Recording]], list[RackPlace]]
 
 
-def replay(runs: Runs, out: Out = None) -> None:
+def replay(runs: Runs, out: Out = None, against: Against = None) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 
     It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a
@@ -45,6 +53,10 @@ def replay(runs: Runs, out: Out = None) -> None:
     each other; how uncertain that is stands in the log. Recordings that did not run together are
     refused.
 
+    With --against, two runs of one rack are shown at once, each under the name of its folder, on
+    one time line, tick by tick: a branch, say, and the run that it branches off. The log marks
+    where it branches off, and the first message that differs.
+
     A run without run.rrd, as of a flight recorder ([record] keep), is first made into a file.
 
     \b
@@ -52,18 +64,25 @@ def replay(runs: Runs, out: Out = None) -> None:
       rack replay runs/nasrem-20250101-120000
       rack replay runs/cell-puma-20250101-120000 runs/cell-k1607-20250101-120001
       rack replay runs/cell-puma-* runs/cell-k1607-* --out both.rrd
+      rack replay runs/slower --against runs/whole
     """
+    place: Places = on_one_time_line
+    if against is not None:
+        if len(runs) > 1:
+            raise Failure("--against: permitted with one RUN", 2)
+        place = side_by_side
+        runs = [against, *runs]
     if out is None and len(runs) == 1 and (recordings := _own(runs[0])):
         _show(*recordings)
         return
     parts = [part for run in runs for part in _parts(run)]
     if out is not None:
-        _make(parts, out)
+        _make(parts, out, place)
     elif len(parts) == 1 and not (parts[0] / CONFIG).exists():
         raise Failure(f"{parts[0]}: nothing to replay: it has no run.rrd", 2)
     elif has_screen():
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-replay-") as folder:
-            _make(parts, Path(folder, "run.rrd"))
+            _make(parts, Path(folder, "run.rrd"), place)
             _show(Path(folder, "run.rrd"))
     else:
         raise Failure(
@@ -91,29 +110,31 @@ def _show(*recordings: Path) -> None:
         raise Failure(problem)
 
 
-def _make(runs: Sequence[Path], out: Path) -> None:
+def _make(runs: Sequence[Path], out: Path, place: Places) -> None:
     if out.suffix != ".rrd":
         raise Failure(
             f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2
         )
     if out.exists():
         raise Failure(f"--out {out}: exists already", 2)
-    for note in merge(runs, out):
+    for note in merge(runs, out, place):
         print(note, file=sys.stderr)
 
 
-def merge(runs: Sequence[Path], out: Path) -> list[str]:
-    """Write the viewer's file of runs that were recorded together; return what a user should know
-    of their times.
+def merge(runs: Sequence[Path], out: Path, place: Places = on_one_time_line) -> list[str]:
+    """Write the viewer's file of runs that `place` puts on one time line, as those recorded
+    together; return what a user should know of their times.
 
-    Raises `Failure` if they cannot be read, or did not run together.
+    Raises `Failure` if they cannot be read, or have no time in common.
     """
     for run in runs:
         if not run.is_dir():
             why = "not the folder of a run" if run.exists() else "no such folder"
             raise Failure(f"{run}: {why}", 2)
-    placed = on_one_time_line([Recording(run) for run in runs])
-    notes = [place.note for place in placed[1:]]
+    placed = place([Recording(run) for run in runs])
+    tick_s = placed[0].own.clock_ns * 1e-9
+    marks = [mark for one in placed for mark in one.marks]
+    notes = [f"{tick * tick_s:g} s: {text}" if tick else text for tick, text in marks]
     # It takes half a second to import.
     from rack.tools.viewer.merged import write_merged
 

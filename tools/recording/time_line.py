@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from rack.boards.config.timing import tick_ns
 from rack.levels.peer import DRIFT_PPM, PEER, Presence, peer_port
 from rack.tools.console.answer import Failure
+from rack.tools.recording.divergence import continued_at, unlike_messages
 from rack.tools.recording.recording import Recording
 
 Ints = NDArray[np.int64]
@@ -86,14 +88,34 @@ class Shift:
         return Shift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
 
 
+class Mark(NamedTuple):
+    """What a user should see on the time line, at a tick."""
+
+    tick: int
+    text: str
+
+
 @dataclass(frozen=True)
 class RackPlace:
     """A recorded rack on the time line: by what shifts its clock leads to the first rack's; in
-    lockstep by none."""
+    lockstep, or `by_ticks`, by none."""
 
     own: RackGrid
     line: RackGrid
     shifts: tuple[Shift, ...] = ()
+    by_ticks: bool = False
+    marked: tuple[Mark, ...] = ()
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """What a user should know of it; of the first rack nothing."""
+        if self.own is self.line:
+            return ()
+        return self.marked or (Mark(0, self.note),)
+
+    @property
+    def _shares_ticks(self) -> bool:
+        return self.own.is_lockstep or self.by_ticks
 
     @property
     def uncertainty_ns(self) -> int:
@@ -121,13 +143,13 @@ class RackPlace:
     def times_ns(self, ticks: Ints, within_ns: Ints | int) -> Ints:
         """Return simulated times on the line of its ticks, and `within_ns` of its own simulated
         time later."""
-        if self.own is self.line or self.own.is_lockstep:
+        if self.own is self.line or self._shares_ticks:
             return ticks * self.own.clock_ns + within_ns
         return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
 
     def wall_ns(self, stamps_ns: Ints) -> Ints:
-        """Return stamps of its machine on the line's wall clock; in lockstep on its own."""
-        launch = self.own.launch if self.own.is_lockstep else self.line.launch
+        """Return stamps of its machine on the line's wall clock; without shifts on its own."""
+        launch = self.own.launch if self._shares_ticks else self.line.launch
         return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
 
 
@@ -156,6 +178,37 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     return [placed[at] for at in range(len(grids))]
 
 
+def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
+    """Return the places of two runs of one rack, tick by tick, each by the name of its folder; a
+    branch and the run that it branches off, say.
+
+    Raises `Failure` if they are not of one rack, or lack rows.
+    """
+    folders = [recording.folder.resolve() for recording in recordings]
+    if len(recordings) != 2 or folders[0] == folders[1]:
+        raise Failure("--against: permitted: two runs of one rack, a folder each", 2)
+    unlike = unlike_messages(*recordings)
+    other = recordings[1]
+    grids = [RackGrid(recording) for recording in recordings]
+    names = [folder.name for folder in folders]
+    if names[0] == names[1]:
+        names = [str(folder) for folder in folders]
+    for grid, name in zip(grids, names, strict=True):
+        grid.rack = name
+    marks = []
+    if (tick := continued_at(other)) is not None:
+        marks.append(Mark(tick, f"{names[1]} branches off"))
+    if unlike:
+        first = unlike[0]
+        marks.append(Mark(first.tick, f"{names[1]} differs from {names[0]}: {first.mailbox}"))
+    marks = marks or [Mark(0, f"all that {names[0]} and {names[1]} both wrote is equal")]
+    line = grids[0]
+    return [
+        RackPlace(line, line, by_ticks=True),
+        RackPlace(grids[1], line, by_ticks=True, marked=tuple(marks)),
+    ]
+
+
 def _named(grids: Iterable[RackGrid]) -> str:
     return ", ".join(f"'{grid.rack}'" for grid in grids)
 
@@ -165,7 +218,9 @@ def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
         if other.rack == grid.rack:
             where = f"{other.recording.folder} and {grid.recording.folder}"
             raise Failure(
-                f"{where}: both are of rack '{grid.rack}'; give one recording of each rack", 2
+                f"{where}: both are of rack '{grid.rack}'; give one recording of each rack, or one"
+                " with --against the other",
+                2,
             )
         if other.is_lockstep != grid.is_lockstep:
             timed, stepped = (other, grid) if grid.is_lockstep else (grid, other)

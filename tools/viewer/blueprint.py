@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.components import PlayState
+from rerun.encodings import EntityPathLike
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import RackConfig, rack_timing
@@ -39,6 +40,8 @@ from rack.tools.viewer.style import GRID, LEGEND, lanes_view, legend_view
 from rack.tools.viewer.timing import BOARDS, boards_of
 
 CONFIG = "config"
+DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
+"""Look of the curves of a run with which another one is compared."""
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
@@ -74,11 +77,34 @@ def together(racks: Mapping[str, RackViews]) -> rrb.Container:
     All at once are a column for each rack, its cell above what its levels do, and below them the
     log of all.
     """
-    columns = rrb.Horizontal(*(views.column(name) for name, views in racks.items()))
-    logs = [f"{path(LOG)}/**", *(views.all(LOG) for views in racks.values())]
-    log = rrb.TextLogView(origin="/", contents=logs, name="log of all racks", columns=LOG_COLUMNS)
-    shown = rrb.Vertical(columns, log, row_shares=[4, 1], name="all racks")
+    shown = rrb.Vertical(_columns(racks), _log(racks, "racks"), row_shares=[4, 1], name="all racks")
     return rrb.Tabs(shown, *(views.everything(name) for name, views in racks.items()), active_tab=0)
+
+
+def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
+    """Return the view of two runs of one rack, by name: as of several racks, and the curves of both
+    in the same plots, those of the first run in grey."""
+    first, other = runs.values()
+    names = "{} in grey, {} in colour".format(*runs)
+    both = zip(first.main_curves().items(), other.main_curves().values(), strict=True)
+    plots = [
+        _curves(f"{title}: {names}", [*grey, *coloured], overrides=dict.fromkeys(grey, DIMMED))
+        for (title, grey), coloured in both
+    ]
+    below = rrb.Horizontal(_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5])
+    shown = rrb.Vertical(_columns(runs), below, row_shares=[5, 3], name="both runs")
+    return rrb.Tabs(shown, *(views.everything(name) for name, views in runs.items()), active_tab=0)
+
+
+def _columns(racks: Mapping[str, RackViews]) -> rrb.Container:
+    return rrb.Horizontal(*(views.column(name) for name, views in racks.items()))
+
+
+def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
+    logs = [f"{path(LOG)}/**", *(views.all(LOG) for views in racks.values())]
+    return rrb.TextLogView(
+        origin="/", contents=logs, name=f"log of all {what}", columns=LOG_COLUMNS
+    )
 
 
 class RackViews:
@@ -132,6 +158,19 @@ class RackViews:
             row_shares=[4, 5, 3],
         )
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
+
+    def main_curves(self) -> dict[str, list[str]]:
+        """Return the entities whose curves show what a run did, by the title of a plot: those of
+        the arm or, without one, all signals."""
+        if not self._joints:
+            boxes = self._layout.mailboxes
+            fields = [(box.name, field.name) for box in boxes for field in box.fields]
+            return {"signals": [self.path(SIGNALS, *names) for names in fields]}
+        found = {
+            f"{quantity}, {unit}": [self.path(JOINTS, name, quantity) for name in self._joints]
+            for quantity, unit in QUANTITIES.items()
+        }
+        return {"tracking error, mrad": [self.path(ERROR)], **found}
 
     def column(self, name: str) -> rrb.Container | rrb.View:
         """Return the cell, if there is one, above what the levels do."""
@@ -288,11 +327,21 @@ class RackViews:
         return rrb.GraphView(origin=self.path(HIERARCHY), name="hierarchy", visual_bounds=bounds)
 
 
-def _curves(name: str, contents: list[str], legend: bool = False) -> rrb.View:
+def _curves(
+    name: str,
+    contents: list[str],
+    legend: bool = False,
+    overrides: Mapping[EntityPathLike, rr.SeriesLines] | None = None,
+) -> rrb.View:
     axis = rrb.TimeAxis(link="LinkToGlobal")
     shown = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(
-        origin="/", contents=contents, name=name, axis_x=axis, plot_legend=shown
+        origin="/",
+        contents=contents,
+        name=name,
+        axis_x=axis,
+        plot_legend=shown,
+        overrides=overrides,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackPlace
-from rack.tools.viewer.blueprint import RackViews, blueprint, together
+from rack.tools.viewer.blueprint import RackViews, blueprint, side_by_side, together
 from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Moment, Stream, Timelines, new_recording
 
@@ -34,13 +34,18 @@ def write_merged(
         roots[rack] = (rack,) if len(placed) > 1 else ()
         views[rack] = RackViews(of.layout, of.config, of.cell, roots[rack])
     name = ", ".join(ran)
-    root = together(views) if len(placed) > 1 else views[name].everything()
+    if placed[0].by_ticks:
+        root = side_by_side(views)
+    else:
+        root = together(views) if len(placed) > 1 else views[name].everything()
     launches = "-".join(str(place.own.launch.created_ns) for place in placed)
     recording = new_recording(name, f"{name}-{launches}", file, blueprint(root))
     first = placed[0].own
     log = Stream(recording, Timelines(first.clock_ns, first.launch))
-    for place in placed[1:]:
-        log.say(Moment(0, place.line.epoch_ns), "time line", place.note, "INFO")
+    for place in placed:
+        for tick, text in place.marks:
+            stamp_ns = int(first.stamp_ns(np.array([tick]))[0])
+            log.say(Moment(tick, stamp_ns), "time line", text, "INFO")
     for at, place in enumerate(placed):
         own = place.own
         stream = Stream(recording, Timelines(own.clock_ns, own.launch, place), roots[own.rack])

@@ -10,12 +10,18 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from rack.boards.config import load
+from rack.tools.live.continued import branched, state_at
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.viewer.merged import write_merged
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
+from tests.boards.checkpoint.test_keeping import REMEMBERING
 from tests.shared_runs import nasrem_run
+from tests.tools.command_line import rack
 from tests.tools.machines import CLOCK_NS, MS, TICKS, A, B, S, recorded
 
 LIVE = ("/recorder/load",)
@@ -114,3 +120,60 @@ def test_no_view_of_several_racks_fails_in_the_viewer(both: Path) -> None:
         pytest.skip(str(error))
     assert look.complaints == ()
     assert {"a: levels", "b: levels", "log of all racks"} <= views
+
+
+@pytest.fixture
+def branched_runs(rack_name: str, tmp_path: Path) -> Path:
+    """Runs "whole", and "other", which branches off at tick 150; the folder of both."""
+    file = tmp_path / "remembering.toml"
+    file.write_text(REMEMBERING)
+    config = load(file, [f"name={rack_name}", "record.checkpoint_s=0.25"])
+    run_rack(config, 1.0, tmp_path / "whole", Display())
+    whole = Recording(tmp_path / "whole")
+    config = branched(whole, ["board.wave.params.factor=2"], None)
+    with state_at(whole, 150) as state:
+        run_rack(config, 1.0, tmp_path / "other", Display(), begins=state.begins)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
+    branched_runs: Path,
+) -> None:
+    names = ("other", "--against", "whole", "--out", "both.rrd")
+    done = rack("replay", *names, folder=branched_runs)
+    assert done.returncode == 0, done.stderr
+    both = branched_runs / "both.rrd"
+    curves = [read(both, f"/{run}/signals/wave.status/value") for run in ("whole", "other")]
+    for rows, run in zip(curves, ("whole", "other"), strict=True):
+        own = Recording(branched_runs / run)
+        assert rows.ticks.tolist() == own.signal("wave.status", "tick").tolist()
+        assert rows.values.ravel().tolist() == own.signal("wave.status", "value").tolist()
+    assert (curves[0].ticks[0], curves[1].ticks[0]) == (0, 150)
+    marks = read(both, "/log/time\\ line", "TextLog:text")
+    assert list(zip(marks.ticks.tolist(), marks.values.ravel().tolist(), strict=True)) == [
+        (150, "other branches off"),
+        (150, "other differs from whole: wave.status"),
+    ]
+    try:
+        with opened(both) as screen:
+            look = screen.look(at_s=0.5)
+            views = set(screen.views)
+    except NoViewerError as error:
+        pytest.skip(str(error))
+    assert look.complaints == ()
+    assert {"signals: whole in grey, other in colour", "log of all runs"} <= views
+
+
+@pytest.mark.slow
+def test_runs_that_cannot_be_shown_together_are_refused(branched_runs: Path) -> None:
+    for arguments, why in (
+        (("other", "whole"), "one with --against the other"),
+        (("other", "whole", "--against", "whole"), "--against: permitted with one RUN"),
+        (("other", "--against", "nowhere"), "nowhere: no such folder"),
+        (("other", "--against", "other"), "permitted: two runs of one rack"),
+    ):
+        refused = rack("replay", *arguments, "--out", "both.rrd", folder=branched_runs)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+        assert why in refused.stderr
+    assert not (branched_runs / "both.rrd").exists()
