@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Annotated, Any
@@ -15,10 +14,10 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, System
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console, table, terminal_width
 from rack.tools.live.message_text import MessageText
+from rack.tools.live.watched import looks
 from rack.tools.recording.signal import mailbox_of
 
 LOOK_S = 0.1
@@ -78,12 +77,8 @@ def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
     is_drawn = terminal.is_terminal and not as_json
     live = Live(console=terminal, auto_refresh=False) if is_drawn else None
     look_s = LOOK_S if is_drawn or as_json else PLAIN_S
-    ended = threading.Event()
-    is_over = False
-    with INTERRUPT.orderly(ended.set), live or nullcontext():
-        while not is_over:
-            # Asked before the look: what is written until the end is shown.
-            is_over = segment.run_is_over or ended.wait(look_s)
+    with live or nullcontext():
+        for _ in looks(segment, look_s):
             found = [*messages.new()]
             if as_json:
                 for document in found:

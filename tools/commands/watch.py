@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import sys
-import threading
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +19,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console
 from rack.tools.live.signals import Lines, Plot, SignalTap, Strip, Written, cell
+from rack.tools.live.watched import looks
 from rack.tools.recording.signal import Signal, Trigger
 
 LOOK_S = 0.02
@@ -129,17 +129,13 @@ def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: 
     first = segment.words[System.TICK]
     view: Lines | Plot = Lines(strip, first, round(every_s / strip.tick_s), as_json)
     terminal = console()
-    if terminal.is_terminal and not as_json:
-        try:
-            view = Plot(strip, span, terminal)
-        except ImportError:
-            print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
-    ended = threading.Event()
-    is_over = False
-    with INTERRUPT.orderly(ended.set), view:
-        while not is_over and not ended.wait(LOOK_S):
-            # Asked before the look: what is written until the end is shown.
-            is_over = segment.run_is_over
+    with ExitStack() as stack:
+        if terminal.is_terminal and not as_json:
+            try:
+                view = stack.enter_context(Plot(strip, span, terminal))
+            except ImportError:
+                print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
+        for is_over in looks(segment, LOOK_S):
             for written in tap.take():
                 strip.add(written)
                 lost += written.lost
@@ -176,16 +172,13 @@ class Capture:
         for written in self._tap.take():
             # Written before anyone asked: it does not count, but may be around the moment.
             self.strip.add(written)
-        ended = threading.Event()
-        is_over = False
-        with INTERRUPT.orderly(ended.set):
-            while not (is_over or self._is_complete()) and not ended.wait(LOOK_S):
-                # Asked before the look: what is written until the end counts.
-                is_over = self._segment.run_is_over
-                for written in self._tap.take():
-                    self._look(written)
+        for _ in looks(self._segment, LOOK_S):
+            for written in self._tap.take():
+                self._look(written)
+            if self._is_complete():
+                break
         if self.tick < 0:
-            why = "was interrupted" if ended.is_set() else "the run is over"
+            why = "was interrupted" if INTERRUPT.number else "the run is over"
             raise Failure(f"rack '{self._segment.rack}': the condition has not held; {why}")
 
     def _look(self, written: Written) -> None:

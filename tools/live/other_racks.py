@@ -10,7 +10,6 @@ import sys
 import time
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 from typing import NamedTuple, Self
 
 from rack.backplane.process import die_with_parent, how_ended
@@ -110,12 +109,7 @@ class OtherRacks:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
         self.finish()
         for rack in self._racks:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -115,17 +114,6 @@ class Lines:
         self._every = max(every, 1)
         self._as_json = as_json
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
-        """Leave what was printed."""
-
     def show(self, last: int) -> None:
         """Print what was released until the tick `last`, and is not printed yet."""
         for tick, values in self._strip.table(self._next, last):
@@ -157,16 +145,11 @@ class Plot:
         self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
 
     def __enter__(self) -> Self:
-        self._live.__enter__()
+        self._live.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
-        self._live.__exit__(kind, error, at)
+    def __exit__(self, *error: object) -> None:
+        self._live.stop()
 
     def show(self, last: int) -> None:
         """Draw what was released in the time before the tick `last`."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 from rack.backplane.segment import Segment
+from rack.tools.console.interrupt import INTERRUPT
 
 if TYPE_CHECKING:
     from rack.backplane.operator_table import Client, Request, RequestEntry
@@ -56,12 +59,7 @@ class LocalRack:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.segment.close()
 
     def refresh(self) -> bool:
@@ -77,6 +75,18 @@ class LocalRack:
         from rack.backplane.operator_table import OperatorTable
 
         return OperatorTable(self.segment).claim(request, client)
+
+
+def looks(segment: Segment, look_s: float) -> Iterator[bool]:
+    """Yield again and again whether the run is over, until it is, or a signal asks for the end."""
+    ended = threading.Event()
+    is_last = False
+    with INTERRUPT.orderly(ended.set):
+        while not is_last:
+            # Asked before the look: what is written until the end is seen.
+            is_over = segment.run_is_over
+            is_last = is_over or ended.wait(look_s)
+            yield is_over
 
 
 def watched(rack: str, asker: Asker | None = None) -> WatchedRack:
