@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,15 +16,14 @@ from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
 from rack.tools.console.address import OPERATOR, Asker
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Failure, fail, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, View
 from rack.tools.live.folder import folder_of
 from rack.tools.live.watched import WatchedRack, watched
-from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink
-from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes
+from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes, unwritable
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import save as save_run
 from rack.tools.viewer.parts import FILE
@@ -100,7 +100,8 @@ def record(
         segment = found[0].segment
         clock_ns = segment.layout.clock_ns
         begun = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
-        notes = _record_together(found, folder) if others else _record(found[0], folder, view)
+        with _ending_when_full(found[0], folder):
+            notes = _record_together(found, folder) if others else _record(found[0], folder, view)
         lasted_s = (segment.words[System.TICK] - begun) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
@@ -140,9 +141,7 @@ def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None =
         rack.follow(mailbox.name)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).write_text(segment.config)
-    view = None
-    if port is not None or Retention.of(segment) is None:
-        view = SafeSink(lambda: ViewSink(segment, folder, port), notes.append)
+    view = SafeSink.of(segment, port, lambda: ViewSink(segment, folder, port), notes.append)
     return Recorder(segment, folder, view, rack.refresh if segment.is_mirror else None)
 
 
@@ -159,6 +158,22 @@ def _record(rack: WatchedRack, folder: Path, view: bool) -> list[str]:
             ViewerWindow(url(port))
         recorder.follow()
     return notes
+
+
+@contextmanager
+def _ending_when_full(rack: WatchedRack, folder: Path) -> Iterator[None]:
+    """End the process with one line when files cannot be written: the viewer's library would wait,
+    maybe for ever, for a file of its own."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        try:
+            fail(unwritable(folder, error, rack.segment.words[System.FOLLOWER_TICK]), 1)
+        finally:
+            sys.stdout.flush()
+            os._exit(1)
 
 
 def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:

@@ -96,6 +96,7 @@ def watch(
     if when is None:
         _show(segment, shown, every_s, as_json)
         return
+    _check_writable(out or Path(f"{rack}.csv"))
     capture = Capture(segment, shown, Trigger.of(when, boxes), before_s, after_s)
     capture.wait()
     path = out or Path(f"{rack}-{capture.tick}.csv")
@@ -116,6 +117,15 @@ def _seconds(option: str, text: str) -> float:
         why = f"not a time; permitted: as in 0.5s or 20ms, at most {MOST_S:g}s"
         raise Failure(f"{option} {text}: {why}", 2)
     return seconds
+
+
+def _check_writable(path: Path) -> None:
+    """Raise `OSError` where a file cannot be written, before the moment: afterwards it is gone."""
+    is_new = not path.exists()
+    with path.open("a"):
+        pass
+    if is_new:
+        path.unlink()
 
 
 def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: bool) -> None:
@@ -197,12 +207,16 @@ class Capture:
         """Write the CSV file; return its number of rows. Raises `Failure` when messages are
         missing."""
         rows = self.strip.table(self.tick - self._before, self.tick + self._after)
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["time, s", "tick", *(signal.head for signal in self.strip.signals)])
-            writer.writerows(
-                [self.strip.time_s(tick), tick, *map(cell, values)] for tick, values in rows
-            )
+        try:
+            with path.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file)
+                heads = (signal.head for signal in self.strip.signals)
+                writer.writerow(["time, s", "tick", *heads])
+                writer.writerows(
+                    [self.strip.time_s(tick), tick, *map(cell, values)] for tick, values in rows
+                )
+        except OSError as error:
+            raise Failure(f"{path}: {error.strerror}: cut off") from None
         if self._lost:
             raise Failure(f"{path}: {self._lost} messages were overwritten before they were taken")
         return len(rows)

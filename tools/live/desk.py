@@ -230,13 +230,13 @@ def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
     goal: dict[str, Any] = {}
     for word in words:
         key, is_given, values = word.partition("=")
+        if key in goal:
+            raise Failure(f"'{word}': {key} is given twice", 2)
         if word == "home":
             goal["home"] = True
         elif not is_given or key not in GOAL_KEYS:
             permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
             raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
-        elif key in goal:
-            raise Failure(f"'{word}': {key} is given twice", 2)
         else:
             goal[key] = [_number(value, word) for value in values.split(",")]
     return goal

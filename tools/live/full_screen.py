@@ -58,7 +58,9 @@ class RackScreen(App[None]):
     TabPane { padding: 0; }
     Input, OptionList { display: none; max-height: 50%; }
     .open { display: block; }
+    .-low #head, .-low ContentTabs, .-low Footer { display: none; }
     """
+    VERTICAL_BREAKPOINTS = [(0, "-low"), (10, "-high")]
     ENABLE_COMMAND_PALETTE = False
     BINDINGS = [
         Binding("h", "give('hold')", "hold"),

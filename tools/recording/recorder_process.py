@@ -38,6 +38,16 @@ UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, as on a full disk: another one could not
 either."""
 
+ENDS = "the recording ends at tick"
+"""In the line that such a recorder prints; the viewer's library may print more after it."""
+
+
+def unwritable(folder: Path, error: OSError, tick: int) -> str:
+    """Return why a recording ends before its run."""
+    # The text of pyarrow's own errors is long.
+    why = os.strerror(error.errno) if error.errno else error
+    return f"{folder}: {why}: {ENDS} {tick}"
+
 
 class RecorderProcess:
     """A recorder for a rack that is about to run; it imports its libraries while the rack is being
@@ -149,15 +159,11 @@ class RecorderProcess:
         """Return how it ended, with the last line that it printed on stderr."""
         size = os.fstat(self._complaints).st_size
         status = self._process.returncode
-        last = (
-            os.pread(self._complaints, 4096, max(0, size - 4096))
-            .decode(errors="replace")
-            .strip()
-            .splitlines()[-1:]
-        )
+        text = os.pread(self._complaints, 4096, max(0, size - 4096)).decode(errors="replace")
+        lines = text.strip().splitlines()
         if status == UNWRITABLE:
-            raise Failure("".join(last))
-        return ": ".join((f"the recorder ended with status {status}", *last))
+            raise Failure(next((line for line in reversed(lines) if ENDS in line), text))
+        return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
 
     def _set_follower(self, pid: int) -> None:
         if self._words is not None:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -167,6 +168,8 @@ class Trigger:
         except ValueError:
             known = f" or one of {', '.join(names)}" if names else ""
             raise Failure(f'"{text}": {found[3]} is not a number{known}', 2) from None
+        if isnan(number):
+            raise Failure(f'"{text}": nan is not a number to compare with', 2)
         return cls(signal, found[2], number)
 
     def holds(self, messages: np.ndarray) -> np.ndarray:

@@ -96,7 +96,7 @@ class StretchHead(NamedTuple):
         folder.mkdir(exist_ok=True)
         text = json.dumps(self[:-1]).encode()
         file = self.path(folder).open("wb", buffering=0)
-        file.write(_STRETCH.pack(MAGIC, self.end, len(text), zlib.crc32(text)) + text)
+        _write(file, _STRETCH.pack(MAGIC, self.end, len(text), zlib.crc32(text)) + text)
         return file
 
     def path(self, folder: Path) -> Path:
@@ -140,7 +140,7 @@ class Spool:
                 raise Failure(f"{self.path}: another recorder is running there")
             if not self.path.stat().st_size:
                 text = json.dumps({"layout": asdict(layout), "launch": launch}).encode()
-                self._file.write(_HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text)
+                _write(self._file, _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text)
             if (found := read_head(self._file, self.path)) != (layout, launch):
                 raise Failure(
                     f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'"
@@ -187,9 +187,7 @@ class Spool:
         if not now and time.monotonic() < self._flush_at:
             return False
         self._flush_at = time.monotonic() + FLUSH_S
-        waiting = b"".join(self._packed())
-        while waiting:
-            waiting = waiting[self._out.write(waiting) :]
+        _write(self._out, b"".join(self._packed()))
         return True
 
     def _packed(self) -> Iterator[bytes]:
@@ -214,6 +212,13 @@ class Spool:
         """Close the spool and leave it to another recorder; its stretch, if any, ends at a tick."""
         self._seal(end)
         self._file.close()
+
+
+def _write(file: IO[bytes], data: bytes) -> None:
+    """Write all of it to an unbuffered file, which may take a part at a time. Raises `OSError` when
+    the disk is full."""
+    while data:
+        data = data[file.write(data) :]
 
 
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:

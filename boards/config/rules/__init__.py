@@ -44,6 +44,7 @@ RULES: tuple[Rule, ...] = (
     boards.circles,
     boards.slots,
     boards.ends,
+    boards.record,
     partial(_of_network, "lan"),
     partial(_of_network, "network"),
     levels.scene,

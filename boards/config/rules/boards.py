@@ -11,6 +11,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import ClockError
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeated
+from rack.boards.config.record import RecordConfig
 from rack.boards.config.schema import (
     LONGEST_EVERY,
     SHORTEST_MS,
@@ -156,6 +157,15 @@ def ends(wiring: Wiring) -> Iterator[Mistake]:
             True,
             f"only one board can end the run; '{ending[0]}' already does",
         )
+
+
+def record(wiring: Wiring) -> Iterator[Mistake]:
+    """Check that a recording which keeps everything is not asked for what surrounds a fault."""
+    table = wiring.config.record
+    if table.keep is None:
+        for key in ("before", "after"):
+            if (value := getattr(table, key)) != RecordConfig.model_fields[key].default:
+                yield Mistake(f"record.{key}", value, "needs record.keep; without it all is kept")
 
 
 LONGEST_MAJOR = 10_000

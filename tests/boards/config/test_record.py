@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, loads
+from rack.boards.config import load, loads, resolve
 from rack.boards.errors import ConfigError
 
 
@@ -40,3 +40,9 @@ def test_a_mistake_is_one_line(small: Path, table: str, line: str) -> None:
         load(small, [f"record={table}"])
     (said,) = str(refused.value).splitlines()
     assert said.startswith(line)
+
+
+def test_what_surrounds_a_fault_is_no_setting_of_a_run_that_is_kept_whole(small: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        resolve(load(small, ["record={ before = '2 s' }"]))
+    assert str(refused.value) == ("record.before = 2.0: needs record.keep; without it all is kept")

@@ -68,6 +68,7 @@ def test_mailboxes_are_listed_and_their_newest_messages_shown(held: str) -> None
 
 @pytest.mark.slow
 def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
+    never = ("watch", held, "counter.status.row", "--when", "counter.status.row > 99")
     cases = {
         ("mailbox", held, "counter.stat"): "counter.stat: no such mailbox; nearest: coun",
         ("mailbox", held, "--watch"): "--watch needs the NAME of a mailbox",
@@ -75,6 +76,11 @@ def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
         ("watch", held, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
         ("watch", held, "counter.status.row", "--every", "1"): "--every 1: not a time; permitted: ",
         ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: not a time; permi",
+        (*never, "--out", "missing/x.csv"): '"missing/x.csv": No such file or directory',
+        (*never, "--out", "."): '".": Is a directory',
+        ("watch", held, "counter.status.row", "--when", "counter.status.row > nan"): (
+            '"counter.status.row > nan": nan is not a number to compare with'
+        ),
         ("watch", "no-such-rack", "a.b"): "rack 'no-such-rack' does not exist",
     }
     for words, why in cases.items():
@@ -114,6 +120,15 @@ def test_a_moment_is_saved_with_what_was_around_it(held: str, tmp_path: Path) ->
     assert ticks == [*range(found["tick"] - 20, found["tick"] + 13, 4)]
     assert [row[2] for row in rows][5] == "turn"
     assert "turn" not in [row[2] for row in rows][:5]
+
+
+@pytest.mark.slow
+def test_a_moment_that_a_full_disk_cuts_off_is_said(held: str) -> None:
+    with in_thread(lambda: go_on(held, '"rows"')):
+        words = ("--when", "counter.status.row == 4", "--after", "30ms", "--out", "/dev/full")
+        done = rack("watch", held, "counter.status.fired", *words)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "/dev/full: No space left on device: cut off\n"
 
 
 @pytest.mark.slow

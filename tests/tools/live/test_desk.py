@@ -339,6 +339,7 @@ REFUSED = {
         "'joints=1,x': 'x' is not a number; permitted: numbers separated by commas",
     ),
     "twice": (("upper", "goto", "joints=1", "joints=2"), "'joints=2': joints is given twice"),
+    "home twice": (("upper", "goto", "home", "home"), "'home': home is given twice"),
     "a tick that has passed": (
         ("upper", "hold", "--tick", "0"),
         "tick = 0: has passed; the rack is at tick ",

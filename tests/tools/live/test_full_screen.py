@@ -162,6 +162,16 @@ def test_a_screen_of_twenty_by_five_loses_nothing_and_the_rack_runs_on(running: 
     on_screen(running, act)
 
 
+def test_a_low_screen_has_its_few_lines_for_the_rack(running: str) -> None:
+    async def act(pilot: Pilot[None]) -> None:
+        await shows(pilot, "running", "missed")
+        assert "hold" not in seen(pilot)
+        await pilot.resize_terminal(60, 24)
+        await shows(pilot, "1 boards", "hold")
+
+    on_screen(running, act, (60, 5))
+
+
 def test_the_screen_ends_with_the_run(running: str) -> None:
     async def act(pilot: Pilot[None]) -> None:
         assert rack("stop", running).returncode == 0

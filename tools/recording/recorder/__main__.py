@@ -39,9 +39,8 @@ def main() -> None:
     launcher = os.getppid()
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
-    from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
-    from rack.tools.recording.recorder_process import UNWRITABLE
+    from rack.tools.recording.recorder_process import UNWRITABLE, unwritable
 
     # It takes half a second. A thread begins with it while the rack is being launched.
     Thread(target=_import_view, daemon=True).start()
@@ -50,13 +49,7 @@ def main() -> None:
         return
     name, folder, port = json.loads(line)
     segment = Segment.attach(name)
-    # A run in real time need not wait for the libraries of the viewer, unless the user wants to
-    # look on from the start.
-    in_background = port is None and not segment.words[System.LOCKSTEP]
-    view = None
-    # A flight recorder writes no file of the viewer; `rack replay` makes it of what is kept.
-    if port is not None or Retention.of(segment) is None:
-        view = SafeSink(lambda: _view(segment, Path(folder), port), _tell, in_background)
+    view = SafeSink.of(segment, port, lambda: _view(segment, Path(folder), port), _tell)
     try:
         with Recorder(segment, Path(folder), view) as recorder:
             _tell("recording")
@@ -71,10 +64,8 @@ def main() -> None:
             if is_hurried and view is not None:
                 view.hurry()
     except OSError as error:
-        # The text of pyarrow's own errors is long.
-        why = os.strerror(error.errno) if error.errno else error
-        ended = f"{folder}: {why}: the recording ends at tick {segment.words[System.FOLLOWER_TICK]}"
-        print(ended, file=sys.stderr, flush=True)
+        tick = segment.words[System.FOLLOWER_TICK]
+        print(unwritable(Path(folder), error, tick), file=sys.stderr, flush=True)
         os._exit(UNWRITABLE)
 
 

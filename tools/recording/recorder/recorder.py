@@ -76,6 +76,22 @@ class SafeSink:
             self._opening.join()
         self._patience_s: float | None = None
 
+    @classmethod
+    def of(
+        cls,
+        segment: Segment,
+        port: int | None,
+        opened: Callable[[], Sink],
+        tell: Callable[[str], None],
+    ) -> Self | None:
+        """Return the sink of the viewer's file, or of a viewer on a port; a flight recorder has no
+        such file: `rack replay` makes it of what is kept."""
+        if port is None and Retention.of(segment) is not None:
+            return None
+        # A run in real time need not wait for the libraries of the viewer, unless the user wants to
+        # look on from the start.
+        return cls(opened, tell, port is None and not segment.words[System.LOCKSTEP])
+
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Keep rows to be passed on."""
         self._waiting.append(lambda sink: sink.add(ring, rows))
