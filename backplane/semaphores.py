@@ -26,8 +26,10 @@ from rack.backplane.segment import PREFIX, SHM_FOLDER, no_room
 _libc = ctypes.CDLL(None)
 _sem_open = _libc.sem_open
 _sem_clockwait = _libc.sem_clockwait
+_sem_close = _libc.sem_close
 _sem_open.argtypes = (ctypes.c_char_p, ctypes.c_int)
 _sem_open.restype = ctypes.c_void_p
+_sem_close.argtypes = (ctypes.c_void_p,)
 _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 
 
@@ -43,12 +45,17 @@ class Semaphore(posix_ipc.Semaphore):  # type: ignore[misc]  # posix_ipc has no 
         """Open the semaphore of that name. Raises `posix_ipc.ExistentialError`."""
         super().__init__(name)
         # The same semaphore: the C library opens a name once in a process.
-        address = _sem_open(name.encode(), 0)
+        self._address = address = _sem_open(name.encode(), 0)
         # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
         self.wait = partial(
             _sem_clockwait, address, time.CLOCK_MONOTONIC, ctypes.addressof(self._deadline)
         )
+
+    def close(self) -> None:
+        """Close it, both times."""
+        super().close()
+        _sem_close(self._address)
 
     def bind(self, deadline_ns: int) -> None:
         """Let waits end at that time, CLOCK_MONOTONIC."""
@@ -122,6 +129,12 @@ def open_all(layout: Layout) -> None:
     """Open every semaphore of a rack in this process."""
     for name in names(layout):
         _OPEN[name] = Semaphore(name)
+
+
+def close_all() -> None:
+    """Close every semaphore that is open in this process."""
+    while _OPEN:
+        _OPEN.popitem()[1].close()
 
 
 def unlink(layout: Layout, kept: Sequence[str] = ()) -> None:

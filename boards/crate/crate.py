@@ -37,6 +37,8 @@ from rack.boards.crate.requests import (
     Forked,
     ForkFailed,
     HogWiring,
+    Leave,
+    Left,
     Open,
     Opened,
     PowerOff,
@@ -48,7 +50,7 @@ from rack.boards.crate.requests import (
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
 from rack.boards.run.board import enter, run_clock_board, run_task_board
-from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
+from rack.boards.wiring import KEEPING, ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
@@ -101,6 +103,9 @@ class Crate:
                 elif fd == self._launcher or (request := received(self._line)) is None:
                     self._leave()
                     return
+                elif isinstance(request, Leave):
+                    self._leave_for_another()
+                    break
                 else:
                     self._serve(request)
 
@@ -115,6 +120,9 @@ class Crate:
                 set_priority(priority)
                 self._line.send(Opened())
             case PowerOn(name, TaskWiring() as task):
+                if task.keeping is not None:
+                    # Here, once for all boards.
+                    import_module(KEEPING)
                 self._fork(name, lambda segment: run_task_board(segment, task, self._attention))
             case PowerOn(name, ClockWiring() as clock):
                 self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
@@ -268,6 +276,23 @@ class Crate:
         self._kill()
         while self._boards:
             self._reap_ended(None)
+
+    def _leave_for_another(self) -> None:
+        """Leave this rack, and wait for the requests of another one."""
+        self._leave()
+        for output in self._outputs.values():
+            output.close()
+        self._outputs.clear()
+        self._resting.clear()
+        if hasattr(self, "_segment"):
+            self._segment.close()
+            del self._segment
+        semaphores.close_all()
+        self._poll.register(self._line, select.POLLIN)
+        self._poll.register(self._launcher, select.POLLIN)
+        # A Rack that is gone is noticed next.
+        with suppress(OSError):
+            self._line.send(Left())
 
     def _reap_ended(self, timeout_ms: int | None) -> None:
         for pidfd, _ in self._poll.poll(timeout_ms):

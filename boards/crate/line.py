@@ -11,12 +11,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Self
 
 from rack.boards.crate.output import lines_of
+from rack.boards.crate.requests import Leave, Left
 from rack.boards.errors import LaunchError
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -28,6 +30,8 @@ SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
 It selects one by processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's
 `math` call them. Boards use the version without, which runs on every processor. The choice is made
 at process start, so it must be in the environment."""
+LEAVE_S = 10.0
+"""Longest time that a crate takes to leave a rack: it may still be importing."""
 NO_WINDOWS = {"MUJOCO_GL": "disable"}
 """Neither boards nor Rack draw: without this, importing MuJoCo also starts a process that looks for
 OpenGL."""
@@ -114,6 +118,42 @@ class CrateLine:
             self._process.wait()
         os.close(self.attention)
         os.close(self._printed)
+
+
+class WarmCrate(CrateLine):
+    """A crate for several racks, one after the other: what it has imported and compiled stays.
+
+    A Rack that closes it makes it leave the rack. Its owner ends it, or the context does.
+    `is_over`: it was ended, or did not leave a rack in time, and serves no more.
+    """
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it serves no more racks."""
+        return self._is_closed
+
+    def close(self, timeout_s: float) -> None:
+        """Have it end the boards of the rack, and wait until none is left."""
+        if self._is_closed:
+            return
+        self.ask(Leave())
+        deadline = time.monotonic() + LEAVE_S
+        answer: object = self
+        while answer is not None and self.line.poll(max(0.0, deadline - time.monotonic())):
+            answer = self.receive()
+            if isinstance(answer, Left):
+                self.printed()
+                with suppress(BlockingIOError):
+                    os.eventfd_read(self.attention)
+                return
+        self.end()
+
+    def end(self) -> None:
+        """End the crate."""
+        super().close(0)
 
 
 def environment() -> dict[str, str]:

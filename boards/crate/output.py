@@ -33,6 +33,11 @@ class HostOutput:
         self.reader, self.writer = os.pipe()
         os.set_blocking(self.reader, False)
 
+    def close(self) -> None:
+        """Close the pipe."""
+        os.close(self.reader)
+        os.close(self.writer)
+
     def pass_on(self, is_over: bool = False) -> None:
         """Pass on what has come; say what was dropped each time that it has doubled, and when the
         board `is_over`."""

@@ -6,7 +6,7 @@ import atexit
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
@@ -222,6 +222,11 @@ class Rack:
         desk = OperatorTable(self.segment)
         for wanted in (*self._plan.commands[before.commands :], *self._requests):
             desk.add(wanted)
+
+    def follow(self, events: Iterable[Event]) -> None:
+        """Take over the events of the run that this one continues, from before its checkpoint: the
+        outcome counts them."""
+        self._journal.events.extend(events)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until

@@ -73,6 +73,16 @@ class PowerOff:
 
 
 @dataclass(frozen=True)
+class Leave:
+    """End the boards of this rack, and wait for another one's requests."""
+
+
+@dataclass(frozen=True)
+class Left:
+    """Answer to `Leave`: no board is left."""
+
+
+@dataclass(frozen=True)
 class Preloading:
     """The crate begins to preload a class."""
 

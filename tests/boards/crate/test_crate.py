@@ -12,10 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.crate.line import CrateLine, received
+from rack.backplane.segment import SHM_FOLDER
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.boards.crate import line as crate_line
+from rack.boards.crate.line import CrateLine, WarmCrate, received
 from rack.boards.crate.requests import Preload, Preloading
 from rack.boards.errors import LaunchError
-from tests.processes import descriptors, runs, wait_until
+from tests.processes import children_of, descriptors, runs, wait_until
 
 PATH = (*sys.path, str(Path(__file__).parents[1]))
 
@@ -95,3 +99,77 @@ def test_the_crate_ignores_an_interrupt_from_the_terminal() -> None:
     line.close(20.0)
     # Killed by the interrupt, it would have another status.
     assert line._process.returncode == 0
+
+
+@pytest.fixture
+def warm() -> Iterator[WarmCrate]:
+    with WarmCrate() as crate:
+        yield crate
+
+
+@pytest.mark.slow
+def test_a_warm_crate_serves_racks_one_after_the_other_and_keeps_nothing_of_them(
+    small: Path, rack_name: str, warm: WarmCrate
+) -> None:
+    config = load(small, [f"name={rack_name}"])
+    with Rack(config) as cold:
+        expected = cold.run(0.5)
+    held = []
+    for name in (rack_name, rack_name, f"{rack_name}-2"):
+        with Rack(config.model_copy(update={"name": name}), crate=warm) as rack:
+            assert rack.run(0.5).digest == expected.digest
+        assert not [path for path in SHM_FOLDER.iterdir() if rack_name in path.name]
+        assert not children_of(warm.pid)
+        mapped = Path(f"/proc/{warm.pid}/maps").read_text()
+        assert rack_name not in mapped
+        held.append(len(list(Path(f"/proc/{warm.pid}/fd").iterdir())))
+    assert len(set(held)) == 1
+    assert not warm.is_over
+    warm.end()
+    assert warm.is_over
+    assert not runs(warm.pid)
+
+
+@pytest.mark.slow
+def test_a_warm_crate_that_is_killed_is_seen_and_over(
+    small: Path, rack_name: str, warm: WarmCrate
+) -> None:
+    with Rack(load(small, [f"name={rack_name}"]), crate=warm) as rack:
+        rack.start()
+        os.kill(warm.pid, signal.SIGKILL)
+        wait_until(lambda: not rack.watch(0.05))
+        assert rack.outcome is not None
+        assert rack.outcome.faults == ("the crate ended, and all boards with it",)
+    assert warm.is_over
+    assert not [path for path in SHM_FOLDER.iterdir() if rack_name in path.name]
+
+
+@pytest.mark.slow
+def test_a_warm_crate_serves_on_after_a_rack_that_was_refused(
+    small: Path, rack_name: str, warm: WarmCrate
+) -> None:
+    faulty = load(small, [f"name={rack_name}", 'fault=[{kind="self-test", board="lower"}]'])
+    with pytest.raises(LaunchError, match="self-test failed"):
+        Rack(faulty, crate=warm).launch()
+    with Rack(load(small, [f"name={rack_name}"]), crate=warm) as rack:
+        assert rack.run(0.2).worked
+        # Of the rack before nothing is printed.
+        assert not [event for event in rack.events if event.kind == "printed"]
+
+
+def test_a_warm_crate_that_does_not_leave_a_rack_is_ended(
+    warm: WarmCrate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(crate_line, "LEAVE_S", 0.05)
+    os.kill(warm.pid, signal.SIGSTOP)
+    warm.close(0.0)
+    assert warm.is_over
+    assert not runs(warm.pid)
+
+
+@pytest.mark.slow
+def test_a_warm_crate_ends_with_its_launcher(warm: WarmCrate) -> None:
+    warm.close(0.0)
+    assert not warm.is_over
+    warm.line.close()
+    wait_until(lambda: not runs(warm.pid))
