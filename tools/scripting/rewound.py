@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rack.boards.config.resolved import classes
-from rack.boards.crate.line import CrateLine
+from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import cell_of
 from rack.boards.crate.requests import Preload
 from rack.boards.events import Event
@@ -44,7 +44,7 @@ class Glance:
 
 
 class RewoundRun:
-    """A run, and the `tick` at which one looks at it. Use it as a context: it keeps a crate ready,
+    """A run, and the `tick` at which one looks at it. Use it as a context: it keeps a crate warm,
     from which boards are forked."""
 
     def __init__(self, folder: Path) -> None:
@@ -57,22 +57,24 @@ class RewoundRun:
         self._boxes = {box.name: box for box in self._layout.timed}
         self._tasks = [task.name for task in self._layout.tasks]
         self._levels: tuple[int, Mapping[str, dict[str, Any]]] = -1, {}
-        self._crate: CrateLine | None = None
+        self._crate: WarmCrate | None = None
 
     def __enter__(self) -> Self:
-        self._prepare()
+        self._ready()
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._crate is not None:
-            self._crate.close(0)
+            self._crate.end()
 
-    def _prepare(self) -> None:
-        """Start the next crate: it imports while the user reads and types."""
-        config = self.recording.rack_config
-        self._crate = CrateLine()
-        path = (*sys.path, *map(str, config.python_path))
-        self._crate.ask(Preload(classes(config), path, cell_of(config)))
+    def _ready(self) -> WarmCrate:
+        """Return the crate. One that has just been started imports while the user types."""
+        if self._crate is None or self._crate.is_over:
+            config = self.recording.rack_config
+            self._crate = WarmCrate()
+            path = (*sys.path, *map(str, config.python_path))
+            self._crate.ask(Preload(classes(config), path, cell_of(config)))
+        return self._crate
 
     @property
     def names(self) -> list[str]:
@@ -143,16 +145,8 @@ class RewoundRun:
     def _level(self, task: str) -> Glance:
         tick, levels = self._levels
         if tick != self.tick:
-            crate = self._crate
-            # The rack that is given it closes it.
-            self._crate = None
             moment = RecordedMoment(self.recording, self._in_force, self.tick)
-            try:
-                levels = moment.levels(crate)
-            finally:
-                if crate is not None:
-                    crate.close(0)
-                self._prepare()
+            levels = moment.levels(self._ready())
             self._levels = self.tick, levels
         rows = [[name, cell(value)] for name, value in _flat(levels[task])]
         return self._shown(
