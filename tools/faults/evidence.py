@@ -3,6 +3,7 @@ to it."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -62,10 +63,14 @@ class Detection:
         return self.bound is None or self.delay <= self.bound
 
     @property
-    def order(self) -> tuple[bool, int, float]:
+    def order(self) -> tuple[bool, int, float, float, str]:
         """Key by which the best of several detections comes first: one within its bound, then the
-        earliest."""
-        return not self.is_within, self.delay, self.delay_ms or 0.0
+        earliest, then that of the tightest bound, then by board.
+
+        In lockstep boards find a fault in the same tick, in an order that is chance.
+        """
+        bound = math.inf if self.bound is None else self.bound
+        return not self.is_within, self.delay, self.delay_ms or 0.0, bound, self.event.board
 
 
 def fits(event: Event, strike: Strike) -> bool:
