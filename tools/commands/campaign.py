@@ -77,6 +77,13 @@ Seconds = Annotated[
         help="simulated seconds of a run, for a rack that no task ends",
     ),
 ]
+Whole = Annotated[
+    bool,
+    typer.Option(
+        "--whole",
+        help="run each trial from its beginning; default: from a checkpoint before its first fault",
+    ),
+]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -98,13 +105,16 @@ def campaign(
     sizes: Sizes = None,
     seconds: Seconds = None,
     settings: Settings = [],  # noqa: B006  typer copies it
+    whole: Whole = False,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """Inject random faults of all kinds into runs of a rack, and judge each of them.
 
     Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one
-    after the other. There are also runs without faults, in real time, alone and under load. The
+    after the other. Until its first fault a trial is the faultless run: in lockstep it starts at a
+    checkpoint of that, with the verdict of a whole trial; --json says which could not, and why.
+    There are also runs without faults, in real time, alone and under load. The
     same --out continues an interrupted campaign.
 
     Exit status: 0 the campaign passed; 1 a fault did not strike, or was not found, reacted to and
@@ -169,7 +179,7 @@ def campaign(
     folder = out if out is not None and goes_on else folder_of(out, "campaign")
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder)):
         with progress_for(silent=as_json) as progress:
-            work = Campaign(order, folder, progress)
+            work = Campaign(order, folder, progress, whole)
             results = work.run()
         report, text = _write(work, results, time.monotonic() - started)
     lacking = "" if can_draw() else f"; {NO_PICTURES}"

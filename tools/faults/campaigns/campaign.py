@@ -18,6 +18,7 @@ from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
+from rack.tools.faults.campaigns.base import BaseRun
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
 from rack.tools.faults.campaigns.environment import examine, load
 from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
@@ -34,7 +35,10 @@ ROUNDS = 8
 """Draws of a fault that does not strike, each at another instant; then it is missing."""
 ORDER = "order.json"
 TRIALS = "trials"
-"""In a campaign's folder: the file with its order, and the folder of its trials."""
+BASE = "base"
+"""In a campaign's folder: the file with its order, the folder of its trials, and, while it goes on,
+that of the run from which they continue."""
+NOMINAL = Plan(0, "nominal", lockstep=True)
 
 
 @dataclass(frozen=True)
@@ -64,10 +68,10 @@ class Order:
 
 
 class Campaign:
-    """One campaign. Raises `ConfigError`, and `Failure` for a task that is not done even without
-    faults."""
+    """One campaign; with `whole`, no trial starts at a checkpoint. Raises `ConfigError`, and
+    `Failure` for a task that is not done even without faults."""
 
-    def __init__(self, order: Order, folder: Path, progress: Progress) -> None:
+    def __init__(self, order: Order, folder: Path, progress: Progress, whole: bool = False) -> None:
         self.order = order
         self.folder = folder
         self._progress = progress
@@ -79,15 +83,18 @@ class Campaign:
         self.kinds = kinds_for(order.kinds, self._targets, False in order.modes)
         self._ticks = 0
         self._number = 0
+        self._base = None if whole else BaseRun(self._config, folder / BASE)
+        self._has_base = False
 
     def run(self) -> Results:
         """Do everything that is not done yet, or as much as there is time for until Ctrl-C."""
         order = self.order
         self._open()
         examine(self._config)
-        with Workers(self._config) as self._workers:
+        base = None if self._base is None else self._base.folder
+        with self._base or nullcontext(), Workers(self._config, base) as self._workers:
             self._progress.begin("without faults, in lockstep")
-            made = self._made([Plan(0, "nominal", lockstep=True)])
+            made = self._made([NOMINAL])
             if not made:
                 raise Failure(f"{order.name}: interrupted before the first run was done")
             nominal = made[0]
@@ -163,9 +170,18 @@ class Campaign:
             if waiting:
                 mode = "lockstep" if lockstep else "real time"
                 self._progress.begin(f"{len(waiting)} in {mode}")
+            if waiting and lockstep:
+                self._make_base(waiting)
             for job in self._workers.run(waiting, alone=not lockstep):
                 self._show(job)
         return [found for job in jobs if (found := _kept(job))]
+
+    def _make_base(self, waiting: Sequence[TrialJob]) -> None:
+        """Make the run from which trials continue, once, unless it is among those that wait."""
+        if self._base is not None and not self._has_base and waiting[0].plan != NOMINAL:
+            job = replace(self._job(NOMINAL), path=self._base.folder / f"{NOMINAL.purpose}.json")
+            list(self._workers.run([job], alone=False))
+        self._has_base = True
 
     def _job(self, plan: Plan) -> TrialJob:
         name = f"{plan.number:04}" if plan.number else plan.purpose

@@ -48,6 +48,12 @@ class Plan:
         """The trial by its number; a run without one by its purpose."""
         return f"trial {self.number}" if self.number else f"{self.purpose} run"
 
+    @property
+    def first(self) -> int:
+        """The tick at which the first fault begins; 0 for one that prevents the launch."""
+        ticks = [table.get("tick", 0) for table in self.faults] + [kill.tick for kill in self.kills]
+        return min(ticks, default=0)
+
     def config(self, config: RackConfig, rack: str) -> RackConfig:
         """Return the config that runs this plan, as a rack of another name."""
         clock: dict[str, Any] = {"mode": "realtime"}

@@ -200,6 +200,10 @@ class CampaignReport:
         ended = self.results.ended
         ends = [f"{ended[name]} {name}" for name in get_args(Ended) if ended[name]]
         yield "trials ended", ", ".join(ends) or "none"
+        begun = [run for run in self.results.trials if run.start]
+        skipped_s = sum(run.start for run in begun) * self.clock_ms * 1e-3
+        spared = f"{len(begun)} trials, {skipped_s:.0f} simulated s of the faultless run"
+        yield "continued from a checkpoint", spared
         yield "limits violated", f"{summary.limits_violated} (in any substep of any run)"
         yield "touches", summary.touches
         yield "left behind", f"{summary.left_behind} (processes, segments)"
@@ -264,6 +268,8 @@ def _trial(run: TrialResult) -> dict[str, Any]:
         "lockstep": run.plan.lockstep,
         "faults": len(run.faults),
         "ended": run.ended,
+        "from_tick": run.start,
+        "whole": run.whole,
         "wall_s": round(run.wall_s, 1),
         "shortfalls": list(run.shortfalls),
     }

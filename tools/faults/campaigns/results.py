@@ -27,7 +27,8 @@ class TrialResult:
 
     `ended`: how the task ended; safely: with the arm at rest and no limit violated. `misses`: their
     number by code; `stray_misses`: those that no fault explains. `unexplained`: false detections.
-    `shortfalls`: a line each; none in a good trial.
+    `shortfalls`: a line each; none in a good trial. `start`: the tick of the checkpoint from which
+    it was run, or 0, and then `whole` says why.
     """
 
     plan: Plan
@@ -44,6 +45,8 @@ class TrialResult:
     faults: tuple[Judgement, ...]
     unexplained: tuple[Event, ...]
     shortfalls: tuple[str, ...]
+    start: int = 0
+    whole: str = ""
 
 
 def result_of(trial: Trial) -> TrialResult:
@@ -67,6 +70,8 @@ def result_of(trial: Trial) -> TrialResult:
         faults=verdict.faults,
         unexplained=verdict.unexplained,
         shortfalls=_shortfalls(trial, verdict, ended),
+        start=trial.start.tick,
+        whole=trial.start.whole,
     )
 
 

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
@@ -16,8 +16,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import BoardError, ConfigError
+from rack.boards.crate.line import WarmCrate
+from rack.boards.errors import BoardError, CheckpointError, ConfigError
 from rack.boards.events import Event, Outcome
+from rack.tools.faults.campaigns.base import BaseRun, Start
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import (
@@ -130,6 +132,7 @@ class Trial:
     `again`: how a run without its faults ended, right after it was refused. `left` is everything
     that it left behind. `levels` holds the last state of each level; `is_late`: one gave up because
     it could not meet a time. `run`: what the judge must know of it; None where it was refused.
+    `events` are those of a whole run, wherever it has its `start`.
     """
 
     plan: Plan
@@ -144,19 +147,29 @@ class Trial:
     levels: str = ""
     is_late: bool = False
     again: Outcome | None = None
+    start: Start = field(default_factory=Start)
 
 
 def run_trial(
-    config: RackConfig, plan: Plan, rack_name: str, ticks: int, seconds: float | None
+    config: RackConfig,
+    plan: Plan,
+    rack_name: str,
+    ticks: int,
+    seconds: float | None,
+    *,
+    base: BaseRun | None = None,
+    crate: WarmCrate | None = None,
 ) -> Trial:
     """Run a plan, and return its outcome, events and strikes.
 
     `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task
-    ends. Raises `ConfigError` for a plan that does not fit the config.
+    ends. It starts at a checkpoint of `base` if it can. A `crate` saves time, as for a `Rack`.
+    Raises `ConfigError` for a plan that does not fit the config.
     """
+    start = Start(whole="as asked") if base is None else base.start_of(plan)
     before = children()
     started = time.monotonic()
-    rack = Rack(plan.config(config, rack_name))
+    rack = Rack(plan.config(config, rack_name), crate=crate, keeping=start.keeping)
     refused = ""
     levels = ""
     late = False
@@ -164,6 +177,7 @@ def run_trial(
     found: tuple[Strike, ...] = ()
     try:
         with rack:
+            rack.follow(start.events)
             killer = Killer(rack.segment, plan.kills)
             _watch(rack, killer, ticks, seconds)
             joints = config.robot.joints if config.robot is not None else ()
@@ -173,6 +187,11 @@ def run_trial(
             late = is_late(rack.segment)
     except ConfigError:
         raise
+    except CheckpointError as error:
+        if base is None or not start.tick:
+            raise
+        base.give_up(str(error))
+        return run_trial(config, plan, rack_name, ticks, seconds, base=base, crate=crate)
     except (BackplaneError, BoardError) as error:
         refused = str(error)
     again = None
@@ -187,7 +206,8 @@ def run_trial(
             moving=tuple(motion.body for motion in config.scene.motion),
         )
     elif plan.faults:
-        again = run_trial(config, replace(plan, faults=()), rack_name, ticks, AGAIN_S).outcome
+        sound = replace(plan, faults=())
+        again = run_trial(config, sound, rack_name, ticks, AGAIN_S, crate=crate).outcome
     return Trial(
         plan=plan,
         run=run,
@@ -201,6 +221,7 @@ def run_trial(
         levels=levels,
         is_late=late,
         again=again,
+        start=start,
     )
 
 

@@ -19,8 +19,10 @@ from typing import Any
 
 from rack.backplane.process import die_with_parent
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import WarmCrate
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.faults.campaigns.base import BaseRun
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.results import keep
 from rack.tools.faults.campaigns.trial import run_trial
@@ -42,10 +44,13 @@ class TrialJob:
 
 class Workers:
     """Processes that make trials. Use it as a context; they end with it, and with the process that
-    made it."""
+    made it.
 
-    def __init__(self, config: RackConfig) -> None:
-        self._config = config
+    `base`: the folder of the run from which trials go on.
+    """
+
+    def __init__(self, config: RackConfig, base: Path | None = None) -> None:
+        self._order = config, base
         self._cores = sorted(os.sched_getaffinity(0))
         self._lines: list[Connection] = []
         self._processes: list[subprocess.Popen[bytes]] = []
@@ -53,8 +58,10 @@ class Workers:
     def __enter__(self) -> Workers:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self._stop()
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None:
+            self._stop()
+        # Workers without a trial end with their lines, and with them their crates.
         for line in self._lines:
             line.close()
         for process in self._processes:
@@ -115,9 +122,33 @@ class Workers:
             )
             self._processes.append(process)
             there.close()
-            here.send(self._config)
+            here.send(self._order)
             self._lines.append(here)
         return self._lines[:count]
+
+
+class Crates:
+    """Keeps a crate for trials in lockstep. In real time each has its own: there a crate that has
+    served would be another machine."""
+
+    def __init__(self) -> None:
+        self._crate: WarmCrate | None = None
+
+    def __enter__(self) -> Crates:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._crate is not None:
+            self._crate.end()
+
+    def ready(self, lockstep: bool) -> WarmCrate | None:
+        """Return the crate for the next trial; None: the rack starts its own."""
+        if self._crate is not None and (self._crate.is_over or not lockstep):
+            self._crate.end()
+            self._crate = None
+        if lockstep and self._crate is None:
+            self._crate = WarmCrate()
+        return self._crate
 
 
 def main() -> None:
@@ -126,13 +157,20 @@ def main() -> None:
     line = Connection(int(sys.argv[1]))
     parent = int(sys.argv[2])
     die_with_parent(parent)
-    with suppress(EOFError):
-        config = line.recv()
+    with suppress(EOFError), Crates() as crates:
+        config, folder = line.recv()
+        base = None if folder is None else BaseRun(config, folder)
         while True:
             job, cores = line.recv()
             os.sched_setaffinity(0, cores)
+            crate = crates.ready(job.plan.lockstep)
             try:
-                trial = run_trial(config, job.plan, f"camp-{os.getpid()}x", job.ticks, job.seconds)
+                name = f"camp-{os.getpid()}x"
+                trial = run_trial(
+                    config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
+                )
+                if base is not None and job.plan.purpose == "nominal":
+                    base.keep(trial.events)
                 keep(trial, job.path)
             except Exception as error:  # whatever it is, the campaign must hear of it
                 line.send(f"{type(error).__name__}: {error}")

@@ -55,8 +55,12 @@ class Trials:
     def __init__(self, ends: Callable[[Plan], TrialResult]) -> None:
         self.ends = ends
         self.made: list[Plan] = []
+        self.base: Path | None = None
 
-    def __call__(self, config: object) -> Self:
+    def __call__(self, config: object, base: Path | None) -> Self:
+        self.base = base
+        # It is there for the trials.
+        assert base is None or base.is_dir()
         return self
 
     def __enter__(self) -> Self:
@@ -87,12 +91,13 @@ def make(
     config = load(small, [f"name={rack_name}"])
 
     def make_one(
-        ends: Callable[[Plan], TrialResult] = struck, **given: Any
+        ends: Callable[[Plan], TrialResult] = struck, whole: bool = False, **given: Any
     ) -> tuple[Campaign, Trials]:
         trials = Trials(ends)
         monkeypatch.setattr(module, "Workers", trials)
         order = Order(**{**ORDER, "config": config, "name": "small", **given})
-        return Campaign(order, tmp_path / "out", Progress()), trials  # type: ignore[arg-type]
+        campaign = Campaign(order, tmp_path / "out", Progress(), whole)  # type: ignore[arg-type]
+        return campaign, trials
 
     return make_one
 
@@ -148,7 +153,23 @@ def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
     path.write_text(json.dumps(found))
     third, once_more = make()
     third.run()
-    assert once_more.made == [trials.made[1]]
+    # What it goes on from is made again, too.
+    assert once_more.made == [trials.made[0], trials.made[1]]
+
+
+def test_trials_have_a_run_to_go_on_from_as_long_as_the_campaign_unless_they_are_whole(
+    make: MakeCampaign,
+) -> None:
+    campaign, trials = make()
+    campaign.run()
+    assert trials.base == campaign.folder.resolve() / module.BASE
+    assert not trials.base.exists()
+    # It is the same campaign, whichever way its trials are made.
+    whole, others = make(whole=True)
+    (whole.folder / "trials" / "0001.json").unlink()
+    whole.run()
+    assert others.base is None
+    assert others.made == [trials.made[1]]
 
 
 def test_a_folder_of_another_campaign_is_refused(make: MakeCampaign) -> None:
