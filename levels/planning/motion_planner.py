@@ -11,6 +11,7 @@ from rack.levels.messages import Error, Verb
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.planning import collision
 from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.fixed_jaw import find_fixed_jaw
 from rack.levels.planning.ik import SAME_RAD, InverseKinematics
 from rack.levels.planning.moves import VERB_NAMES, Move, Situation
 from rack.levels.planning.path_planner import MAX_SEARCHES, PathPlanner
@@ -53,6 +54,7 @@ class MotionPlanner:
         self.checker = CollisionChecker(cell, scene, MAX_STRAY_M)
         self.paths = PathPlanner(cell, scene.clearance, seed)
         self.payloads = Payloads(cell, scene.objects)
+        self.fixed_jaw = find_fixed_jaw(cell, self.payloads)
 
     def plan(
         self,

@@ -54,7 +54,7 @@ class Payloads:
         self._objects = [
             np.flatnonzero(model.body_rootid[model.geom_bodyid] == body) for body in cell.bodies
         ]
-        self._jaws = self._closing()
+        self.jaws = self._closing()
 
     def check_grip(self, row: int, grip: Pose) -> None:
         """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the
@@ -114,7 +114,7 @@ class Payloads:
     def _around(self, width: float) -> tuple[Jaws | None, Jaws | None]:
         """Return the last jaws wider than `width`, m, and the first that are not; None: there are
         no such jaws."""
-        for wide, narrow in zip(self._jaws, self._jaws[1:], strict=False):
+        for wide, narrow in zip(self.jaws, self.jaws[1:], strict=False):
             if wide.gap > width >= narrow.gap:
                 return wide, narrow
         return None, None
@@ -137,7 +137,6 @@ class Payloads:
     def _closing(self) -> list[Jaws]:
         """Return the jaws from open to closed, while there is a gap and a finger on either side."""
         cell = self._cell
-        data = self._data
         gripper = cell.gripper
         if gripper is None:
             return []
@@ -150,9 +149,18 @@ class Payloads:
             cell.gripper_geoms,
             np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
+        # A single finger closes on a jaw of the body that carries it.
+        return self._jaws_of(fingers, openings) or self._jaws_of(cell.gripper_geoms, openings)
+
+    def _jaws_of(self, fingers: NDArray[np.int_], openings: Array) -> list[Jaws]:
+        """Return the jaws that geoms make at these openings, while there are any."""
+        cell = self._cell
+        data = self._data
+        gripper = cell.gripper
+        assert gripper is not None, "there are openings"
         jaws: list[Jaws] = []
         for opening in openings:
-            linkage.set(data.qpos, float(opening))
+            gripper.linkage.set(data.qpos, float(opening))
             mujoco.mj_fwdPosition(cell.model, data)
             sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]

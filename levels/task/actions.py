@@ -148,7 +148,11 @@ class Handling(NamedTuple):
         start = self.start
         refusal: Refused | None = None
         is_taken = False
+        jaw = start.motion.fixed_jaw
+        seen = start.situation.object_pose(self.row)
         for tools in grasps(start.motion.cell, start.situation, self.row):
+            if jaw is not None:
+                tools = [jaw.beside(tool, self.row, seen) for tool in tools]
             takes = [
                 spot for tool in tools for spot in self._spots(tool, start.situation, grasps=True)
             ]

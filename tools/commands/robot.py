@@ -75,10 +75,10 @@ def new(
 
     What the model states is taken: the joints along the chain, their limits, torques of actuators
     or of a URDF's efforts, a keyframe. The rest is found (the tool, a home free of contact, the
-    gripper's drive and what follows it, bodies that always overlap) or guessed: each guess is
-    named here, in the file, and in [robot] guessed. Two blocks on a table are moved, or, without a
-    gripper that can, poses toured; the planner has rehearsed it. On a terminal it asks for what
-    no option says.
+    gripper's drive, what follows it or the jaw it closes on, bodies that always overlap) or
+    guessed: each guess is named here, in the file, and in [robot] guessed. Two blocks on a table
+    are moved, or, without a gripper that can, poses toured; the planner has rehearsed it. On a
+    terminal it asks for what no option says.
 
     Exit status: 0 written; 2 nothing can be made of the model, and nothing is written.
 
@@ -114,7 +114,8 @@ def check(model: ModelOrConfig, out: Picture = None, as_json: Json = False) -> N
 
     Of a config its arm, of a model file the arm that `rack robot new` would make of it: axes,
     limits, reach, payload at the edge of its reach, contacts at home, bodies that nothing holds,
-    actuators by kind, coupling of the gripper, natural frequency, objects that fall without end.
+    actuators by kind, coupling of the gripper, one finger or two, natural frequency, objects that
+    fall without end.
 
     Exit status: 0 all is well; 1 something fails; 2 nothing can be made of it.
 

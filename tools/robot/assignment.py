@@ -14,24 +14,24 @@ import numpy as np
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import Refused, RobotError
-from rack.levels.planning.ik import InverseKinematics
+from rack.levels.planning.ik import MAX_RESTARTS, InverseKinematics
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import pointing, pose
 from rack.levels.robot.abilities import Statics
 from rack.levels.robot.cell import Cell, check_start
 from rack.levels.tables import SceneConfig
-from rack.levels.task.actions import rehearse
-from rack.levels.task.grasps import QUARTERS
+from rack.levels.task.actions import LEANING_RESTARTS, rehearse
+from rack.levels.task.grasps import FULL_ORIENTATION, QUARTERS
 from rack.levels.task.program import DOWN, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, poses
-from rack.tools.robot.gripper import Fingertips
+from rack.tools.robot.fingertips import Fingertips
 
 SEED = 1990
 """That of `nasrem`."""
 HEIGHTS = (0.05, 0.2, -0.1, 0.4, 0.6)
-DISTANCES = (0.55, 0.7, 0.42)
+DISTANCES = (0.55, 0.7, 0.42, 0.34)
 FRONTS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Tables that are tried: height over the base and distance of the middle in parts of the reach;
 direction, rad."""
@@ -40,7 +40,7 @@ SPOTS = ((-0.04, -0.1), (0.04, -0.26), (-0.04, 0.1), (0.04, 0.26))
 TABLES = 4
 """Tables on which the whole task is rehearsed, at most."""
 SEARCH_S = 15.0
-"""Time for that, about: then a tour has to do."""
+"""Processor time for that, about: then a tour has to do."""
 STOPS = 4
 """Poses of a tour."""
 OBJECTS = ("block1", "block2")
@@ -85,7 +85,7 @@ def lay_out(made: Draft) -> Assignment:
 
 def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
     cell = made.cell()
-    width = min(0.5 * jaws.width, MOST_BLOCK_M)
+    width = min(jaws.block, MOST_BLOCK_M)
     # The tool is in the middle of a block that stands, its fingers clear of the table.
     clear = CLEAR_M + LOOSE_M * bool(made.table["gripper"].follow)
     half = 0.5 * np.array([width, width, max(width, 2.0 * (jaws.below + clear))])
@@ -111,7 +111,7 @@ def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
         ]
         actions.append({"do": "home"})
         try:
-            made.search_home(scene)
+            made.search_home(scene, [np.array(action["to"]) for action in actions[:-1]])
             _rehearse(made, scene, actions)
             return Assignment(scene, actions, "a table, two blocks to move")
         except (Refused, RobotError) as refused:
@@ -140,9 +140,9 @@ def _base(cell: Cell) -> Array:
 
 def _spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
     base = _base(cell)
-    end = time.monotonic() + SEARCH_S
+    end = time.process_time() + SEARCH_S
     for height, distance, front in itertools.product(HEIGHTS, DISTANCES, FRONTS):
-        if time.monotonic() > end:
+        if time.process_time() > end:
             return
         out = np.array([np.cos(front), np.sin(front)])
         side = np.array([-out[1], out[0]])
@@ -154,14 +154,15 @@ def _spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
 def _serves(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
     """Say whether the tool comes down to every place."""
     ik = InverseKinematics(cell, SEED)
+    # Of fewer joints one has to be chosen less luckily.
+    restarts = MAX_RESTARTS if len(cell.qpos) >= FULL_ORIENTATION else LEANING_RESTARTS
 
     def is_reached(place: Array) -> bool:
         for quarter in QUARTERS:
             turned = pointing(DOWN, -(spot.front + 0.5 * np.pi * quarter))
             low = pose([*place, spot.top + half], turned)
-            if any(
-                ik.nearby(low, q) is not None for q in ik.reachable(low.raised(lift), cell.home)
-            ):
+            above = ik.reachable(low.raised(lift), cell.home, restarts=restarts)
+            if any(ik.nearby(low, q) is not None for q in above):
                 return True
         return False
 
@@ -189,12 +190,17 @@ def _furnish(
         geom.group = spec.compiler.inertiagrouprange[0]  # of others no inertia is inferred
         geom.condim = 4
         geom.friction[:] = [1.0, 0.02, 0.001]
-        geom.solref[:] = [0.004, 1.0]
+        # As stiff with any finger: the mean with MuJoCo's 20 ms lets what is carried drift.
+        geom.priority = 1
+        geom.solref[:] = [0.002, 1.0]
         geom.solimp[:3] = [0.95, 0.99, 0.001]
         added.append(block)
-    for body in added:
-        # The model's own defaults may say otherwise.
-        body.geoms[0].contype = body.geoms[0].conaffinity = 1
+    bits = 1
+    for geom in spec.geoms:
+        bits |= geom.contype | geom.conaffinity
+    # The model's own defaults may say otherwise; blocks touch pads that touch nothing else, too.
+    for body, own in zip(added, (1, bits, bits), strict=True):
+        body.geoms[0].contype = body.geoms[0].conaffinity = own
     return added
 
 

@@ -23,7 +23,9 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
 from rack.levels.tables import RobotConfig, SceneConfig
 from rack.tools.robot.arm import ArmParts, find_arm, hold
-from rack.tools.robot.gripper import Fingertips, find_fingertips, fit_fingers, tool_outward
+from rack.tools.robot.fingertips import Fingertips, find_fingertips, tool_outward
+from rack.tools.robot.gripper import fit_fingers
+from rack.tools.robot.pieces import cut_meshes
 from rack.tools.robot.source import Source, copy_model
 
 CLOCK_NS = 2_500_000
@@ -102,9 +104,16 @@ class Draft:
         self.spec = load_spec(self.model)
         return left
 
-    def search_home(self, scene: SceneConfig = NOTHING) -> None:
-        """Set home to a free pose in which the arm carries itself. Raises `RobotError`."""
-        self.table["home"], guess = _home(self.cell(scene), scene, self.starts, self.wanted.home)
+    def search_home(self, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> None:
+        """Set home to a pose in which the arm carries itself, free before and after the objects of
+        the scene are at their `ends`, m. Raises `RobotError`."""
+        cell = self.cell(scene)
+        data = cell.start()
+        checkers = [CollisionChecker(cell, scene)]
+        if ends:
+            checkers.append(CollisionChecker(cell, scene))
+            checkers[1].place(np.array(ends), data.xquat[cell.bodies])
+        self.table["home"], guess = _home(cell, checkers, self.starts, self.wanted.home)
         self.guessed.pop("home", None)
         if guess:
             self.guessed["home"] = guess
@@ -190,7 +199,14 @@ def _add_gripper(made: Draft) -> None:
         config, guess = fit_fingers(made.spec, compile_spec(made.spec, made.model), arm, wanted)
         made.table["gripper"] = config
         made.write_model()
-        jaws = find_fingertips(made.cell(), arm.tip)
+        cell = made.cell()
+        jaws = find_fingertips(cell, arm.tip)
+        if jaws.is_one:
+            pieces = cut_meshes(made.spec, cell, jaws.out)
+            why = f"; their meshes are cut to {pieces} convex pieces" if pieces else ""
+            made.notes.append(f"one finger closes on a fixed jaw{why}")
+            made.write_model()
+            jaws = find_fingertips(made.cell(), arm.tip, is_one=True)
         config = config.model_copy(update={"open": round(jaws.opening, 5)})
         made.table["gripper"] = config
         cell = made.cell()
@@ -211,7 +227,8 @@ def _add_gripper(made: Draft) -> None:
     made.jaws = jaws
     if not made.wanted.tool:
         made.table |= {"tool": arm.tip, "tool_offset": jaws.tool}
-        made.guessed["tool"] = "between the fingers, z out of the hand, y across"
+        sides = "finger and fixed jaw" if jaws.is_one else "the fingers"
+        made.guessed["tool"] = f"between {sides}, z out of the hand, y across"
 
 
 def _exclude(made: Draft) -> None:
@@ -286,17 +303,19 @@ def _rounded(values: Array) -> list[float]:
 
 
 def _home(
-    cell: Cell, scene: SceneConfig, starts: Mapping[str, Array], wanted: str
+    cell: Cell, checkers: Sequence[CollisionChecker], starts: Mapping[str, Array], wanted: str
 ) -> tuple[list[float], str]:
     """Return home, and why if it is a guess: a keyframe that serves, or the best pose that does.
     Raises `RobotError`."""
-    checker = CollisionChecker(cell, scene)
+    first, *later = checkers
     statics = Statics(cell)
     low, high = cell.limits.position.T
 
     def left(q: Array) -> float:
         """Return the part of the torques that gravity leaves; negative: the pose does not serve."""
-        if not (np.all(q >= low) and np.all(q <= high) and checker.free(q, 0.0)):
+        if not (np.all(q >= low) and np.all(q <= high) and first.free(q, 0.0)):
+            return -1.0
+        if not all(checker.free(q) for checker in later):
             return -1.0
         return float(statics.held(q)[0].min()) - LEAST_PART
 
@@ -317,7 +336,7 @@ def _home(
 
     def rating(q: Array) -> float:
         is_near = bool(touching(cell, data, q, APART_M))
-        return left(q) + _downward(checker, cell, q) - 2.0 * is_near
+        return left(q) + _downward(first, cell, q) - 2.0 * is_near
 
     found = [(rating(q), q) for q in poses(cell) if left(q) > 0]
     if not found:

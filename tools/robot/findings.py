@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 
 from rack.levels.errors import RobotError
+from rack.levels.planning.fixed_jaw import find_fixed_jaw
+from rack.levels.planning.payload import Payloads
 from rack.levels.robot.abilities import Abilities, Statics, abilities
 from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
 from rack.levels.robot.model import load_spec
@@ -45,7 +47,7 @@ def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
     """Examine an arm in its cell; contacts at home are found, not refused. Raises `RobotError`."""
     cell = unchecked_cell(robot, scene, clock_ns)
     able = abilities(cell)
-    findings = list(_findings(cell, robot, able))
+    findings = list(_findings(cell, robot, scene, able))
     return Examined(cell, list(_joints(cell, robot)), able, findings)
 
 
@@ -66,7 +68,9 @@ def _joints(cell: Cell, robot: RobotConfig) -> Iterator[dict[str, Any]]:
         }
 
 
-def _findings(cell: Cell, robot: RobotConfig, able: Abilities) -> Iterator[Observation]:
+def _findings(
+    cell: Cell, robot: RobotConfig, scene: SceneConfig, able: Abilities
+) -> Iterator[Observation]:
     model = cell.model
     data = cell.start()
     low, high = cell.limits.position.T
@@ -94,6 +98,7 @@ def _findings(cell: Cell, robot: RobotConfig, able: Abilities) -> Iterator[Obser
     if robot.gripper is not None:
         why = _elsewhere(cell, robot.gripper)
         yield Observation("coupling", why or "fingers settle where planning poses them", bool(why))
+        yield Observation("fingers", _facing(cell, scene), False)
     turn, spring = _fastest(cell)
     needed = int(np.ceil(robot.substeps * turn / MOST_TURN)) or 1
     text = f"{spring:.3g} Hz at most; {needed} of {robot.substeps} substeps are enough"
@@ -111,6 +116,17 @@ def _kind(actuator: mujoco.MjsActuator) -> str:
     if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
         return "motor"
     return "position" if actuator.biasprm[1] else "velocity"
+
+
+def _facing(cell: Cell, scene: SceneConfig) -> str:
+    """Return what closes at the tool, and how far it opens there."""
+    payloads = Payloads(cell, scene.objects)
+    if not payloads.jaws:
+        return "none on both sides of the tool, along its y axis"
+    sides = "fingers on both sides"
+    if find_fixed_jaw(cell, payloads) is not None:
+        sides = "one finger, which closes on a fixed jaw"
+    return f"{sides}; {1e3 * payloads.jaws[0].gap:.0f} mm open at the tool"
 
 
 def _elsewhere(cell: Cell, config: GripperConfig) -> str:

@@ -1,5 +1,4 @@
-"""The gripper that an arm carries: one joint drives it, the others follow; the tool between its
-fingers."""
+"""The gripper that an arm carries: one joint drives it, the others follow."""
 
 from __future__ import annotations
 
@@ -10,10 +9,9 @@ import numpy as np
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import RobotError
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
 from rack.levels.robot.model import JOINT_DRIVES, add_motor, listed, remove, stated_torque
-from rack.levels.tables import FollowConfig, GripperConfig, ToolConfig
+from rack.levels.tables import FollowConfig, GripperConfig
 from rack.tools.robot.arm import ArmParts
 
 MOTOR = "gripper"
@@ -27,21 +25,6 @@ SIDEWAYS = 0.5
 """Cosine between a finger's motion and the way to the others below which it does not close."""
 ROUNDING = 1e-9
 """In the Jacobian of an equality."""
-STEP_M = 0.0025
-"""Spacing of the places between the fingers that are tried."""
-FROM_TIP_M = 0.012
-"""Depth of the tool's origin between the fingers."""
-LEAST_GAP_M = 0.012
-"""A gripper that opens less has no use for a block."""
-NEARLY = 0.6
-"""Part of the way to closed, near enough to tell where the fingers will meet."""
-LEAST_WAY_M = 1e-4
-SEEN = np.array([0, 1, 0, 0, 0, 0], dtype=np.uint8)
-"""Groups of geoms, for rays: the second."""
-ASIDE_M = (0.0, 0.01, -0.01, 0.02, -0.02)
-"""Where a ray between the fingers starts, besides the middle: the two of three leave a gap."""
-ALIGNED = 0.98
-"""Cosine above which a direction is that of the body's axis."""
 
 
 class _Finger(NamedTuple):
@@ -188,133 +171,3 @@ def _ratio(
     ratio = (own.closed - own.open) / (lead.closed - lead.open)
     is_same = model.joint(driven).type == model.joint(name).type
     return float(np.sign(ratio)) if is_same else round(ratio, 5)
-
-
-class Fingertips(NamedTuple):
-    """What two fingers can take."""
-
-    tool: ToolConfig  # z out of the hand, y across
-    opening: float  # m or rad: the widest at which they face each other
-    width: float  # between them there, m
-    below: float  # how far they reach beyond the tool, m
-
-
-def find_fingertips(cell: Cell, tip: str) -> Fingertips:
-    """Return what the gripper can take, by rays between its fingers. Raises `RobotError` where they
-    do not close on each other, or not on a block."""
-    model = cell.model
-    data = cell.start()
-    gripper = cell.gripper
-    assert gripper is not None, "there are fingers"
-    solid = (model.geom_contype | model.geom_conaffinity) != 0
-    geoms = cell.gripper_geoms[solid[cell.gripper_geoms]]
-    # Of the gripper, rays see what is solid, of the rest nothing.
-    model.geom_group[:] = 0
-    model.geom_group[geoms] = 1
-
-    def closed_to(part: float) -> Array:
-        gripper.linkage.set(data.qpos, gripper.open + part * (gripper.closed - gripper.open))
-        mujoco.mj_forward(model, data)
-        return np.array(data.geom_xpos[geoms])
-
-    closed = closed_to(1.0)
-    ways = closed_to(NEARLY) - closed
-    moving = np.linalg.norm(ways, axis=1) > LEAST_WAY_M
-    ways = ways[moving]
-    if not moving.any() or (ways @ ways.T).min() >= 0.0:
-        raise RobotError("one finger, or fingers that do not close on each other")
-    hand = model.body(tip).id
-    axes = data.xmat[hand].reshape(3, 3).T
-    across = np.linalg.svd(ways - ways.mean(axis=0))[2][0]
-    side = ways @ across > 0
-    half = closed_to(NEARLY)[moving]
-    middle = 0.5 * (half[side].mean(axis=0) + half[~side].mean(axis=0))
-    out = middle - data.xpos[hand]
-    out = _snapped(out - across * (across @ out), axes)
-    across = _snapped(across - out * (across @ out), axes)
-
-    def gap(at: Array) -> tuple[float, float]:
-        """Return the distances from a place to the fingers on both sides, m; inf: none."""
-        found = []
-        for way in (across, -across):
-            starts = (at + aside * np.cross(across, out) for aside in ASIDE_M)
-            rays = (mujoco.mj_ray(model, data, one, way, SEEN, 1, -1, None) for one in starts)
-            found.append(next((d for d in rays if d >= 0), np.inf))
-        return found[0], found[1]
-
-    places = [middle + out * step * STEP_M for step in range(60, -40, -1)]
-    between = [place for place in places if np.isfinite(gap(place)).all()]
-    if not between:
-        raise RobotError("fingers that close past each other")
-    origin = between[min(int(FROM_TIP_M / STEP_M), len(between) // 2)]
-    left, right = gap(origin)
-    origin = origin + 0.5 * (left - right) * across
-    for part in np.linspace(0.0, NEARLY, 8):
-        closed_to(part)
-        width = sum(gap(origin))
-        if np.isfinite(width):
-            break
-    if not LEAST_GAP_M < width < np.inf:
-        raise RobotError(
-            f"fingers that open {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} are needed"
-        )
-    # Fingers that turn reach farther as they close.
-    ends = []
-    for step in np.linspace(part, 1.0, 5):
-        closed_to(step)
-        ends += [_extent(model, data, int(geom), out) for geom in geoms]
-    below = max(ends) - float(origin @ out)
-    turned = np.stack((np.cross(across, out), across, out), axis=1)
-    opening = gripper.open + float(part) * (gripper.closed - gripper.open)
-    return Fingertips(_placed(data, hand, origin, turned), opening, width, below)
-
-
-def _extent(model: mujoco.MjModel, data: mujoco.MjData, geom: int, way: Array) -> float:
-    """Return how far a geom's bounding box reaches along a way, m."""
-    turned = data.geom_xmat[geom].reshape(3, 3)
-    centre = data.geom_xpos[geom] + turned @ model.geom_aabb[geom, :3]
-    return float(way @ centre + np.abs(way @ turned) @ model.geom_aabb[geom, 3:])
-
-
-def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
-    """Return the tool of an arm that ends at a body, z along the last joint, outward: a site of the
-    model, or a place on the body."""
-    model = cell.model
-    data = cell.start()
-    at = data.xpos[model.body(body).id]
-    axes = data.xmat[model.body(body).id].reshape(3, 3).T
-    last, before = (int(model.dof_jntid[dof]) for dof in (cell.dof[-1], cell.dof[-2:][0]))
-    out = data.xaxis[last]
-    if out @ (at - data.xanchor[before]) < 0.0:
-        out = -out
-    out = _snapped(out, axes)
-    carried = below(model, model.jnt_bodyid[[last]])[model.site_bodyid]
-    carried[cell.tool] = False
-    along = data.site_xmat[:, [2, 5, 8]] @ out > ALIGNED
-    named = [model.site(site).name for site in np.flatnonzero(carried & along)]
-    if sites := [str(name) for name in named if name]:
-        return sites[-1], None
-    side = axes[int(np.argmin(np.abs(axes @ out)))]
-    side = side - out * (side @ out)
-    side /= norm(side)
-    turned = np.stack((np.cross(side, out), side, out), axis=1)
-    return body, _placed(data, model.body(body).id, at, turned)
-
-
-def _snapped(way: Array, axes: Array) -> Array:
-    """Return a unit vector, that of an axis where it is about that."""
-    way = way / norm(way)
-    along = axes @ way
-    best = int(np.argmax(np.abs(along)))
-    return np.sign(along[best]) * axes[best] if abs(along[best]) > ALIGNED else way
-
-
-def _placed(data: mujoco.MjData, body: int, origin: Array, turned: Array) -> ToolConfig:
-    """Return a frame of the world, (3,) and (3, 3), as one on a body."""
-    own = data.xmat[body].reshape(3, 3)
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, (own.T @ turned).ravel())
-    position = own.T @ (origin - data.xpos[body])
-    x, y, z = position.round(5).tolist()
-    a, b, c, d = quaternion.round(6).tolist()
-    return ToolConfig(position=(x, y, z), quaternion=(a, b, c, d))

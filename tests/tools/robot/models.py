@@ -29,9 +29,9 @@ def joint(
     )
 
 
-def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True) -> str:
+def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True, jaw: bool = False) -> str:
     """Return an arm of six joints; with a gripper, of two fingers of which one mimics the other, or
-    does not."""
+    does not, or of one that turns towards a `jaw`."""
     parts = [link("base", "0.1 0.1 0.1", "0 0 0")]
     parent = "base"
     below = 0.05
@@ -47,6 +47,9 @@ def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True) -> str
             joint("mount", parent, "hand", f"0 0 {below}", "0 0 1", limit="", kind="fixed")
         )
         limit = LIMIT.format(low=0, high=0.04, effort=30)
+        if jaw:
+            parts += turning_finger()
+            return f'<robot name="small">{"".join(parts)}</robot>'
         for side, name in ((1, "left"), (-1, "right")):
             parts.append(link(name, "0.02 0.01 0.06", f"0 {0.005 * side} 0.03", 0.1, 0.0001))
             mimic = '<mimic joint="left_finger"/>' if side < 0 and mimics else ""
@@ -56,6 +59,17 @@ def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True) -> str
                       kind="prismatic", mimic=mimic)
             )  # fmt: skip
     return f'<robot name="small">{"".join(parts)}</robot>'
+
+
+def turning_finger() -> list[str]:
+    """Return a jaw that is fixed to the hand, and a finger hinged next to it."""
+    limit = LIMIT.format(low=0, high=1.0, effort=3)
+    return [
+        link("jaw", "0.02 0.01 0.07", "0 -0.005 0.035", 0.1, 0.0001),
+        joint("weld", "hand", "jaw", "0 0 0.02", "0 0 1", limit="", kind="fixed"),
+        link("thumb", "0.02 0.01 0.07", "0 0.005 0.035", 0.1, 0.0001),
+        joint("hinge_of_thumb", "hand", "thumb", "0 0.012 0.02", "-1 0 0", limit=limit),
+    ]
 
 
 def written(folder: Path, text: str, name: str = "small.urdf") -> Path:

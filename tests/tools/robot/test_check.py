@@ -54,7 +54,14 @@ def test_of_a_model_file_the_arm_is_drafted_first(tmp_path: Path) -> None:
     assert found["robot"] == "small"
     texts = {one["about"]: one["text"] for one in found["findings"]}
     assert texts["actuators"] == "1 motor"
+    assert texts["fingers"].startswith("fingers on both sides; 80 mm open")
     assert "home" in texts["guessed"]
+
+
+def test_a_single_finger_and_its_jaw_are_named(tmp_path: Path) -> None:
+    found = checked(tmp_path, written(tmp_path, urdf(jaw=True)), 0)
+    texts = {one["about"]: one["text"] for one in found["findings"]}
+    assert texts["fingers"].startswith("one finger, which closes on a fixed jaw; ")
 
 
 def test_what_is_no_model_has_exit_status_2(tmp_path: Path) -> None:

@@ -55,9 +55,24 @@ def test_soft_tendons_that_stay_within_the_residual_are_accepted(tmp_path: Path)
     assert gripper.linkage.yields
 
 
-def test_a_single_finger_is_held_and_the_reason_said(tmp_path: Path) -> None:
+def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: Path) -> None:
     robot, _ = grippers.one_finger(tmp_path)
     made = drafted(tmp_path, robot.model)
+    gripper = gripper_of(made)
+    assert (gripper.joint, gripper.open, gripper.closed) == ("finger_left", 0.04, -0.035)
+    assert made.jaws is not None
+    assert made.jaws.is_one
+    # The jaw is at y = -35 mm of the hand, the finger opens 75 mm from it.
+    assert made.jaws.block == pytest.approx(0.35 * 0.075)
+    assert made.jaws.tool.position[1] == pytest.approx(-0.035 + 0.5 * made.jaws.block, abs=1e-4)
+    assert "finger and fixed jaw" in made.guessed["tool"]
+
+
+def test_a_finger_that_meets_nothing_is_held_and_the_reason_said(tmp_path: Path) -> None:
+    robot, _ = grippers.one_finger(tmp_path)
+    model = tmp_path / "puma560.xml"
+    model.write_text(model.read_text().replace(grippers.FIXED, ""))
+    made = drafted(tmp_path, robot.model)
     assert made.robot.gripper is None
-    assert "no gripper: one finger, or fingers that do not close on each other" in made.notes
+    assert "no gripper: fingers that do not close on each other, nor on a jaw" in made.notes
     assert [joint.name for joint in made.spec.joints] == list(made.robot.joints)

@@ -61,6 +61,20 @@ def test_a_urdf_with_two_fingers_transfers_two_blocks_with_nothing_edited(small:
     assert json.loads(done.stdout)["worked"]
 
 
+@pytest.mark.thorough
+def test_a_finger_that_turns_towards_a_jaw_transfers_two_blocks(tmp_path: Path) -> None:
+    model = written(tmp_path, urdf(jaw=True), "jaw.urdf")
+    done = rack("robot", "new", model, "--json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    made = json.loads(done.stdout)
+    assert made["task"] == "a table, two blocks to move", made["notes"]
+    words = ("--lockstep", "--json", "--out", tmp_path / "run", "--set", "name=jaw-of-test")
+    done = rack("run", "jaw", *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    off = [row["off_mm"] for row in json.loads(done.stdout)["objects"]]
+    assert max(off) < 5.0
+
+
 @pytest.mark.slow
 def test_what_the_urdf_states_is_taken_and_the_rest_named_as_guessed(small: Path) -> None:
     text = (small / "small" / "small.toml").read_text()
