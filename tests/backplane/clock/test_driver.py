@@ -242,14 +242,14 @@ def test_nothing_is_released_to_a_planner_within_its_time_slice(make_bus: MakeBu
     segment = make_bus(task("fast"), task("planner", slot=3))
     start(segment)
     block, released = segment.block("planner"), []
-    end_of_slice = 20
+    end_of_slice = 2 * STOP
 
     def plan(tick: int) -> None:
         if released or block[Block.RELEASED] >= 3:
             released.append(block[Block.RELEASED])
             block[Block.DEADLINE] = max(end_of_slice, block[Block.DEADLINE])
 
-    ticks = [tick for tick, _ in given_out(segment, 40, plan)][-len(released) :]
+    ticks = [tick for tick, _ in given_out(segment, 4 * STOP, plan)][-len(released) :]
     # A tick sees the releases of the tick before it.
     within = [seen for tick, seen in zip(ticks[1:], released, strict=False) if tick < end_of_slice]
     assert set(within) == {released[0]}

@@ -47,7 +47,7 @@ from rack.tools.lab.reproduction.sections.page import (
     Ruling,
 )
 from rack.tools.lab.reproduction.sections.sharing import judge_background, judge_loose
-from rack.tools.recording.history import Difference
+from rack.tools.recording.divergence import Difference
 from rack.tools.timing.charts.panel import Count
 
 SECTIONS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]

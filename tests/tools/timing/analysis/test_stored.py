@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rack.tools.timing.analysis import stored
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.analysis.report import OtherRun, write_report
 from rack.tools.timing.analysis.stored import RECORDED, stored_report
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
@@ -72,7 +72,7 @@ def test_it_is_made_anew_if_it_is_damaged(folder: Path) -> None:
 
 
 def test_it_is_made_anew_in_another_folder_and_after_a_comparison(folder: Path) -> None:
-    write_report(folder, folder)
+    write_report(folder, OtherRun(folder))
     assert stored_report(folder) is None
     write_report(folder)
     moved = folder.with_name(f"{folder.name}-moved")
