@@ -12,7 +12,7 @@ from __future__ import annotations
 import mmap
 
 import numpy as np
-from wire import UNIT
+from wire import MOST, UNIT
 
 from rack.levels.algebra import Array, mat_vec, solve
 from rack.levels.robot.cell import Cell
@@ -56,9 +56,10 @@ class Joint:
         return len(self._braking)
 
     def sample(self) -> tuple[int, int]:
-        """Return position and velocity, in `wire.UNIT`."""
+        """Return position and velocity, in `wire.UNIT`, as far as its registers go."""
         state = self._all.position[self._number], self._all.velocity[self._number]
-        return round(state[0] / UNIT), round(state[1] / UNIT)
+        position, velocity = (round(np.clip(each / UNIT, -MOST, MOST)) for each in state)
+        return position, velocity
 
     def drive(self, torque: Array) -> None:
         """Release the brake and give a torque: that of this joint in `torque`, (joints,), N m.

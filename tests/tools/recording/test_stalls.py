@@ -319,13 +319,13 @@ class Stop(Display):
     """Stops the clock's board and the lower level, once, until three more ticks have passed."""
 
     period_s = 0.05
-    struck = False
+    since_ns = until_ns = 0
 
     def show(self, snapshot: Snapshot) -> None:
         """Look at the tick."""
-        if snapshot.tick < 20 or self.struck:
+        if snapshot.tick < 20 or self.since_ns:
             return
-        self.struck = True
+        self.since_ns = time.monotonic_ns()
         segment = Segment.attach(snapshot.rack)
         pids = segment.words[System.CLOCK_PID], segment.block("lower")[Block.PID]
         clock = SystemClock(segment)
@@ -336,6 +336,7 @@ class Stop(Display):
             time.sleep(left_ns * 1e-9)
         for pid in pids:
             os.kill(pid, signal.SIGCONT)
+        self.until_ns = time.monotonic_ns()
 
 
 @pytest.mark.slow
@@ -347,8 +348,13 @@ def test_a_stop_of_the_clocks_board_is_a_stall_of_its_core(
     urgent = ["clock.mode=realtime", "clock.priority=10", "board.lower.priority=9"]
     display = Stop()
     run_rack(load(small, [f"name={rack_name}", *urgent, *slow]), 2.4, tmp_path / "run", display)
-    assert display.struck
+    assert display.until_ns
     recording = Recording(tmp_path / "run")
+    if any(
+        each.core == FIRST and each.to_ns > display.since_ns and each.from_ns < display.until_ns
+        for each in recording.cores.stolen or ()
+    ):
+        pytest.skip("the hypervisor took the core meanwhile: it is to blame then, and is blamed")
     (absence,) = [each for each in found_in(recording).absences if each.core == FIRST]
     # Ticks 2 and 3 after the stop cannot have been made.
     assert absence.lost >= 2
