@@ -19,6 +19,7 @@ import pytest
 
 from rack.backplane.process import DEADLINE, Reservation, take_core
 from rack.tools.lab.benches.network import Lab
+from rack.tools.recording.cores import STAT, STEAL
 
 WAIT_S = 600.0
 """Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the
@@ -43,6 +44,12 @@ def obtains_deadlines() -> bool:
         is_given = take_core(min(os.sched_getaffinity(0)), 0, Reservation(100_000, 10_000_000))
         os._exit(is_given != DEADLINE)
     return not os.waitpid(pid, 0)[1]
+
+
+def stolen() -> int:
+    """Return how long the hypervisor has held cores back since the machine began, in the kernel's
+    steps of 10 ms."""
+    return int(STAT.read_text().split(maxsplit=STEAL + 1)[STEAL])
 
 
 needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
