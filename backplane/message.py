@@ -181,6 +181,11 @@ class Message:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
 
 
+def reason_of(status: Message) -> str:
+    """Return the reason in a level's status; empty for a status of a user's level without one."""
+    return str(getattr(status, "reason", ""))
+
+
 def copied(message: Message) -> Message:
     """Return a copy of a message, in memory of its own."""
     copy = Message(message.record.dtype)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State
+from rack.backplane.message import Message, State, reason_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
@@ -212,7 +212,7 @@ class Ending:
         reason = (
             f"'{self._ends_run}' has not been written for {silent_s:g} s"
             if silent_s
-            else status.reason
+            else reason_of(status)
         )
         return State(status.state).name.lower(), reason
 
@@ -220,7 +220,7 @@ class Ending:
         """Return a line for every level whose last status reports an error, except the level that
         ends the run."""
         return [
-            f"level '{board}': {status.reason}"
+            f"level '{board}': {reason_of(status) or f'error {status.error}'}"
             for board, status in statuses(self._segment, "error")
             if status.error and f"{board}.status" != self._ends_run
         ]
@@ -245,11 +245,11 @@ class Ending:
             since = block[Block.LEVEL_SINCE]
             lasted_ms = ran_ms - since * segment.layout.clock_ns * 1e-6
             if not found and getattr(status, "braked", False):
-                never.append(Braking(status.reason or NO_TORQUE, since, lasted_ms))
+                never.append(Braking(reason_of(status) or NO_TORQUE, since, lasted_ms))
             if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
                 held.append(
                     f"level '{name}' held for {lasted_ms:g} ms without a cause in sight:"
-                    f" {status.reason}"
+                    f" {reason_of(status) or 'no reason given'}"
                 )
         braked = [one for one in found if one.why != DEMANDED] or never
         times = [one.lasted_ms for one in braked]

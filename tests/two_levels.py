@@ -7,7 +7,7 @@ from typing import Any
 
 import pydantic
 
-from rack.backplane.message import Field, Message, MessageType, command, status
+from rack.backplane.message import Field, Message, MessageType, State, command, status
 from rack.levels.level import Executor, Input, Planner, Ports, Program
 from rack.levels.tables import RobotConfig, SceneConfig
 
@@ -28,6 +28,28 @@ class Upper(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Ask for one more."""
         write.command.goal = read.status.value.count + 1
+
+
+class Stateless(Upper):
+    """Has a status of its own, without a state or a reason."""
+
+    outputs = {
+        "command": COUNT_COMMAND,
+        "status": MessageType("bare", 1, (Field("fired", "u1", "1", "1: it has"),)),
+    }
+
+
+class Reasonless(Upper):
+    """Holds, and has no field for the reason."""
+
+    outputs = {
+        "command": COUNT_COMMAND,
+        "status": MessageType("terse", 1, (Field("state", "u1", State, "of the level"),)),
+    }
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Hold."""
+        write.status.state = State.HOLDING
 
 
 class CountProgram(Program):

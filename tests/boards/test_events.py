@@ -104,6 +104,20 @@ def test_an_error_of_a_level_that_counts_no_moves_is_a_failure(bus: Segment) -> 
     assert ending(bus, "lower.status").cause() == "task failed"
 
 
+def test_an_error_or_a_hold_of_a_level_without_a_reason_counts_as_any_other(
+    make_bus: MakeBus,  # noqa: F811
+) -> None:
+    kind = MessageType(
+        "terse", 1, (Field("state", "u1", State, ""), Field("error", "u2", "1", "code"))
+    )
+    bus = make_bus(task("upper"), box("upper.status", kind, "upper"))
+    write(bus, "upper.status", state=State.HOLDING, error=3)
+    bus.block("upper")[Block.LEVEL_STATE] = State.HOLDING
+    assert ending(bus, None).latched() == ["level 'upper': error 3"]
+    (held,) = ending(bus, None).held((), (), 2 * HELD_MS)
+    assert held.endswith("without a cause in sight: no reason given")
+
+
 def test_a_run_that_no_level_ends_is_over_in_time(bus: Segment) -> None:
     assert ending(bus, None).cause() == "time over"
     assert ending(bus, None).final_state() == ("", "")

@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.layout import Layout
-from rack.backplane.message import State
+from rack.backplane.message import State, reason_of
 from rack.backplane.segment import Segment
 from rack.boards.events import statuses
 from rack.boards.faults.bounds import struck_mailboxes
@@ -118,8 +118,8 @@ def arm_of(segment: Segment) -> ArmEnd:
 def levels_of(segment: Segment) -> str:
     """Return the last state of each level, with its reason, as one readable text."""
     states = []
-    for writer, status in statuses(segment, "reason"):
-        reason = f" ({status.reason})" if status.reason else ""
+    for writer, status in statuses(segment, "state"):
+        reason = f" ({why})" if (why := reason_of(status)) else ""
         states.append(f"{writer} {State(status.state).name.lower()}{reason}")
     return ", ".join(states)
 

@@ -12,7 +12,7 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State
+from rack.backplane.message import Message, State, reason_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.events import Event
@@ -133,7 +133,7 @@ class Holds:
             since = self._segment.block(level)[Block.LEVEL_SINCE]
             asks = ASKED.get(status.error) if level == self._arm else None
             release = f"rack command {self._segment.rack} {level} {asks}" if asks else ""
-            why = f"holding: {status.reason or 'no reason given'}"
+            why = f"holding: {reason_of(status) or 'no reason given'}"
             yield self._hold(level, since, why, release)
 
     def _standing(self, level: str, status: Message) -> tuple[int, int, str]:

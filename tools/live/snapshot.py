@@ -13,7 +13,7 @@ from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State
+from rack.backplane.message import Message, State, reason_of
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Demand, Run, System, TaskState
@@ -33,6 +33,8 @@ GONE = "gone"
 """State of a run on another machine that does not answer any more."""
 HELD = "HELD: 'rack step {}' lets it go on"
 """Line of a rack in lockstep that is single-stepped."""
+LEVEL_STATES: Mapping[int | None, str] = {state: state.name.lower() for state in State}
+"""Names of the states of levels."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
 
@@ -225,8 +227,9 @@ class RackMonitor:
         if block[Block.LOST]:
             state = LOST
         elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
-            state = State(status.value.state).name.lower()
-            reason = status.value.reason
+            # Of a user's level without a state, or with others, it is that of its process.
+            state = LEVEL_STATES.get(getattr(status.value, "state", None), state)
+            reason = reason_of(status.value)
             row = fired(status.value)
             mode = mode_of(status.value)
         return TaskRow(
@@ -279,7 +282,7 @@ def mode_of(status: Message) -> str:
 def fired(status: Message) -> str:
     """Return what fired of a state table in a level's newest cycle, as text; empty for a level
     without one."""
-    if "fired" not in (status.record.dtype.names or ()):
+    if not {"row", "fired", "in_state", "table"} <= {*(status.record.dtype.names or ())}:
         return ""
     what = f"row {status.row} '{status.fired}'" if status.row else "no row"
     return f"{what}, now in '{status.in_state}', table {status.table}"

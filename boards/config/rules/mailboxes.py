@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
+from rack.backplane.message import State
 from rack.boards.config.schema import LAN
 from rack.boards.config.wiring import (
     TaskPorts,
@@ -98,10 +99,18 @@ def _wired_at(ports: TaskPorts, port: str) -> str:
 
 
 def statuses(wiring: Wiring) -> Iterator[Mistake]:
-    """Check that the board that ends the run has a status."""
+    """Check that the board that ends the run has a status, and in it a state."""
     for name, board in wiring.config.board.items():
-        if board.ends_run and not wiring.is_known(f"{name}.status"):
+        if not board.ends_run:
+            continue
+        if not wiring.is_known(f"{name}.status"):
             yield Mistake(f"board.{name}.ends_run", True, "its executor writes no status")
+        elif (found := wiring.type_of(f"{name}.status")) is not None and not any(
+            field.name == "state" and field.unit is State for field in found.fields
+        ):
+            yield Mistake(
+                f"board.{name}.ends_run", True, "its status has no field 'state' of State"
+            )
 
 
 def sides(wiring: Wiring) -> Iterator[Mistake]:

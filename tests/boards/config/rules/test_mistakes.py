@@ -143,6 +143,10 @@ MISTAKES = {
         "board.lower.ends_run=true",
         "only one board can end the run; 'upper' already does",
     ),
+    "end without a state": (
+        "board.upper.executor=two_levels:Stateless",
+        "board.upper.ends_run = true: its status has no field 'state' of State",
+    ),
     "board name": (
         "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
         "invalid name for a board",
@@ -166,7 +170,10 @@ MISTAKES = {
     ),
     "no class": (
         "board.upper.executor='two_levels:Uper'",
-        "has no class 'Uper'; it has: Lower, PlanWriter, Programmed, Unfinished, Upper",
+        (
+            "has no class 'Uper'; it has: Lower, PlanWriter, Programmed, Reasonless, Stateless,"
+            " Unfinished, Upper"
+        ),
     ),
     "no executor": (
         "board.upper.executor='two_levels:LowerPlanner'",
