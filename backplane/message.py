@@ -125,7 +125,8 @@ class Message:
 
     Every field is an attribute. Array fields are numpy views of `record`: fill them in place
     (`m.position[:] = q`) or assign (`m.position = q`). Scalars read and assign as plain numbers,
-    byte strings as `str`. `record` is the structured array, shape (), `raw` its bytes.
+    byte strings as `str`, see `text_of`. `record` is the structured array, shape (), `raw` its
+    bytes.
     """
 
     # Slots: a misspelt field is an error, not a new attribute that is never sent.
@@ -179,6 +180,18 @@ class Message:
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
+
+
+def text_of(content: bytes | bytearray) -> str:
+    """Return the content of a text field for people, with control characters as escapes.
+
+    Texts come from other racks and from levels of users, and end on terminals, which would obey an
+    escape sequence.
+    """
+    text = content.decode("ascii", "replace")
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def reason_of(status: Message) -> str:
@@ -235,7 +248,7 @@ def _property(slot: str, dtype: np.dtype) -> property:
             data = value.encode("ascii", "replace") if isinstance(value, str) else value
             view(self)[...] = data[:size]
 
-        return property(lambda self: view(self).item().decode("ascii", "replace"), store_text)
+        return property(lambda self: text_of(view(self).item()), store_text)
     return property(lambda self: view(self).item(), store)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message
+from rack.backplane.message import Message, text_of
 from rack.boards.checkpoint.kinds import part_kind
 from rack.boards.checkpoint.parts import Parts
 from rack.boards.errors import CheckpointError
@@ -43,7 +43,7 @@ class Attributes:
             case Enum():
                 return thing.name.lower()
             case bytes() | bytearray():
-                return thing.hex() if b"\x00" in thing else thing.decode("ascii", "replace")
+                return thing.hex() if b"\x00" in thing else text_of(thing)
             case float() if not isfinite(thing):
                 # JSON has no word for it.
                 return str(thing)

@@ -15,6 +15,7 @@ from rack.backplane.message import (
     command,
     fill_counts,
     status,
+    text_of,
 )
 
 POSE = MessageType(
@@ -102,6 +103,15 @@ def test_text_reads_as_text_cut_to_its_field(track: Message) -> None:
     assert track.word == "grip"
     track.word = "né"
     assert track.word == "n?"
+
+
+def test_text_reads_with_escapes_in_place_of_control_characters(track: Message) -> None:
+    for content, shown in ((b"\x1b[2J", r"\x1b[2J"), (b"a\n\x7f", r"a\n\x7f"), (b"a\\b", r"a\b")):
+        track.word = content
+        assert track.word == text_of(content) == shown
+        # As often as it is passed on.
+        assert text_of(shown.encode()) == shown
+    assert text_of(b"\xe9t") == "\N{REPLACEMENT CHARACTER}t"
 
 
 def test_shorter_text_leaves_nothing_of_the_longer(track: Message) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.message import text_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.levels.operator import DRIVES, SETTINGS, Answer
@@ -134,7 +135,7 @@ class Replies:
             self._refuse(row)
 
     def _refuse(self, row: np.void) -> None:
-        objection = row["message"]["objection"].decode("ascii", "replace")
+        objection = text_of(row["message"]["objection"])
         self.reply = replace(self.reply, fate="refused", objection=objection)
 
 

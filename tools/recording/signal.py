@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
+from rack.backplane.message import text_of
 from rack.tools.console.answer import Failure
 from rack.tools.recording.parquet import Column, columns_of
 
@@ -103,7 +104,7 @@ class Signal:
     def in_message(self, message: np.ndarray) -> Any:
         """Return it in one message: an array or a number; a state by its name."""
         value = self.named(self.values(message[None]))[0]
-        return value.decode() if isinstance(value, bytes) else value
+        return text_of(value) if isinstance(value, bytes) else value
 
     def named(self, values: np.ndarray) -> np.ndarray:
         """Return its values with names in place of the numbers that stand for them."""
@@ -117,7 +118,7 @@ class Signal:
         lists of them; None for what is not finite."""
         values = self.values(messages)
         if values.dtype.kind == "S":
-            values = np.strings.decode(values, "ascii", "replace")
+            values = np.vectorize(text_of, "O")(values)
         elif self.column.values:
             values = self.named(values)
         elif values.dtype.kind == "f" and not np.isfinite(values).all():

@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.message import State
+from rack.backplane.message import State, text_of
 from rack.levels.messages import Verb
 from rack.levels.systems.hand.messages import GraspKind
 from rack.levels.timing.rack import RackTiming
@@ -97,7 +97,7 @@ class Activity:
         self._states.write(block)
         for row in self._errors.rows(messages["error"]):
             if error := messages["error"][row]:
-                reason = messages["reason"][row].decode("ascii", "replace")
+                reason = text_of(messages["reason"][row])
                 text = f"{self._board}: {reason or f'error {error}'}"
                 self._stream.say(block.when(row), "levels", text, "ERROR")
 
@@ -117,8 +117,7 @@ class FiredRows:
         names = []
         for at in changed:
             table, fired, state = (
-                messages[field][at].decode("ascii", "replace")
-                for field in ("table", "fired", "in_state")
+                text_of(messages[field][at]) for field in ("table", "fired", "in_state")
             )
             row = messages["row"][at]
             text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"

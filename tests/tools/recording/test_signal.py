@@ -80,6 +80,14 @@ def test_a_signal_is_a_field_or_a_part_of_it(
     assert signal.plain(messages[:0]) == []
 
 
+def test_a_text_is_shown_with_escapes_in_place_of_control_characters(messages: np.ndarray) -> None:
+    signal = Signal.of("walker.status.name", [BOX])
+    messages["name"] = b"\x1b[2J\xe9"
+    shown = "\\x1b[2J\N{REPLACEMENT CHARACTER}"
+    assert signal.plain(messages) == [shown] * 3
+    assert signal.in_message(messages[0]) == shown
+
+
 def test_units_are_those_of_numbers() -> None:
     units = {column.path[0]: Signal("", "", column, ()).unit for column in columns_of(BOX)}
     assert units == {"gait": "", "speed": "m/s", "name": "", "legs": "rad"}
