@@ -50,7 +50,7 @@ def report(
     attributes of the level differed before it, and whether its code repeats what it wrote.
 
     Exit status: 0 the report was printed; 1 with --against: the runs diverge before any miss; 2 RUN
-    is not a run, or the two are of different racks.
+    is not a run, or the two cannot be compared: they are of different racks, or either lacks rows.
 
     \b
     Examples:

@@ -96,7 +96,7 @@ def _check_whole(recording: Recording) -> None:
         why = f"its recorder lost {lost} rows"
     else:
         return
-    raise Failure(f"{recording.folder}: {why}; the two runs cannot be compared")
+    raise Failure(f"{recording.folder}: {why}; the two runs cannot be compared", 2)
 
 
 def _check_alike(one: Recording, other: Recording) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -92,6 +94,18 @@ def ran(rack_name: str, tmp_path: Path) -> Run:
 def why(one: Recording, other: Recording, *, of: str = "", repeats: bool = True) -> dict[str, Any]:
     """Return what the report says of two runs."""
     return compared(one, OtherRun(other.folder, of, repeats))
+
+
+def _losing(run: Recording) -> Path:
+    """Return a copy of a recorded run whose recorder lost rows."""
+    folder = Path(shutil.copytree(run.folder, run.folder.with_name("losing")))
+    events = folder / "events.jsonl"
+    lines = [json.loads(line) for line in events.read_text().splitlines()]
+    ends = [
+        line | {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else line for line in lines
+    ]
+    events.write_text("".join(json.dumps(line) + "\n" for line in ends))
+    return folder
 
 
 def test_equal_runs_have_no_chain(ran: Run) -> None:
@@ -240,6 +254,7 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
             "are of different racks: only the first has 'wave'",
         ),
         ((one.folder, "--against", tmp_path), "not a run"),
+        ((one.folder, "--against", _losing(two)), "lost 3 rows; the two runs cannot be compared"),
         ((one.folder, "--against", two.folder, "--of", "wave.statu"), "nearest: wave.status"),
         ((one.folder, "--of", "wave.status"), "permitted with --against"),
     ):
