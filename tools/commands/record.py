@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -22,7 +22,7 @@ from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, V
 from rack.tools.live.folder import folder_of
 from rack.tools.live.watched import WatchedRack, watched
 from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder.recorder import Recorder, SafeSink
+from rack.tools.recording.recorder.recorder import Recorder, SafeSink, is_opening
 from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes, unwritable
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import save as save_run
@@ -108,6 +108,14 @@ def record(
     answer = {"rack": rack, "folder": str(folder), "notes": notes, **sizes(folder, lasted_s)}
     line = f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
     print_answer(answer, line, as_json)
+    if is_opening():
+        _end_at_once(0)
+
+
+def _end_at_once(status: int) -> NoReturn:
+    """End the process without the viewer's library, which would wait, maybe for ever."""
+    sys.stdout.flush()
+    os._exit(status)
 
 
 def _saved(rack: WatchedRack, folder: Path) -> tuple[dict[str, Any], str]:
@@ -172,8 +180,7 @@ def _ending_when_full(rack: WatchedRack, folder: Path) -> Iterator[None]:
         try:
             fail(unwritable(folder, error, rack.segment.words[System.FOLLOWER_TICK]), 1)
         finally:
-            sys.stdout.flush()
-            os._exit(1)
+            _end_at_once(1)
 
 
 def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:

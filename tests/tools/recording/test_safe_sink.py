@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from rack.tools.recording.recorder.recorder import SafeSink
+from rack.tools.recording.recorder.recorder import SafeSink, is_opening
 
 WATCHDOG_S = 30.0
 
@@ -99,6 +99,24 @@ def test_a_recorder_in_a_hurry_does_without_a_sink_that_is_not_open(
     assert sink.calls == []
     assert len(notes) == 1
     assert notes[0].startswith("run.rrd is missing: ")
+
+
+def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rack.tools.recording.recorder.recorder.OPENED_S", 0.05)
+    may_open, notes = threading.Event(), list[str]()
+
+    def opened() -> Taking:
+        assert may_open.wait(WATCHDOG_S)
+        return Taking()
+
+    safe = SafeSink(opened, notes.append, in_background=True)
+    safe.close(1, {})
+    assert is_opening()
+    may_open.set()
+    why = "the viewer's library has not opened it within 0.05 s; 'rack replay' makes it"
+    assert notes == [f"run.rrd is missing: {why}"]
 
 
 def test_a_sink_that_cannot_be_opened_is_reported_once() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from threading import Thread
+from threading import enumerate as enumerate_threads
 from typing import Protocol, Self
 
 import numpy as np
@@ -31,6 +32,12 @@ faster than time."""
 
 HAND_OVER_S = 0.1
 """Time of a pass for a sink that is behind: what boards write meanwhile is not in the spool yet."""
+OPENED_S = 120.0
+"""Time that a recorder at its end waits for a sink that is being opened: on a loaded machine the
+viewer's library alone may take a minute, and for a file that cannot be written it waits for
+ever."""
+OPENING = "opening a sink"
+"""Name of a thread that does so."""
 HURRIED_S = 0.5
 """Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends
 within 2 s."""
@@ -69,12 +76,16 @@ class SafeSink:
         self._late = 0  # calls that were left waiting
         # A daemon: a process in a hurry does not wait for it.
         self._opening = Thread(
-            target=self._guarded, args=(lambda: setattr(self, "_sink", opened()),), daemon=True
+            target=self._guarded,
+            args=(lambda: setattr(self, "_sink", opened()),),
+            name=OPENING,
+            daemon=True,
         )
         self._opening.start()
         if not in_background:
             self._opening.join()
-        self._patience_s: float | None = None
+        self._patience_s = OPENED_S
+        self._why_late = f"the viewer's library has not opened it within {OPENED_S:g} s"
 
     @classmethod
     def of(
@@ -110,10 +121,7 @@ class SafeSink:
         self._waiting.append(lambda sink: sink.close(tick, lost))
         self._opening.join(self._patience_s)
         if self._opening.is_alive():
-            self._tell(
-                "run.rrd is missing: the run was interrupted before the libraries of the viewer"
-                " were loaded; 'rack replay' makes it"
-            )
+            self._tell(f"run.rrd is missing: {self._why_late}; 'rack replay' makes it")
         else:
             self._late = 0
             self._hand_over()
@@ -121,6 +129,7 @@ class SafeSink:
     def hurry(self) -> None:
         """Do without a sink that will not be open soon."""
         self._patience_s = HURRIED_S
+        self._why_late = "the run was interrupted before the libraries of the viewer were loaded"
 
     def _hand_over(self, until: float = 0.0) -> None:
         """Make the calls that wait for the sink, as many as have come and more `until` then; there
@@ -136,6 +145,12 @@ class SafeSink:
         except Exception as error:
             self._sink, self._failed = None, self._sink
             self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
+
+
+def is_opening() -> bool:
+    """Return whether a sink of this process is still being opened: the viewer's library would wait
+    for that at the end of the interpreter."""
+    return any(thread.name == OPENING for thread in enumerate_threads())
 
 
 RISKED_PART = 4
