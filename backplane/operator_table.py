@@ -13,7 +13,7 @@ sees when it ends, or is not `heard` any more.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
@@ -88,6 +88,14 @@ class RequestEntry:
     def stage(self) -> RequestStage:
         """Stage of the request."""
         return RequestStage(self.words[RequestWord.STAGE])
+
+    def becomes(self, issued: Request) -> bool:
+        """Say whether this request may be the one that was issued so."""
+        return (
+            self.words[RequestWord.MAILBOX] == issued.mailbox
+            and self.words[RequestWord.TICK] <= issued.tick
+            and self.message[: len(issued.message)] == issued.message
+        )
 
 
 class RequestClaim(NamedTuple):
@@ -212,6 +220,19 @@ class OperatorTable:
         """Return the waiting requests in the order in which they were added."""
         found = [entry for entry in self.entries if self.is_waiting(entry)]
         return sorted(found, key=lambda entry: entry.words[RequestWord.TICKET])
+
+    def lacking(self, requests: Sequence[Request]) -> list[Request]:
+        """Return those of a run's commands, given in the order of issue, that do not wait here
+        already: each entry is issued at its tick or, added late, after it."""
+        waiting = sorted(self.waiting(), key=lambda entry: entry[RequestWord.TICK])
+        found = []
+        for wanted in requests:
+            entry = next((entry for entry in waiting if entry.becomes(wanted)), None)
+            if entry is None:
+                found.append(wanted)
+            else:
+                waiting.remove(entry)
+        return found
 
     def _fill(self, entry: RequestEntry, request: Request, ticket: int, client: Client) -> None:
         words = entry.words

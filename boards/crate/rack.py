@@ -87,7 +87,7 @@ class Rack:
     was started earlier saves time. With `entries`, by bus adapter and port, host boards are not
     started: what a recorded run wrote there enters instead. `keeping`: the checkpoints that it
     takes in lockstep, and the one that it continues from. `requests`: an operator's commands
-    besides the config's.
+    besides the config's, and those that wait in the checkpoint, by their ticks.
     """
 
     def __init__(
@@ -220,7 +220,10 @@ class Rack:
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        for wanted in (*self._plan.commands[before.commands :], *self._requests):
+        # A checkpoint has those that waited, and leases, of which no client can be here.
+        for lease in desk.leased():
+            desk.release(lease)
+        for wanted in (*self._plan.commands[before.commands :], *desk.lacking(self._requests)):
             desk.add(wanted)
 
     def follow(self, events: Iterable[Event]) -> None:

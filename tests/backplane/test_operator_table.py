@@ -60,6 +60,26 @@ def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None
     assert [entry[RequestWord.TICK] for entry in OperatorTable(segment).waiting()] == [3, 5, 7]
 
 
+def test_of_commands_issued_those_are_lacking_that_wait_for_no_tick_until_theirs(
+    segment: Segment,
+) -> None:
+    table = OperatorTable(segment)
+    hold, resume = b"\1", b"\2"
+    issued = [
+        Request(0, message, tick)
+        for message, tick in ((hold, 100), (resume, 150), (hold, 200), (hold, 300))
+    ]
+    assert table.lacking(issued) == issued
+    # Added late, at once, and one that the run did not live to see.
+    for message, tick in ((hold, 300), (hold, -1), (resume, 400)):
+        table.add(Request(0, message, tick))
+    assert table.lacking(issued) == issued[1:3]
+    with table.claim(Request(0, resume, 150)):
+        assert table.lacking(issued) == issued[2:3]
+    # Its client is gone.
+    assert table.lacking(issued) == issued[1:3]
+
+
 def test_a_request_that_waits_can_be_taken_back(segment: Segment) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))

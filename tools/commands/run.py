@@ -116,8 +116,9 @@ def run(
     --no-record it has the same keys; those that need a recording are null.
 
     In lockstep the folder of a run holds checkpoints, each record.checkpoint_s of simulated time.
-    With --from, the rack first goes on unchanged from the one before to TIME. --seconds counts from
-    the beginning of the run that is continued, as there.
+    With --from, the rack first goes on unchanged from the one before to TIME. What operators
+    commanded in that run, before TIME and after it, is repeated; stops and faults by hand are not.
+    --seconds counts from the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the

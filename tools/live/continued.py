@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.mailbox.history import chains
+from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints
@@ -31,13 +33,13 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.launch import Beginning
 from rack.tools.recording.divergence import ticks_of
-from rack.tools.recording.entries import recorded_commands
+from rack.tools.recording.entries import commands_from, recorded_commands
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
 WHY_NOT = (
-    "the code of a level has changed since, it missed cycles in real time, or somebody commanded it"
-    " while it ran"
+    "the code of a level has changed since, it missed cycles in real time, or somebody injected a"
+    " fault or stopped it while it ran"
 )
 
 
@@ -139,11 +141,12 @@ def branched(recording: Recording, settings: Sequence[str], faults: str | None) 
 
 
 def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Beginning]:
-    """Return the last checkpoint at `tick` or before, and what goes on from it; without one, tick 0
-    and what operators commanded. Raises `Failure`."""
+    """Return the last checkpoint at `tick` or before, or tick 0 without one, and what goes on from
+    there, with what operators commanded later. Raises `Failure`."""
     kept = checkpoints(recording.folder)
     if begins := max((at for at in kept if at <= tick), default=0):
-        return begins, Beginning(_kept_in(recording, kept[begins].resolve(), begins))
+        keeping = _kept_in(recording, kept[begins].resolve(), begins)
+        return begins, Beginning(keeping, _commanded(recording, begins, asked))
     if ticks_of(recording)[0] > max(task.every for task in recording.layout.tasks):
         # Of a run that goes on from another the beginning is that other's.
         first = min(kept, default=ticks_of(recording)[1]) * recording.layout.clock_ns * 1e-9
@@ -158,6 +161,18 @@ def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Begi
             file=sys.stderr,
         )
     return 0, Beginning(requests=commands)
+
+
+def _commanded(recording: Recording, begins: int, asked: str) -> tuple[Request, ...]:
+    """Return the commands from a checkpoint on that find room in the operator table; note on stderr
+    those that do not."""
+    commands = commands_from(recording, begins)
+    room = OPERATOR_ENTRIES - len(recording.rack_config.command)
+    if left := commands[room:]:
+        since_s = left[0].tick * recording.layout.clock_ns * 1e-9
+        why = f"the operator table holds {OPERATOR_ENTRIES}"
+        print(f"{asked}: commands from {since_s:g} s on are not repeated: {why}", file=sys.stderr)
+    return commands[:room]
 
 
 def _kept_in(recording: Recording, origin: Path, tick: int) -> Keeping:

@@ -33,6 +33,7 @@ from rack.tools.live.continued import (
 from rack.tools.live.launch import Beginning
 from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, dotted
 from rack.tools.recording.divergence import continued_at
+from rack.tools.recording.entries import commands_from
 from rack.tools.recording.recording import Recording
 
 Because = Literal["state", "code", "chance"]
@@ -142,7 +143,8 @@ class _Repeater:
         with state_at(parent, branched_at) as state:
             keeping = state.begins.checkpoint
             assert keeping is not None, "a state that is kept"
-            yield Beginning(replace(keeping, packages=run.rack_config.python_path))
+            keeping = replace(keeping, packages=run.rack_config.python_path)
+            yield Beginning(keeping, commands_from(run, branched_at))
 
     def strays(self, again: CycleAgain) -> tuple[str, ...]:
         """Return the mailboxes of other tasks that are not as recorded."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.layout import MailboxSpec
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import COMMAND_ID
 from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
@@ -58,12 +58,34 @@ def recorded_commands(recording: Recording) -> tuple[Request, ...]:
     Raises `Failure` if the recording lacks some.
     """
     plan = resolve(recording.rack_config)
-    layout = plan.layout
+    commanded = _issued(recording, plan.layout)
+    if commanded and recording.kept:
+        raise Failure(f"--from {recording.folder}: {recording.kept_text}", 2)
+    for known in plan.commands:
+        given = (r for r in commanded if replace(r, tick=known.tick) == known)
+        if (one := next(given, None)) is not None:
+            commanded.remove(one)
+    return tuple(commanded)
+
+
+def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
+    """Return all commands issued in a recorded run from `tick` on, those of its config too, in
+    their order; of a flight recorder's run, until the end of what it kept around that tick.
+
+    Raises `Failure` if the recording lacks some.
+    """
+    end = next((end for _, end in recording.kept if tick < end), None)
+    issued = _issued(recording, recording.layout)
+    return tuple(one for one in issued if tick <= one.tick and (end is None or one.tick < end))
+
+
+def _issued(recording: Recording, layout: Layout) -> list[Request]:
+    """Return what the clock issued, in its order. Raises `Failure` if the recording lacks some."""
     found: list[tuple[int, int, Request]] = []
     for box in layout.mailboxes:
         if box.writer != CLOCK or box.name not in recording.mailboxes:
             continue
-        _check(box, box, recording, "--from")
+        _check_whole(box, recording, "--from")
         messages = recording.messages(box)
         ids = messages[COMMAND_ID].tolist()
         # The clock numbers commands when it issues them.
@@ -73,17 +95,10 @@ def recorded_commands(recording: Recording) -> tuple[Request, ...]:
         ):
             found.append((tick, number, Request(layout.index(box.name), message.tobytes(), tick)))
     found.sort(key=lambda command: command[:2])
-    commanded = [request for _, _, request in found]
-    for known in plan.commands:
-        given = (r for r in commanded if replace(r, tick=known.tick) == known)
-        if (one := next(given, None)) is not None:
-            commanded.remove(one)
-    return tuple(commanded)
+    return [request for _, _, request in found]
 
 
-def _check(
-    box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording, asked: str = "--entries"
-) -> None:
+def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:
     if recorded is None or (recorded.message, recorded.version, recorded.size) != (
         box.message,
         box.version,
@@ -95,9 +110,13 @@ def _check(
             else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
         )
         wanted = f"{box.message} {box.version}, {box.size} bytes"
-        raise Failure(f"{asked} {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
+        raise Failure(f"--entries {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
     if recording.kept:
-        raise Failure(f"{asked} {recording.folder}: {recording.kept_text}", 2)
+        raise Failure(f"--entries {recording.folder}: {recording.kept_text}", 2)
+    _check_whole(box, recording, "--entries")
+
+
+def _check_whole(box: MailboxSpec, recording: Recording, asked: str) -> None:
     if lost := recording.lost.get(box.name):
         raise Failure(
             f"{asked} {recording.folder}: {box.name}: its recorder lost {lost} messages", 2

@@ -11,14 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.operator_table import OperatorTable, Request
+from rack.backplane.operator_table import Client, OperatorTable, Request, RequestClaim
 from rack.backplane.segment import Segment
-from rack.boards.config import load, resolve
+from rack.backplane.words import System
+from rack.boards.config import RackConfig, load, resolve
 from rack.boards.config.commands import asked, request
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
 from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
+from rack.tools.recording.entries import commands_from
 from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
@@ -44,6 +46,47 @@ class Commanding(Display):
                 OperatorTable(segment).add(replace(self._given.pop(0), tick=-1))
 
 
+class ByHand(Display):
+    """An operator, waiting or under a lease, at a rack that is held before each command's tick."""
+
+    period_s = 0.01
+
+    def __init__(self, rack: str, given: Sequence[Request], client: Client) -> None:
+        self._rack = rack
+        self._given = [*given]
+        self._client = client
+        self._segment: Segment | None = None
+        self._claims: list[RequestClaim | None] = []
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Command what is due, and step the rack to the next command."""
+        if self._segment is None:
+            self._segment = Segment.attach(self._rack)
+        words = self._segment.words
+        if not words[System.HELD]:
+            return
+        if self._given and words[System.HELD] - 1 == self._given[0].tick:
+            now = replace(self._given.pop(0), tick=-1)
+            self._claims.append(OperatorTable(self._segment).try_claim(now, self._client))
+        words[System.HOLD_AT] = self._given[0].tick + 1 if self._given else 0
+
+    def close(self) -> None:
+        """Leave the rack."""
+        for claim in filter(None, self._claims):
+            claim.leave()
+        if self._segment is not None:
+            self._segment.close()
+
+
+def requests(config: RackConfig, **ticks: int) -> tuple[Request, ...]:
+    """Return commands to the upper level, each at a tick."""
+    layout = resolve(config).layout
+    return tuple(
+        request(asked({"level": "upper", "what": what, "tick": tick}), config, layout)
+        for what, tick in ticks.items()
+    )
+
+
 def commanded(folder: Path, name: str, mode: str) -> Recording:
     """Return a run of 2 s in which an operator commands what no config has: in lockstep at given
     ticks, in real time whenever it comes."""
@@ -51,14 +94,10 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
     file.write_text(COMMANDED)
     settings = (f"name={name}", f"clock.mode={mode}", "record.checkpoint_s=0", commands(HOLD))
     config = load(file, settings)
-    layout = resolve(config).layout
-    given = [
-        request(asked({"level": "upper", "what": what, "tick": tick}), config, layout)
-        for what, tick in (("resume", 80), ("hold", 200))
-    ]
+    given = requests(config, resume=80, hold=200)
     run = folder / "one"
     if mode == "lockstep":
-        run_rack(config, SECONDS, run, Display(), begins=Beginning(requests=tuple(given)))
+        run_rack(config, SECONDS, run, Display(), begins=Beginning(requests=given))
     else:
         run_rack(config, SECONDS, run, Commanding(name, given))
     return Recording(run)
@@ -125,3 +164,82 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
         assert difference is None or difference.tick >= missed[0]
     else:
         assert difference is None
+
+
+@pytest.fixture(params=[Client.WAITS, Client.LEASES])
+def by_hand(request: pytest.FixtureRequest, rack_name: str, tmp_path: Path) -> Recording:
+    """A run in lockstep with a checkpoint each 100 ticks, whose operator commands at 140 and 260
+    what no config has; under a lease these are in force to the end."""
+    file = tmp_path / "commanded.toml"
+    file.write_text(COMMANDED)
+    settings = ("clock.mode=lockstep", "record.checkpoint_s=0.25", commands(HOLD))
+    config = load(file, (f"name={rack_name}", *settings))
+    given = requests(config, resume=140, hold=260)
+    with closing(ByHand(rack_name, given, request.param)) as operator:
+        run_rack(config, SECONDS, tmp_path / "one", operator, step=True)
+    one = Recording(tmp_path / "one")
+    assert one.signal("upper.operator", "tick").tolist() == [40, 140, 260]
+    return one
+
+
+def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
+    """Return the run that goes on from it, with nothing to note."""
+    options = [option for setting in settings for option in ("--set", setting)]
+    names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
+    done = rack("run", *names, *options)
+    assert (done.returncode, done.stderr) == (0, "")
+    return Recording(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("at", "ticks"), [(0.25, [140, 260]), (0.3, [140, 260]), (0.4, [260]), (0.6, [260]), (0.7, [])]
+)
+def test_what_operators_commanded_after_a_checkpoint_is_repeated(
+    by_hand: Recording, tmp_path: Path, at: float, ticks: list[int]
+) -> None:
+    two = continued(by_hand, at, tmp_path / "two")
+    assert first_difference(by_hand, two) is None
+    assert two.signal("upper.operator", "tick").tolist() == ticks
+    assert by_hand.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
+
+
+@pytest.mark.slow
+def test_a_command_that_waits_in_a_checkpoint_is_issued_once(
+    by_hand: Recording, tmp_path: Path
+) -> None:
+    two = continued(by_hand, 0.3, tmp_path / "two")
+    # Those that two repeats wait in its checkpoint at tick 200.
+    three = continued(two, 0.6, tmp_path / "three")
+    assert three.signal("upper.operator", "tick").tolist() == [260]
+    assert first_difference(two, three) is None
+    assert by_hand.ended["outcome"]["digest"] == three.ended["outcome"]["digest"]
+
+
+@pytest.mark.slow
+def test_a_branch_has_its_own_commands_besides_those_repeated(
+    by_hand: Recording, tmp_path: Path
+) -> None:
+    earlier = "level = 'upper', what = 'hold', tick = 200"
+    two = continued(by_hand, 0.25, tmp_path / "two", commands(HOLD, earlier))
+    assert two.signal("upper.operator", "tick").tolist() == [140, 200, 260]
+
+
+@pytest.mark.slow
+def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
+    by_hand: Recording,
+) -> None:
+    by_hand.kept = [(0, 200), (240, 800)]
+    found = [[one.tick for one in commands_from(by_hand, tick)] for tick in (0, 100, 250)]
+    assert found == [[40, 140], [140], [260]]
+
+
+@pytest.mark.slow
+def test_commands_that_do_not_fit_into_the_table_are_noted(
+    by_hand: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # One of them is the config's.
+    monkeypatch.setattr("rack.tools.live.continued.OPERATOR_ENTRIES", 2)
+    options = ("--seconds", SECONDS, "--no-record", "--json")
+    done = rack("run", "--from", f"{by_hand.folder}@0.4", *options)
+    assert "commands from 0.65 s on are not repeated: the operator table holds 2" in done.stderr
