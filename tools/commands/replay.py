@@ -13,6 +13,7 @@ import typer
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import reading_progress
+from rack.tools.recording.divergence import other_run
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackPlace, on_one_time_line, side_by_side
@@ -36,7 +37,10 @@ Against = Annotated[
     Path | None,
     typer.Option(
         metavar="RUN",
-        help="another run of the same rack, as the one that RUN branches off: both, tick by tick",
+        help=(
+            "another run of the same rack, or 'origin', the one that RUN continues: both, tick by"
+            " tick"
+        ),
     ),
 ]
 Places = Callable[[Sequence[Recording]], list[RackPlace]]
@@ -65,13 +69,14 @@ def replay(runs: Runs, out: Out = None, against: Against = None) -> None:
       rack replay runs/cell-puma-20250101-120000 runs/cell-k1607-20250101-120001
       rack replay runs/cell-puma-* runs/cell-k1607-* --out both.rrd
       rack replay runs/slower --against runs/whole
+      rack replay runs/slower --against origin
     """
     place: Places = on_one_time_line
     if against is not None:
         if len(runs) > 1:
             raise Failure("--against: permitted with one RUN", 2)
         place = side_by_side
-        runs = [against, *runs]
+        runs = [other_run(runs[0], against), *runs]
     if out is None and len(runs) == 1 and (recordings := _own(runs[0])):
         _show(*recordings)
         return

@@ -14,7 +14,10 @@ from rack.tools.timing.analysis.stored import print_report, show_report
 
 Against = Annotated[
     Path | None,
-    typer.Option(metavar="RUN", help="another run: where the two diverge, and why"),
+    typer.Option(
+        metavar="RUN",
+        help="another run, or 'origin', the one that RUN continues: where the two diverge, and why",
+    ),
 ]
 Of = Annotated[
     str,
@@ -57,15 +60,18 @@ def report(
       rack report runs/nasrem-20250101-120000
       rack report runs/a --against runs/b
       rack report runs/a --against runs/b --of task.status
+      rack report runs/slower --against origin
     """
     if against is None:
         if of or no_repeat:
             raise Failure("--of and --no-repeat: permitted with --against", 2)
         show_report(run, as_json)
         return
+    from rack.tools.recording.divergence import other_run
     from rack.tools.timing.analysis.report import OtherRun, write_report
 
-    data, text = write_report(run, OtherRun(against, of, not no_repeat))
+    other = other_run(run, against)
+    data, text = write_report(run, OtherRun(other, of, not no_repeat))
     print_report(data, text, as_json)
     if not data["against"]["explained"]:
         sys.exit(1)

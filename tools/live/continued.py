@@ -34,6 +34,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.launch import Beginning
 from rack.tools.recording.divergence import ticks_of
 from rack.tools.recording.entries import commands_from, recorded_commands
+from rack.tools.recording.origin import Origin
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
@@ -94,8 +95,9 @@ def state_at(
     """
     asked = asked or f"{recording.folder}@{tick * recording.layout.clock_ns * 1e-9:g}"
     begins, before = begun_before(recording, tick, asked)
+    this = Origin.at(recording, tick)
     if begins == tick and not shows:
-        yield RunState(before)
+        yield RunState(replace(before, origin=this))
         return
     with ExitStack() as stack:
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-") as folder:
@@ -110,7 +112,8 @@ def state_at(
         # The file has no name any more: however this process ends, nothing is left. Boards open it
         # by this process's descriptor.
         origin = Path(f"/proc/{os.getpid()}/fd/{file.fileno()}")
-        yield RunState(Beginning(_kept_in(recording, origin, tick)), attributes)
+        kept_there = _kept_in(recording, origin, tick)
+        yield RunState(Beginning(kept_there, origin=this), attributes)
 
 
 def tick_of(text: str, clock_ns: int) -> int:

@@ -32,8 +32,8 @@ from rack.tools.live.continued import (
 )
 from rack.tools.live.launch import Beginning
 from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, dotted
-from rack.tools.recording.divergence import continued_at
 from rack.tools.recording.entries import commands_from
+from rack.tools.recording.origin import continued_at
 from rack.tools.recording.recording import Recording
 
 Because = Literal["state", "code", "chance"]

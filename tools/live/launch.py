@@ -29,6 +29,7 @@ from rack.tools.live.holds import Standstill
 from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import Queues
 from rack.tools.live.snapshot import RackMonitor
+from rack.tools.recording.origin import Origin
 from rack.tools.recording.recorder_process import RecorderProcess
 
 COUNTED = (
@@ -48,10 +49,11 @@ News = Callable[[], list[str]]
 @dataclass(frozen=True)
 class Beginning:
     """What a run goes on from: the checkpoint of another run, or, without one, the other's first
-    tick; and the commands that its operators gave."""
+    tick; the commands that its operators gave; and which run that is, for the record."""
 
     checkpoint: Keeping | None = None
     requests: tuple[Request, ...] = ()
+    origin: Origin | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,8 @@ def run_rack(  # noqa: PLR0913  # each is an option of the command
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                     (folder / "config.toml").write_text(config.text())
+                    if begins.origin is not None:
+                        begins.origin.write(folder)
                     log.open(folder / "events.jsonl")
                 except OSError as error:
                     raise Failure(f"{folder}: {error.strerror}") from None

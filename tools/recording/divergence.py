@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.boards.events import CONTINUES
 from rack.tools.console.answer import Failure
+from rack.tools.recording.origin import Origin
+from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
 HEADS = ("serial", "tick", "visible_at", "chain")
@@ -40,6 +42,23 @@ class UnlikeMessage:
     serial: int
     tick: int
     visible_at: int
+
+
+def other_run(run: Path, named: Path) -> Path:
+    """Return the folder of the run that one is compared with: the one `named` or, for "origin", the
+    one that it goes on from, where its user named it or next to it. Raises `Failure`."""
+    if str(named) != "origin":
+        return named
+    asked = f"--against origin: {run}"
+    origin = Origin.of(Recording(run))
+    if origin is None or origin.folder is None:
+        raise Failure(f"{asked} records no run that it goes on from; permitted: --against RUN", 2)
+    there = Path(origin.folder)
+    for folder in (there, run.resolve().parent / there.name):
+        if (folder / CONFIG).is_file() and origin.is_of(Recording(folder)):
+            return folder
+    why = "that run is not there any more; permitted: --against RUN"
+    raise Failure(f"{asked} goes on from {there}, and {why}", 2)
 
 
 def first_difference(one: Recording, other: Recording) -> Difference | None:
@@ -74,12 +93,6 @@ def ticks_of(recording: Recording) -> tuple[int, int]:
     end: int = recording.ended.get("outcome", {}).get("ticks", 0)
     end = end or max((int(ticks[-1]) + 1 for ticks in found), default=0)
     return min((int(ticks[0]) for ticks in found), default=0), end
-
-
-def continued_at(recording: Recording) -> int | None:
-    """Return the tick before which a run that goes on from another begins; None for any other."""
-    found = (event["tick"] for event in recording.events if event.get("code") == CONTINUES)
-    return next(found, None)
 
 
 def common_ticks(one: Recording, other: Recording) -> tuple[int, int]:

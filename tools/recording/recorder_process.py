@@ -20,6 +20,8 @@ VIEW = "rack.tools.viewer.sink:ViewSink"
 """What shows a recording, by name: recording itself needs none of it."""
 SPOOL = "recorder.spool"
 """Name of the file that a recorder has open in the folder of its run."""
+ORIGIN = "origin.json"
+"""Name of the file, there, that says which run this one goes on from."""
 BEGUN = "recording"
 """Printed by the recorder when it has attached."""
 ATTACH_S = 30.0

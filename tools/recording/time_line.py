@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from rack.boards.config.timing import tick_ns
 from rack.levels.peer import DRIFT_PPM, PEER, Presence, peer_port
 from rack.tools.console.answer import Failure
-from rack.tools.recording.divergence import continued_at, unlike_messages
+from rack.tools.recording.divergence import unlike_messages
+from rack.tools.recording.origin import continued_at
 from rack.tools.recording.recording import Recording
 
 Ints = NDArray[np.int64]

@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 
 from rack.boards.checkpoint.format import FOLDER
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recorder_process import ORIGIN
 from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.report import write_report
 from tests.tools.command_line import rack
 
 SECONDS = 2.0
@@ -51,6 +54,65 @@ def test_a_recorded_run_continues_and_its_recording_begins_there(run: Path, tmp_
         assert serials.tolist() == one.signal(name, "serial")[-len(serials) :].tolist()
     assert other.trace("lower")["tick"][[0, -1]].tolist() == [480, 799]
     assert content(run) == before
+
+
+@pytest.mark.slow
+def test_a_branch_names_the_run_that_it_continues(run: Path, tmp_path: Path) -> None:
+    two = tmp_path / "two"
+    done = rack(
+        *("run", "--from", f"{run}@1.2", "--set", "record.checkpoint_s=0"),
+        *("--seconds", SECONDS, "--out", two, "--json"),
+    )
+    named = json.loads(done.stdout)["continues"]
+    assert named == {
+        "folder": str(run),
+        "tick": 480,
+        "time_s": 1.2,
+        "launched_ns": Recording(run).launch.created_ns,
+    }
+    assert f"\n- continues {run} from 1.2 s\n" in rack("report", two).stdout
+    assert json.loads(rack("report", run, "--json").stdout)["continues"] is None
+
+
+@pytest.mark.slow
+def test_the_run_that_a_branch_continues_is_found_if_it_is_the_very_run(
+    run: Path, small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    rack("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--out", tmp_path / "two", "--json")
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for folder in (run, tmp_path / "two"):
+        folder.rename(moved / folder.name)
+    against = ("report", moved / "two", "--against", "origin")
+    found = json.loads(rack(*against, "--json").stdout)["against"]
+    assert (found["folder"], found["first_difference"]) == (str(moved / "one"), None)
+    (moved / "one").rename(moved / "elsewhere")
+    names = ("--set", f"name={rack_name}", "--out", run)
+    rack("run", small, "--lockstep", "--seconds", SECONDS, *names)
+    refused = rack(*against)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+    assert f"goes on from {run}, and that run is not there any more" in refused.stderr
+
+
+@pytest.mark.slow
+def test_a_branch_of_an_earlier_version_still_reads(run: Path, tmp_path: Path) -> None:
+    two = tmp_path / "two"
+    rack("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--out", two)
+    (two / ORIGIN).unlink()
+    report, text = write_report(two)
+    found = report["continues"]
+    assert found == {"folder": None, "tick": 480, "time_s": 1.2, "launched_ns": None}
+    assert "\n- continues another run from 1.2 s\n" in text
+    refused = rack("report", two, "--against", "origin")
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+    assert "records no run that it goes on from; permitted: --against RUN" in refused.stderr
+
+
+@pytest.mark.slow
+def test_an_origin_that_is_none_is_refused(run: Path) -> None:
+    (run / ORIGIN).write_text("{}")
+    with pytest.raises(Failure, match=r"origin\.json: not the origin of a run: KeyError"):
+        write_report(run)
 
 
 @pytest.mark.slow

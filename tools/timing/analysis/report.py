@@ -38,6 +38,7 @@ from rack.tools.recording.history import (
     misses,
     steal,
 )
+from rack.tools.recording.origin import Origin
 from rack.tools.recording.recorder_process import sizes
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
@@ -82,6 +83,7 @@ def report_of(recording: Recording) -> Report:
     config = recording.rack_config
     layout = recording.layout
     ended = recording.ended
+    origin = Origin.of(recording)
     found = misses(recording)
     last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
     report = _head(config, ended, last + 1)
@@ -91,6 +93,7 @@ def report_of(recording: Recording) -> Report:
     return {
         **report,
         "folder": str(recording.folder),
+        "continues": None if origin is None else origin.document(layout.clock_ns),
         "misses": found,
         "steal": steal(recording),
         "stalls": asdict(stalls_of(recording)[0]),
@@ -124,7 +127,7 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     unknown = (
         *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
         *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
-        *("task", "motion", "hand", "force", "queues", "interrupts"),
+        *("task", "motion", "hand", "force", "queues", "interrupts", "continues"),
         *("rows_lost", "gaps", "untraced", "kept", "bytes", "bytes_per_s"),
     )
     layout = wire(config)

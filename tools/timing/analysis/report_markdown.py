@@ -77,6 +77,8 @@ def _blocks(report: Report) -> Iterator[str | TextTable]:
         f"{report['missed']} missed, {report['skipped']} skipped cycles."
         f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
     )
+    if found := report["continues"]:
+        yield f"- continues {found['folder'] or 'another run'} from {found['time_s']:g} s"
     yield from (f"- fault: {fault}" for fault in outcome["faults"])
     if found := outcome.get("brakings"):
         yield f"- {braked_text([Braking(**one) for one in found])}"

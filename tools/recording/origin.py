@@ -1,0 +1,76 @@
+"""The run that another one goes on from: origin.json in the folder of the later one.
+
+Launching a run needs this, so it imports nothing that reads recordings.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from rack.boards.events import CONTINUES
+from rack.tools.console.answer import Failure
+from rack.tools.recording.recorder_process import ORIGIN
+
+if TYPE_CHECKING:
+    from rack.tools.recording.recording import Recording
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The run that another one goes on from before `tick`.
+
+    `folder`: as its user named it. `launched_ns`: when it was launched, on the wall clock; no other
+    run has that. Both are None where an earlier version recorded no more than the tick, and the
+    latter for a run of an earlier version.
+    """
+
+    folder: str | None
+    tick: int
+    launched_ns: int | None
+
+    @classmethod
+    def at(cls, run: Recording, tick: int) -> Self:
+        """Return it for what goes on from a run."""
+        return cls(str(run.folder), tick, _launched_ns(run))
+
+    @classmethod
+    def of(cls, recording: Recording) -> Self | None:
+        """Return it for a recorded run; None for one that goes on from no other. Raises `Failure`
+        for a file that is not one of these."""
+        path = recording.folder / ORIGIN
+        if not path.exists():
+            tick = continued_at(recording)
+            return None if tick is None else cls(None, tick, None)
+        try:
+            found = json.loads(path.read_bytes())
+            return cls(str(found["folder"]), int(found["tick"]), found["launched_ns"])
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise Failure(f"{path}: not the origin of a run: {error!r}", 2) from None
+
+    def is_of(self, run: Recording) -> bool:
+        """Say whether it is this run, and no other one of that name."""
+        return _launched_ns(run) == self.launched_ns
+
+    def write(self, folder: Path) -> None:
+        """Write it into the folder of the later run. Raises `OSError`."""
+        (folder / ORIGIN).write_text(json.dumps(asdict(self)) + "\n")
+
+    def document(self, clock_ns: int) -> dict[str, Any]:
+        """Return it as plain data, with its simulated time, s."""
+        return {**asdict(self), "time_s": round(self.tick * clock_ns * 1e-9, 9)}
+
+
+def continued_at(recording: Recording) -> int | None:
+    """Return the tick before which a run that goes on from another begins; None for any other."""
+    found = (event["tick"] for event in recording.events if event.get("code") == CONTINUES)
+    return next(found, None)
+
+
+def _launched_ns(run: Recording) -> int | None:
+    with suppress(Failure):
+        return run.launch.created_ns
+    return None
