@@ -170,10 +170,10 @@ class PlannerLoop(Task):
             return
         self._take_time_slice(tick)
         self.plan(tick)
-        watch.process_ns = monotonic_ns()
         with self._critical_section():
+            # Stamped inside: before the section, and on leaving it, the executor may run first.
+            watch.process_ns = monotonic_ns()
             in_time = self.write_plan(tick, watch.now(tick + self.slice))
-            # Stamped inside: on leaving the section the executor may run first.
             watch.end_ns = monotonic_ns()
         self.block[Block.PLANS] += 1
         # A plan begun late gets its whole slice, and answers any release within it.

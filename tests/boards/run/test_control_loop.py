@@ -22,6 +22,7 @@ from rack.backplane.words import Block, System
 from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
 from rack.boards.faults.kind import KINDS
+from rack.boards.run import control_loop
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
 from tests.backplane.bus import task as task_spec
@@ -161,6 +162,21 @@ def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -
     slots = Slots(rack.segment, rack.segment.layout.mailbox("watch.status"))
     assert slots.fetch(1)
     assert (slots.tick, slots.basis) == (8, 3)
+
+
+def test_the_update_of_a_plan_is_stamped_inside_the_critical_section(
+    bench: MakeBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What is outside the executor may preempt: that is no fault of the update.
+    rack = bench("board.wave.priority=50", "protocol.default=lock")
+    called: list[int] = []
+    monkeypatch.setattr(
+        control_loop, "set_priority", lambda priority: called.append(time.monotonic_ns())
+    )
+    rack.task("wave.planner").cycle(0)
+    (row,) = trace_ring(rack.segment, "wave.planner").drain().rows
+    entered, left = called
+    assert entered <= row["process_ns"] <= row["end_ns"] <= left
 
 
 def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
