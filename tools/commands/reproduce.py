@@ -64,7 +64,7 @@ def reproduce(
     Every ruling results from comparisons of measured values, which the page lists. A claim is not
     judged by a run that does not show it, such as one in which a level made no plan.
 
-    It takes fourteen to eighteen minutes on two cores. Do not use the machine meanwhile: real-time
+    It takes fifteen minutes on two cores. Do not use the machine meanwhile: real-time
     figures suffer. What is finished is kept, also if the command is interrupted or killed: given
     again, it continues. A change of configs, program or machine makes the experiments anew that
     depend on it.

@@ -24,7 +24,7 @@ from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import BenchResult, plain
-from rack.tools.lab.benches.observed import record
+from rack.tools.lab.benches.observed import UNVIEWED, record
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, plot, response_of
 
@@ -119,7 +119,8 @@ class ResponseRuns:
         self._mode = mode
         self._seed = seed
         self._progress = progress
-        self._config = load(name, [f"name=response-{os.getpid()}", f"clock.mode={mode}"])
+        own = f"name=response-{os.getpid()}", f"clock.mode={mode}"
+        self._config = load(name, [*own, *UNVIEWED])
         layout = wire(self._config)
         self._paths = command_paths(rack_timing(self._config, layout), layout)
         if not self._paths:

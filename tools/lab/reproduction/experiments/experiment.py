@@ -32,7 +32,7 @@ from rack.boards.crate.clean import remove_dead
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.lab.benches.cyclictest import permits_fifo
-from rack.tools.lab.benches.observed import Recorded, record
+from rack.tools.lab.benches.observed import UNVIEWED, Recorded, record
 
 KEPT = "parts"
 RUNS = "runs"
@@ -79,8 +79,9 @@ class Workshop:
     def config(
         self, name: str, settings: Sequence[str] = (), faults: str | None = None
     ) -> RackConfig:
-        """Return a config under a name of its own. Raises `ConfigError`."""
-        return load(self.source(name), [*settings, f"name={self.rack}"], faults)
+        """Return a config under a name of its own, whose recording nobody views. Raises
+        `ConfigError`."""
+        return load(self.source(name), [*settings, *UNVIEWED, f"name={self.rack}"], faults)
 
     def source(self, name: str) -> str:
         """Return a config's name, or its text, as an experiment loads it: a rack that breaks a

@@ -78,7 +78,7 @@ class NetworkRun(TaskRun):
 def _run(name: str, workshop: Workshop) -> TaskRun:
     need_real_time()
     with _patience(workshop, TASKS_S[name]):
-        return _found(*workshop.run(f"task-{name}", workshop.config(name, UNVIEWED)))
+        return _found(*workshop.run(f"task-{name}", workshop.config(name)))
 
 
 @contextmanager
