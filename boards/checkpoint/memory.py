@@ -74,10 +74,12 @@ def _newest(ring: tuple[int, int, int], head: int, count: int) -> Iterator[tuple
     records; as few pieces as there are."""
     address, size, depth = ring
     count = min(count, depth, head)
+    if not count:
+        # A host board's trace has no depth.
+        return
     first = (head - count + 1) % depth
     before_wrap = min(count, depth - first)
-    if count:
-        yield address + first * size, before_wrap * size
+    yield address + first * size, before_wrap * size
     if count > before_wrap:
         yield address, (count - before_wrap) * size
 

@@ -25,7 +25,7 @@ def origin(plan: Resolved, keeping: Keeping) -> Checkpoint | None:
     rack = plan.config.name
     if plan.config.clock.mode != "lockstep":
         raise CheckpointError(f"rack '{rack}': checkpoints are taken in lockstep; add --lockstep")
-    if why := outside(plan.config):
+    if why := outside(plan.config, runs_hosts=bool(plan.hosts)):
         raise CheckpointError(f"rack '{rack}' has no checkpoints: {why}")
     if keeping.origin is None:
         return None

@@ -145,6 +145,8 @@ def run(
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
+    if origin is not None and entries is not None:
+        raise Failure("--entries and --from: a run that is continued has its own; leave one out", 2)
     if origin is not None:
         from rack.tools.live.continued import beginning, run_of
 
@@ -155,7 +157,7 @@ def run(
     from rack.boards.config.resolved import validated
     from rack.tools.live.display import display_for
     from rack.tools.live.folder import folder_of
-    from rack.tools.live.launch import NO_TIME, run_rack
+    from rack.tools.live.launch import NO_TIME, Beginning, run_rack
 
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
@@ -173,7 +175,8 @@ def run(
         unfinished = NO_TIME.format(folder) if folder else ""
         stack.enter_context(INTERRUPT.orderly(unfinished=unfinished))
         with display_for(silent=as_json) as display:
-            again = None if entries is None else recorded_entries(found, entries)
+            if entries is not None:
+                begins = Beginning(entries=recorded_entries(found, entries))
             result = run_rack(
                 found,
                 seconds,
@@ -183,7 +186,6 @@ def run(
                 share=share,
                 crate=crate,
                 step=step,
-                entries=again,
                 begins=begins,
             )
         _report(found, folder, result, as_json)

@@ -28,12 +28,12 @@ from rack.boards.config.files import assembled
 from rack.boards.config.resolved import validated
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
-from rack.boards.wiring import Keeping
+from rack.boards.wiring import Entries, Keeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.launch import Beginning
 from rack.tools.recording.divergence import ticks_of
-from rack.tools.recording.entries import commands_from, recorded_commands
+from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
@@ -72,6 +72,12 @@ def beginning(config: RackConfig, origin: str) -> Iterator[Beginning]:
     asked = f"--from {origin}"
     tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
     with state_at(recording, tick, asked=asked) as state:
+        if state.begins.entries is not None:
+            hosts = ", ".join(map(repr, config.host))
+            print(
+                f"{asked}: host boards are not started: what {hosts} sent enters again",
+                file=sys.stderr,
+            )
         checkpoint = state.begins.checkpoint
         if checkpoint is not None:
             checkpoint = replace(checkpoint, packages=config.python_path)
@@ -113,7 +119,7 @@ def state_at(
         # by this process's descriptor.
         origin = Path(f"/proc/{os.getpid()}/fd/{file.fileno()}")
         kept_there = _kept_in(recording, origin, tick)
-        yield RunState(Beginning(kept_there, origin=this), attributes)
+        yield RunState(Beginning(kept_there, entries=before.entries, origin=this), attributes)
 
 
 def tick_of(text: str, clock_ns: int) -> int:
@@ -152,7 +158,9 @@ def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Begi
         return begins, Beginning(keeping, _commanded(recording, begins, asked))
     if ticks_of(recording)[0] > max(task.every for task in recording.layout.tasks):
         # Of a run that goes on from another the beginning is that other's.
-        first = min(kept, default=ticks_of(recording)[1]) * recording.layout.clock_ns * 1e-9
+        if not kept:
+            raise Failure(f"{asked}: it continues another run, and has no checkpoints", 2)
+        first = min(kept) * recording.layout.clock_ns * 1e-9
         raise Failure(f"{asked}: permitted: from its first checkpoint, {first:g} s, on", 2)
     commands = recorded_commands(recording)
     if not kept:
@@ -163,7 +171,13 @@ def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Begi
             f" beginning, with {len(commands)} commands of its operators{without}",
             file=sys.stderr,
         )
-    return 0, Beginning(requests=commands)
+    return 0, Beginning(requests=commands, entries=_entered(recording, asked))
+
+
+def _entered(recording: Recording, asked: str) -> Mapping[str, Entries] | None:
+    """Return what host boards sent in a run; None: its rack has none."""
+    config = recording.rack_config
+    return recorded_entries(config, recording.folder, asked) if config.host else None
 
 
 def _commanded(recording: Recording, begins: int, asked: str) -> tuple[Request, ...]:
@@ -212,7 +226,9 @@ def gone_on(
     ran = branched(recording, (), None)
     # The run's own name may be in use, by a branch.
     config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{until}-{os.getpid()}"})
-    with Rack(config, crate=crate, keeping=keeping, requests=begins.requests) as rack:
+    with Rack(
+        config, crate=crate, entries=begins.entries, keeping=keeping, requests=begins.requests
+    ) as rack:
         rack.run(until * config.clock_ns * 1e-9)
         if keeping is not None and not _is_kept(keeping):
             printed = [event.text for event in rack.events if event.kind == "printed"]

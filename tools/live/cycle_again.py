@@ -144,7 +144,9 @@ class _Repeater:
             keeping = state.begins.checkpoint
             assert keeping is not None, "a state that is kept"
             keeping = replace(keeping, packages=run.rack_config.python_path)
-            yield Beginning(keeping, commands_from(run, branched_at))
+            yield replace(
+                state.begins, checkpoint=keeping, requests=commands_from(run, branched_at)
+            )
 
     def strays(self, again: CycleAgain) -> tuple[str, ...]:
         """Return the mailboxes of other tasks that are not as recorded."""

@@ -49,10 +49,12 @@ News = Callable[[], list[str]]
 @dataclass(frozen=True)
 class Beginning:
     """What a run goes on from: the checkpoint of another run, or, without one, the other's first
-    tick; the commands that its operators gave; and which run that is, for the record."""
+    tick; the commands that its operators gave; what its host boards sent, which are not started
+    then; and which run that is, for the record."""
 
     checkpoint: Keeping | None = None
     requests: tuple[Request, ...] = ()
+    entries: Mapping[str, Entries] | None = None
     origin: Origin | None = None
 
 
@@ -114,7 +116,7 @@ class RunResult:
         return "\n".join([*lines, f"digest {end.digest}"])
 
 
-def run_rack(  # noqa: PLR0913  # each is an option of the command
+def run_rack(
     config: RackConfig,
     seconds: float | None,
     folder: Path | None,
@@ -124,16 +126,15 @@ def run_rack(  # noqa: PLR0913  # each is an option of the command
     share: bool = True,
     crate: CrateLine | None = None,
     step: bool = False,
-    entries: Mapping[str, Entries] | None = None,
     begins: Beginning | None = None,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`
     unless that is None.
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
-    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share`, `crate` and
-    `entries` are as in `Rack`; `begins`: the run that it continues or repeats. A rack in lockstep
-    that is recorded takes checkpoints, if it can. Launch the racks that the config names: one that
+    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share` and `crate` are
+    as in `Rack`; `begins`: the run that it continues or repeats. A rack in lockstep that is
+    recorded takes checkpoints, if it can. Launch the racks that the config names: one that
     fails ends the run, and a run that does not succeed ends them.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
@@ -158,7 +159,7 @@ def run_rack(  # noqa: PLR0913  # each is an option of the command
                     log.add,
                     share or bool(others),
                     crate,
-                    entries,
+                    begins.entries,
                     keeping,
                     begins.requests,
                 )

@@ -19,13 +19,14 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
 
-def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
+def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Entries]:
     """Return what each bus adapter of a config wrote in the run in folder `run`, by adapter and
     port.
 
-    Raises `ConfigError` for mistakes in the config, and `Failure` if the run has other entries, or
-    lost some.
+    Raises `ConfigError` for mistakes in the config, and `Failure`, which begins with what was
+    `asked`, if the run has other entries, or lost some.
     """
+    asked = asked or f"--entries {run}"
     plan = resolve(config)
     layout = plan.layout
     recording = Recording(run)
@@ -42,12 +43,12 @@ def recorded_entries(config: RackConfig, run: Path) -> dict[str, Entries]:
         ]
         boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in (*inward, STATUS)}
         for box in boxes.values():
-            _check(box, ran.get(box.name), recording)
+            _check(box, ran.get(box.name), recording, asked)
         found[task.task] = {
             port: _rows(recording, box, is_queued=port in task.sent) for port, box in boxes.items()
         }
     if not found:
-        raise Failure(f"--entries {run}: '{config.name}' has no bus adapter", 2)
+        raise Failure(f"{asked}: '{config.name}' has no bus adapter", 2)
     return found
 
 
@@ -85,7 +86,7 @@ def _issued(recording: Recording, layout: Layout) -> list[Request]:
     for box in layout.mailboxes:
         if box.writer != CLOCK or box.name not in recording.mailboxes:
             continue
-        _check_whole(box, recording, "--from")
+        _check_whole(box, recording, f"--from {recording.folder}")
         messages = recording.messages(box)
         ids = messages[COMMAND_ID].tolist()
         # The clock numbers commands when it issues them.
@@ -98,7 +99,9 @@ def _issued(recording: Recording, layout: Layout) -> list[Request]:
     return [request for _, _, request in found]
 
 
-def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording) -> None:
+def _check(
+    box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording, asked: str
+) -> None:
     if recorded is None or (recorded.message, recorded.version, recorded.size) != (
         box.message,
         box.version,
@@ -110,17 +113,15 @@ def _check(box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording)
             else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
         )
         wanted = f"{box.message} {box.version}, {box.size} bytes"
-        raise Failure(f"--entries {recording.folder}: {box.name}: {what}; needed: {wanted}", 2)
+        raise Failure(f"{asked}: {box.name}: {what}; needed: {wanted}", 2)
     if recording.kept:
-        raise Failure(f"--entries {recording.folder}: {recording.kept_text}", 2)
-    _check_whole(box, recording, "--entries")
+        raise Failure(f"{asked}: {recording.kept_text}", 2)
+    _check_whole(box, recording, asked)
 
 
 def _check_whole(box: MailboxSpec, recording: Recording, asked: str) -> None:
     if lost := recording.lost.get(box.name):
-        raise Failure(
-            f"{asked} {recording.folder}: {box.name}: its recorder lost {lost} messages", 2
-        )
+        raise Failure(f"{asked}: {box.name}: its recorder lost {lost} messages", 2)
 
 
 def _rows(recording: Recording, box: MailboxSpec, is_queued: bool) -> list[tuple[int, bytes]]:

@@ -81,7 +81,12 @@ class RecordedMoment:
             config = branched(self._recording, settings, faults)
             with state_at(self._recording, self.tick) as state:
                 begins = state.begins
-                rack = Rack(config, keeping=begins.checkpoint, requests=begins.requests)
+                rack = Rack(
+                    config,
+                    entries=begins.entries,
+                    keeping=begins.checkpoint,
+                    requests=begins.requests,
+                )
                 rack.launch()
                 rack.run_in_background(seconds)
                 _await_begun(rack)

@@ -14,11 +14,16 @@ from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import CheckpointError
 from rack.boards.wiring import Keeping
+from rack.tools.lab.benches.observed import record
+from rack.tools.live.continued import beginning
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
 from tests import golden
 
 EVERY_S = 1.5
 WITHOUT = ("chimera", "condor", "ibm", "penn")
 """Racks with programs on the host side, whose state nobody can copy."""
+HOSTED_S = 3.0
 RUNS = [run for run in golden.RUNS if not run.startswith(WITHOUT)]
 
 
@@ -66,3 +71,17 @@ def test_a_rack_with_programs_on_the_host_side_is_refused_by_their_names(
     config, _ = rack_of(system, rack_name)
     with pytest.raises(CheckpointError, match=r"has no checkpoints: '.*': a host program's state"):
         Rack(config, keeping=Keeping(tmp_path, 100)).launch()
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(240)  # three runs
+@pytest.mark.parametrize("system", WITHOUT)
+def test_a_shipped_rack_with_host_programs_continues_with_what_they_sent(
+    system: str, rack_name: str, tmp_path: Path
+) -> None:
+    config, _ = rack_of(system, rack_name)
+    one = record(config, HOSTED_S, tmp_path / "one")
+    two = tmp_path / "two"
+    with beginning(config, f"{tmp_path / 'one'}@{HOSTED_S / 2}") as begins:
+        again = run_rack(config, HOSTED_S, two, Display(), begins=begins)
+    assert again.outcome.digest == one.result.outcome.digest

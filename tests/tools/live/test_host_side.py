@@ -13,8 +13,10 @@ from typing import Any
 
 import pytest
 
+from rack import open_run
 from rack.boards import Rack
 from rack.boards.config import load
+from rack.tools.recording.recording import Recording
 from tests.boards.host.test_board import HOSTED
 from tests.processes import RACK
 from tests.tools.command_line import rack
@@ -51,6 +53,47 @@ def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
     assert next(entry["passed"] for entry in first["entries"]) == 40
     unkept = "no checkpoints: 'program': a host program's state"
     assert first["notes"] == again["notes"] == [unkept]
+
+
+@pytest.mark.slow
+def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
+    tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
+) -> None:
+    run, first = recorded
+    one = Recording(run)
+    tick = int(one.signal("bridge.numbers", "tick")[20])
+    middle_s = tick * one.layout.clock_ns * 1e-9
+    asked = f"--from {run}@{middle_s}"
+    done = rack("run", *asked.split(), "--out", tmp_path / "two", "--json")
+    assert json.loads(done.stdout)["digest"] == first["digest"]
+    assert done.stderr.splitlines() == [
+        f"{asked}: {run} has no checkpoints: it is repeated in lockstep from its beginning, with 0"
+        " commands of its operators",
+        f"{asked}: host boards are not started: what 'program' sent enters again",
+    ]
+    two = Recording(tmp_path / "two")
+    assert two.signal("bridge.numbers", "tick").min() >= tick
+    refused = rack("run", "--from", f"{two.folder}@{middle_s}", "--no-record")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr.endswith("it continues another run, and has no checkpoints\n")
+    refused = rack("run", *asked.split(), "--entries", run)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "a run that is continued has its own" in refused.stderr
+
+
+@pytest.mark.slow
+def test_the_levels_of_a_run_with_a_host_board_are_shown_at_a_tick(
+    recorded: tuple[Path, dict[str, Any]],
+) -> None:
+    run, first = recorded
+    one = Recording(run)
+    tick = int(one.signal("bridge.numbers", "tick")[20])
+    moment = open_run(run).at(tick * one.layout.clock_ns * 1e-9)
+    assert set(moment.levels()) == {"adder", "bridge"}
+    with moment.resume() as again:
+        outcome = again.wait(60)
+    assert outcome is not None
+    assert outcome.digest == first["digest"]
 
 
 @pytest.mark.slow
