@@ -183,12 +183,16 @@ class Message:
 
 
 def text_of(content: bytes | bytearray) -> str:
-    """Return the content of a text field for people, with control characters as escapes.
+    """Return the content of a text field for people: see `printable`."""
+    return printable(content.decode("ascii", "replace"))
+
+
+def printable(text: str) -> str:
+    """Return a text with control characters as escapes.
 
     Texts come from other racks and from levels of users, and end on terminals, which would obey an
     escape sequence.
     """
-    text = content.decode("ascii", "replace")
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -153,7 +153,7 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
         why = (
             Operation(what[first]).name.lower()
             if is_operators
-            else _reason(recording, mailbox, end - 1)
+            else recording.reason(mailbox, end - 1)
         )
         since = int(ticks[first])
         until = int(ticks[end]) if end < len(ticks) else None
@@ -165,12 +165,6 @@ def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
             "until_s": None if until is None else round(until * tick_s, 6),
             "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),
         }
-
-
-def _reason(recording: Recording, mailbox: str, row: int) -> str:
-    """Return the reason in a status; empty without one."""
-    has_reason = "reason" in recording.fields(mailbox)
-    return str(recording.signal(mailbox, "reason")[row]) if has_reason else ""
 
 
 def _stretches(what: np.ndarray) -> list[tuple[int, int]]:

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from rack.backplane.layout import MailboxSpec, TaskSpec
 from rack.backplane.mailbox.history import row_dtype
 from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.message import printable
 from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
@@ -325,6 +326,12 @@ class Recording:
         if not values:
             return np.empty((0, *shape))
         return np.concatenate(values).reshape(-1, *shape)
+
+    def reason(self, mailbox: str, row: int) -> str:
+        """Return the reason in a status, for people; empty for one of a user's level without
+        one."""
+        has_reason = "reason" in self.fields(mailbox)
+        return printable(str(self.signal(mailbox, "reason")[row])) if has_reason else ""
 
     def messages(self, box: MailboxSpec) -> np.ndarray:
         """Return every message of a mailbox as it was written, oldest first; `box` with its

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from rack.backplane.message import State
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
 from rack.tools.recording.parquet import HEAD, SignalTables
@@ -183,6 +184,19 @@ def test_a_last_line_that_is_cut_is_left_out_and_said(
     path.write_text("\n".join([*lines, lines[0][:20]]))
     assert Recording(damaged).events == [json.loads(line) for line in lines]
     assert f"{path}: line {len(lines) + 1} is cut off, and left out" in capsys.readouterr().err
+
+
+def test_a_reason_cannot_command_the_terminal_that_shows_a_report(damaged: Path) -> None:
+    file = damaged / TABLE / "0001.parquet"
+    table = pq.read_table(file)
+    for name, value in (("state", State.HOLDING), ("reason", "\x1b[2J")):
+        column = table.schema.field(name)
+        values = pa.array([value] * len(table), column.type)
+        table = table.set_column(table.schema.get_field_index(name), column, values)
+    pq.write_table(table, file)
+    _, text = write_report(damaged)
+    assert "\x1b" not in text
+    assert r"\x1b[2J" in text
 
 
 def test_a_run_without_events_has_a_report_all_the_same(damaged: Path) -> None:

@@ -45,7 +45,7 @@ def task_outcome(recording: Recording) -> Report | None:
     }
     return {
         "state": State(int(last("state"))).name.lower(),
-        "reason": str(last("reason")),
+        "reason": recording.reason(mailbox, -1),
         **counts,
     }
 

@@ -88,7 +88,7 @@ def _outcome(workshop: Workshop, label: str, place: list[float], by_s: float | N
         earliest_s=_earliest_s(recording),
         moved=_has_moved(recording),
         cause=outcome.cause,
-        reason=outcome.reason or str(recording.signal("task.status", "reason")[-1]),
+        reason=outcome.reason or recording.reason("task.status", -1),
     )
 
 
