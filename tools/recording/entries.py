@@ -63,7 +63,9 @@ def recorded_commands(recording: Recording) -> tuple[Request, ...]:
     if commanded and recording.kept:
         raise Failure(f"--from {recording.folder}: {recording.kept_text}", 2)
     for known in plan.commands:
-        given = (r for r in commanded if replace(r, tick=known.tick) == known)
+        # Issued at its tick, or later in real time: the same may have been commanded before it.
+        later = (r for r in commanded if r.tick >= known.tick)
+        given = (r for r in later if replace(r, tick=known.tick) == known)
         if (one := next(given, None)) is not None:
             commanded.remove(one)
     return tuple(commanded)

@@ -20,7 +20,7 @@ from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
 from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
-from rack.tools.recording.entries import commands_from
+from rack.tools.recording.entries import commands_from, recorded_commands
 from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
@@ -114,6 +114,18 @@ def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
     assert done.stderr.splitlines() == [said]
     assert json.loads(done.stdout)["recording"] == "complete"
     return Recording(folder)
+
+
+@pytest.mark.slow
+def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
+    rack_name: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "commanded.toml"
+    file.write_text(COMMANDED)
+    config = load(file, (f"name={rack_name}", "clock.mode=lockstep", commands(HOLD)))
+    given = requests(config, hold=20, resume=30)
+    run_rack(config, 0.5, tmp_path / "one", Display(), begins=Beginning(requests=given))
+    assert recorded_commands(Recording(tmp_path / "one")) == given
 
 
 @pytest.mark.slow
