@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from PIL import Image
 
 from rack.levels.robot.cell import Cell
 
@@ -56,16 +54,5 @@ def draw(cell: Cell, path: Path) -> str:
     mujoco.mjr_readPixels(pixels, None, window, drawn)
     drawn.free()
     context.free()
-    path.write_bytes(_png(pixels[::-1]))
+    Image.fromarray(pixels[::-1]).save(path, "png")
     return str(path)
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """Return pixels (height, width, 3) as a PNG file: every row unfiltered."""
-    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (1, 0)))
-    head = struct.pack(">IIBBBBB", pixels.shape[1], len(pixels), 8, 2, 0, 0, 0)
-    found = b"\x89PNG\r\n\x1a\n"
-    for kind, body in ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")):
-        check = struct.pack(">I", zlib.crc32(kind + body))
-        found += struct.pack(">I", len(body)) + kind + body + check
-    return found
