@@ -19,7 +19,8 @@ MOTOR = "gripper"
 FORCE_N = 20.0
 """Of a gripper whose model says nothing, at its fingers."""
 MOST_FORCE_N = 40.0
-"""At the fingers; of more, which pushes a light block out, no use is made."""
+"""At the fingers, beyond their dry friction; of more, which pushes a light block out, no use is
+made."""
 LEAST_LEVER_M = 0.02
 SIDEWAYS = 0.5
 """Cosine between a finger's motion and the way to the others below which it does not close."""
@@ -69,9 +70,10 @@ def fit_fingers(
     actuators = [actuator for actuator, _ in drives]
     stated = [stated_torque(spec, name, actuators) for name in moving]
     levers = [fingers[name].lever for name in moving]
+    dry = model.dof_frictionloss[[model.joint(name).dofadr[0] for name in moving]].tolist()
     used = [
-        min(known or FORCE_N * lever, MOST_FORCE_N * lever)
-        for known, lever in zip(stated, levers, strict=True)
+        min(known or FORCE_N * lever + rub, MOST_FORCE_N * lever + rub)
+        for known, lever, rub in zip(stated, levers, dry, strict=True)
     ]
     force = sum(used)
     remove(spec, actuators[1:])

@@ -1,0 +1,49 @@
+"""What `rack robot new` makes of an arm's joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.levels.robot.dynamics import Dynamics
+from rack.tools.robot.draft import Wishes, draft
+from rack.tools.robot.source import read_source
+from tests.tools.robot.models import urdf, written
+
+DRY_N_M = 30.0
+SPEED = 0.3  # rad/s
+
+
+def with_friction(text: str) -> str:
+    return text.replace("<axis", f'<dynamics friction="{DRY_N_M}"/><axis')
+
+
+@pytest.mark.slow
+def test_dry_friction_of_light_links_is_what_the_equation_of_motion_says(tmp_path: Path) -> None:
+    source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
+    made = draft(source, Wishes(), tmp_path, "drafted")
+    assert "dry friction acts within 1 ms" in made.notes
+    cell = made.cell()
+    dynamics = Dynamics(cell)
+    velocity = np.full(6, SPEED)
+    friction = dynamics.friction(velocity)
+    assert friction == pytest.approx(np.full(6, DRY_N_M), rel=1e-3)
+    data = cell.start()
+    data.qvel[cell.dof] = velocity
+    data.qfrc_applied[cell.dof] = dynamics.terms(cell.home, velocity).bias + friction
+    mujoco.mj_forward(cell.model, data)
+    # A steady motion takes the torque that the servo level expects.
+    assert -data.qfrc_constraint[cell.dof] == pytest.approx(friction, rel=0.01)
+
+
+@pytest.mark.slow
+def test_what_a_model_says_of_its_friction_stays(tmp_path: Path) -> None:
+    source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
+    for joint in source.spec.joints:
+        joint.solref_friction[:] = [0.005, 1.0]
+    made = draft(source, Wishes(), tmp_path, "drafted")
+    assert made.cell().model.dof_solref[:, 0].tolist() == [0.005] * 6
+    assert not made.notes
